@@ -1,0 +1,95 @@
+"""The box convention, said once; every module keeps it.
+
+Frame: LiDAR, metres. x forward, y left, z up; yaw counter-clockwise about +z from +x, in [-pi, pi).
+
+    seen from above              x (forward)
+                                 ^
+                   front-left    |       front-right
+                        0 +------^------+ 3          The arrow is the heading: `length` runs along it,
+                          |      |      |            `width` across it. Drawn here with yaw = 0.
+              y           |      |      |
+          (left) <--------|------o      | length     A footprint lists its corners 0, 1, 2, 3:
+                          |             |            counter-clockwise, the front-left one first.
+                          |             |
+                        1 +-------------+ 2          o = (x, y, z), the geometric centre.
+                    rear-left  width  rear-right
+
+Box: (x, y, z, length, width, height, yaw), one row of an (N, 7) array.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Signs of the length and the width of the corners 0..3.
+_LENGTH_SIGNS = np.array([0.5, -0.5, -0.5, 0.5])
+_WIDTH_SIGNS = np.array([0.5, 0.5, -0.5, -0.5])
+
+
+def wrap_angle(angle_rad: ArrayLike, period: float = 2 * math.pi) -> NDArray[Any]:
+    """Angles moved by whole periods into [-period / 2, period / 2); those already there come back unchanged.
+
+    float32 in, float32 out; any other type comes out as float64. The interval holds for the rounded result
+    too: the float32 nearest to pi is greater than pi and never returned.
+    """
+    angle = np.asarray(angle_rad)
+    dtype = np.dtype(np.float32) if angle.dtype == np.float32 else np.dtype(np.float64)
+    angle = angle.astype(np.float64)
+    half = period / 2
+    wrapped = angle - period * np.floor((angle + half) / period)
+    wrapped = np.where(wrapped >= half, -half, np.maximum(wrapped, -half)).astype(dtype)
+    if dtype == np.float32:
+        limit = np.float32(half)
+        if float(limit) >= half:
+            limit = np.nextafter(limit, np.float32(0))
+        wrapped = np.clip(wrapped, -limit, limit)
+    return wrapped
+
+
+def footprints(boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Corners of the boxes seen from above: (N, 7) -> (N, 4, 2) x, y in metres, LiDAR frame.
+
+    Counter-clockwise, the front-left corner first (the drawing above). Keeps the floating type of `boxes`.
+    """
+    along = boxes[:, 3, None] * _LENGTH_SIGNS.astype(boxes.dtype)
+    across = boxes[:, 4, None] * _WIDTH_SIGNS.astype(boxes.dtype)
+    cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
+    x = boxes[:, 0, None] + cos * along - sin * across
+    y = boxes[:, 1, None] + sin * along + cos * across
+    return np.stack([x, y], axis=-1)
+
+
+def corners(boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """All corners: (N, 7) -> (N, 8, 3) metres, LiDAR frame; bottom four as in `footprints`, then top four."""
+    flat = footprints(boxes)
+    half_height = boxes[:, 5] / 2
+    z = np.stack([boxes[:, 2] - half_height, boxes[:, 2] + half_height], axis=1)
+    return np.concatenate([np.tile(flat, (1, 2, 1)), np.repeat(z, 4, axis=1)[:, :, None]], axis=2)
+
+
+def points_in_boxes(
+    points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[Any]], margin_m: float = 0.0
+) -> NDArray[np.bool_]:
+    """Which points lie in which boxes, faces included: (P, >=3), (N, 7) -> (P, N) bool.
+
+    Args:
+        points: columns x, y, z in metres, LiDAR frame; non-finite ones are in no box.
+        margin_m: by how much each face of the boxes is moved outwards.
+    """
+    inside = np.zeros((len(boxes), len(points)), bool)
+    xyz = np.ascontiguousarray(points[:, :3].T)
+    for row, (x, y, z, length, width, height, yaw) in zip(inside, boxes.astype(np.float64), strict=True):
+        reach = math.hypot(length / 2 + margin_m, width / 2 + margin_m)
+        # A quick look along x first, with some slack for float32; few points are near any one box.
+        near = np.flatnonzero(np.abs(xyz[0] - x) <= reach + 1e-3)
+        dx, dy, dz = (xyz[axis, near].astype(np.float64) - centre for axis, centre in enumerate((x, y, z)))
+        along = math.cos(yaw) * dx + math.sin(yaw) * dy
+        across = math.cos(yaw) * dy - math.sin(yaw) * dx
+        row[near] = (
+            (np.abs(along) <= length / 2 + margin_m)
+            & (np.abs(across) <= width / 2 + margin_m)
+            & (np.abs(dz) <= height / 2 + margin_m)
+        )
+    return inside.T

@@ -1,0 +1,225 @@
+"""Overlaps against shapely, and suppression against its definition."""
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.geometry.boxes import footprints
+from asca_pillars.geometry.overlap import aligned_bev_iou, bev_intersection, bev_iou, iou_3d, rotated_nms
+
+# Places up to 70 m away, sizes from a thin plate to a lorry.
+CENTRES = st.tuples(st.floats(-70, 70), st.floats(-70, 70), st.floats(-2, 1))
+SIZES = st.tuples(*[st.sampled_from([1e-3, 0.6, 1.6, 4.0, 20.0]) | st.floats(0.01, 20)] * 3)
+YAWS = st.floats(-7, 7) | st.sampled_from([k * math.pi / 4 for k in range(-4, 5)] + [1e-320, 1e-9])
+BOXES = st.builds(lambda c, s, yaw: np.array([*c, *s, yaw]), CENTRES, SIZES, YAWS)
+
+
+def moved(box: np.ndarray, dx: float = 0, dy: float = 0, dz: float = 0, turn: float = 0) -> np.ndarray:
+    """The box, or boxes, moved in the LiDAR frame and turned."""
+    return box + np.array([dx, dy, dz, 0, 0, 0, turn])
+
+
+def polygon(box: np.ndarray) -> shapely.Polygon:
+    return shapely.Polygon(footprints(box[None].astype(np.float64))[0])
+
+
+def intersection_twin(a: np.ndarray, b: np.ndarray) -> float:
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    # About the origin: at 70 m shapely's own rounding would be larger than ours.
+    return float(polygon(moved(a, *-a[:2])).intersection(polygon(moved(b, *-a[:2]))).area)
+
+
+def bev_iou_twin(a: np.ndarray, b: np.ndarray) -> float:
+    shared = intersection_twin(a, b)
+    return float(shared / (a[3] * a[4] + b[3] * b[4] - shared))
+
+
+def iou_3d_twin(a: np.ndarray, b: np.ndarray) -> float:
+    top, bottom = min(a[2] + a[5] / 2, b[2] + b[5] / 2), max(a[2] - a[5] / 2, b[2] - b[5] / 2)
+    shared = intersection_twin(a, b) * max(0.0, top - bottom)
+    return float(shared / (np.prod(a[3:6]) + np.prod(b[3:6]) - shared))
+
+
+def assert_overlaps(a: np.ndarray, b: np.ndarray) -> None:
+    """All three measures of one pair, both ways round."""
+    for first, second in ((a, b), (b, a)):
+        (area,), (flat,), (solid,) = (f(first[None], second[None])[0] for f in (bev_intersection, bev_iou, iou_3d))
+        assert area == pytest.approx(intersection_twin(a, b), abs=1e-6)
+        assert flat == pytest.approx(bev_iou_twin(a, b), abs=1e-6)
+        assert solid == pytest.approx(iou_3d_twin(a, b), abs=1e-6)
+        assert 0 <= solid <= flat + 1e-12 <= 1 + 2e-12
+        assert 0 <= area <= min(a[3] * a[4], b[3] * b[4]) * (1 + 1e-12)
+
+
+@settings(max_examples=300)
+@given(BOXES, st.floats(-3, 3), st.floats(-3, 3), st.floats(-2, 2), SIZES, YAWS)
+def test_nearby_boxes(a: np.ndarray, dx: float, dy: float, dz: float, size: tuple[float, ...], yaw: float) -> None:
+    assert_overlaps(a, np.array([a[0] + dx, a[1] + dy, a[2] + dz, *size, yaw]))
+
+
+@given(BOXES, st.sampled_from([0.0, 1e-12, -1e-9, 1e-6]), st.sampled_from([0.0, 1e-12, 1e-9, -1e-7, math.pi]))
+def test_nearly_equal_boxes(a: np.ndarray, shift: float, turn: float) -> None:
+    b = moved(a, shift, -shift, turn=turn)
+    assert_overlaps(a, b)
+
+
+@given(BOXES, st.floats(0.05, 1), st.floats(-1, 1), st.floats(-1, 1))
+def test_nested_boxes(a: np.ndarray, scale: float, along: float, across: float) -> None:
+    # A smaller box with the same yaw, moved inside as far as it goes; at +-1 their sides touch.
+    inner = a.copy()
+    inner[3:6] *= scale
+    dx, dy = along * (a[3] - inner[3]) / 2, across * (a[4] - inner[4]) / 2
+    inner[:2] += dx * math.cos(a[6]) - dy * math.sin(a[6]), dx * math.sin(a[6]) + dy * math.cos(a[6])
+    assert_overlaps(a, inner)
+    assert bev_intersection(a[None], inner[None])[0, 0] == pytest.approx(inner[3] * inner[4], rel=1e-6, abs=1e-9)
+
+
+@given(BOXES, SIZES, st.sampled_from([0.0, 1e-3, 5.0]))
+def test_touching_and_disjoint_boxes(a: np.ndarray, size: tuple[float, ...], gap: float) -> None:
+    # Side by side: b stands in front of a.
+    b = np.array([*a[:3], *size, a[6]])
+    forward = (a[3] + b[3]) / 2 + gap
+    b[:2] += forward * math.cos(a[6]), forward * math.sin(a[6])
+    assert_overlaps(a, b)
+    if gap:
+        for first, second in ((a, b), (b, a)):
+            assert bev_intersection(first[None], second[None])[0, 0] == 0.0
+            assert iou_3d(first[None], second[None])[0, 0] == 0.0
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_boxes_that_do_not_meet_share_exactly_nothing(seed: int) -> None:
+    a, b = random_boxes(seed, 12, 12.0).astype(np.float64), random_boxes(seed + 1, 12, 12.0).astype(np.float64)
+    shared = bev_intersection(a, b)
+    for row, column in np.ndindex(shared.shape):
+        meet = polygon(a[row]).distance(polygon(b[column])) < 1e-9
+        assert (shared[row, column] > 0) == meet
+
+
+@given(BOXES)
+def test_a_box_and_itself(a: np.ndarray) -> None:
+    for box in (a, a.astype(np.float32)):
+        assert bev_iou(box[None], box[None]).tolist() == [[1.0]]
+        assert iou_3d(box[None], box[None]).tolist() == [[1.0]]
+    half_turn = moved(a, turn=math.pi)
+    assert iou_3d(a[None], half_turn[None])[0, 0] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_overlaps_by_hand() -> None:
+    unit = np.array([[30.0, -5.0, 0.0, 2.0, 2.0, 2.0, 0.0]])
+    # Turned by 45 degrees the squares share a regular octagon: 8 (sqrt(2) - 1) of inradius 1.
+    octagon = 8 * (math.sqrt(2) - 1)
+    turned = moved(unit, turn=math.pi / 4)
+    assert bev_intersection(unit, turned)[0, 0] == pytest.approx(octagon)
+    # Moved by half a side: 2 of 6 square metres; raised by half the height as well: 2 of 14 cubic metres.
+    assert bev_iou(unit, moved(unit, dx=1))[0, 0] == pytest.approx(2 / 6)
+    assert iou_3d(unit, moved(unit, dx=1, dz=1))[0, 0] == pytest.approx(2 / 14)
+    # One above the other.
+    assert iou_3d(unit, moved(unit, dz=2))[0, 0] == 0.0
+
+
+def random_boxes(seed: int, count: int, spread_m: float) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    low = [30.0, -10.0, -1.5, 0.5, 0.5, 1.0, -math.pi]
+    high = [30.0 + spread_m, -10.0 + spread_m / 2, -0.5, 5.0, 2.5, 2.0, math.pi]
+    return rng.uniform(low, high, (count, 7)).astype(np.float32)
+
+
+def test_rows_are_a_and_columns_are_b() -> None:
+    a, b = random_boxes(0, 7, 8.0), random_boxes(1, 5, 8.0)
+    for measure, twin in (
+        (bev_intersection, intersection_twin),
+        (bev_iou, bev_iou_twin),
+        (iou_3d, iou_3d_twin),
+    ):
+        result = measure(a, b)
+        assert result.shape == (7, 5) and result.dtype == np.float64
+        expected = [[twin(x, y) for y in b.astype(np.float64)] for x in a.astype(np.float64)]
+        np.testing.assert_allclose(result, expected, atol=1e-6)
+        assert (result > 0).any() and (result == 0).any()
+
+
+def test_inputs_are_not_changed() -> None:
+    a, b = random_boxes(0, 7, 8.0).astype(np.float64), random_boxes(1, 5, 8.0).astype(np.float64)
+    before = a.copy(), b.copy()
+    for measure in (bev_intersection, bev_iou, iou_3d, aligned_bev_iou):
+        measure(a, b)
+    np.testing.assert_array_equal(a, before[0])
+    np.testing.assert_array_equal(b, before[1])
+
+
+@pytest.mark.parametrize("measure", [bev_intersection, bev_iou, iou_3d, aligned_bev_iou])
+@pytest.mark.parametrize(("rows", "columns"), [(0, 0), (0, 3), (3, 0)])
+def test_no_boxes(measure, rows: int, columns: int) -> None:  # type: ignore[no-untyped-def]
+    assert measure(random_boxes(0, rows, 5.0), random_boxes(1, columns, 5.0)).shape == (rows, columns)
+
+
+def test_boxes_without_area_overlap_nothing() -> None:
+    flat = np.array([[1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.5]])
+    assert bev_iou(flat, flat).tolist() == iou_3d(flat, flat).tolist() == [[0.0]]
+    assert aligned_bev_iou(flat, flat).tolist() == [[0.0]]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_aligned_iou_turns_to_the_nearest_axis(seed: int) -> None:
+    a, b = random_boxes(seed, 6, 6.0), random_boxes(seed + 1, 9, 6.0)
+    turned_a, turned_b = a.copy(), b.copy()
+    for boxes in (turned_a, turned_b):
+        boxes[:, 6] = np.round(boxes[:, 6] / (math.pi / 2)) * (math.pi / 2)
+    result = aligned_bev_iou(a, b)
+    assert result.dtype == np.float32
+    np.testing.assert_allclose(result, bev_iou(turned_a, turned_b), atol=2e-5)
+    np.testing.assert_array_equal(np.diag(aligned_bev_iou(a, a)), 1.0)
+
+
+def nms_twin(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> list[int]:
+    """The definition: walk down the scores, keep what no kept box overlaps too much; by shapely."""
+    kept: list[int] = []
+    for index in sorted(range(len(boxes)), key=lambda i: -scores[i]):
+        if all(bev_iou_twin(boxes[index], boxes[other]) <= threshold for other in kept):
+            kept.append(index)
+    return kept
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 150),
+    st.sampled_from([2.0, 10.0, 40.0]),
+    st.sampled_from([0.01, 0.2, 0.5, 0.8]),
+    st.booleans(),
+)
+def test_suppression_equals_its_definition(
+    seed: int, count: int, spread_m: float, threshold: float, ties: bool
+) -> None:
+    boxes = random_boxes(seed, count, spread_m).astype(np.float64)
+    scores = np.random.default_rng(seed).normal(size=count)
+    if ties:
+        scores = np.round(scores)
+    kept = rotated_nms(boxes, scores, threshold)
+    assert kept.dtype == np.int64
+    assert kept.tolist() == nms_twin(boxes, scores, threshold)
+
+
+def test_a_suppressed_box_suppresses_nothing() -> None:
+    # A row of three, each half over the next: the middle one falls to the first and so spares the last.
+    boxes = np.array([[10.0 + 1.2 * k, 1.0, 0.0, 2.0, 1.0, 1.0, 0.0] for k in range(3)])
+    assert rotated_nms(boxes, np.array([0.9, 0.8, 0.7]), 0.2).tolist() == [0, 2]
+    assert rotated_nms(boxes, np.array([0.7, 0.8, 0.9]), 0.2).tolist() == [2, 0]
+    assert rotated_nms(boxes, np.array([0.7, 0.9, 0.8]), 0.2).tolist() == [1]
+
+
+def test_of_equal_scores_the_earlier_stays() -> None:
+    boxes = np.repeat(random_boxes(0, 1, 1.0), 130, axis=0)
+    assert rotated_nms(boxes, np.full(130, 0.5, np.float32), 0.5).tolist() == [0]
+    boxes[:, 0] += 10 * np.arange(130)
+    assert rotated_nms(boxes, np.full(130, 0.5, np.float32), 0.5).tolist() == list(range(130))
+
+
+def test_suppression_of_nothing() -> None:
+    kept = rotated_nms(np.empty((0, 7), np.float32), np.empty(0, np.float32), 0.1)
+    assert kept.shape == (0,) and kept.dtype == np.int64
