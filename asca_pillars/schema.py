@@ -1,0 +1,79 @@
+"""Typed settings from plain data: frozen dataclasses in, helpful one-line errors out."""
+
+import dataclasses
+import difflib
+import functools
+from collections.abc import Hashable
+from typing import Any, ClassVar, TypeVar, cast, get_args
+
+import pydantic
+
+from asca_pillars.errors import ConfigError
+
+T = TypeVar("T")
+
+_UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
+
+
+class Strict:
+    """Base of the settings dataclasses: a key that does not exist is an error at every level."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
+
+def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
+    """Build the dataclass `type_` from nested plain values.
+
+    Args:
+        type_: a dataclass whose fields are plain values, dataclasses or tuples of them.
+        data: what a YAML or JSON file held.
+        source: the file or command-line option to blame in the error.
+
+    Raises:
+        ConfigError: an unknown key (the nearest one that exists is named), a missing or an unusable value.
+    """
+    try:
+        return _adapter(cast(Hashable, type_)).validate_python(data)
+    except ConfigError as error:  # a dataclass that checks its own values
+        raise ConfigError(f"{source}: {error}") from None
+    except pydantic.ValidationError as error:
+        # A misspelt key is reported twice, as missing and as unknown; the latter helps.
+        first = min(error.errors(), key=lambda item: item["type"] not in _UNKNOWN_KEY)
+        raise ConfigError(f"{source}: {_explain(type_, first)}") from None
+
+
+def to_dict(settings: Any) -> dict[str, Any]:
+    """Plain values (dict, list, str, int, float, bool, None) of a settings dataclass, for YAML or JSON."""
+    plain: dict[str, Any] = _adapter(cast(Hashable, type(settings))).dump_python(settings, mode="json")
+    return plain
+
+
+@functools.cache
+def _adapter(type_: Hashable) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(type_)
+
+
+def _explain(type_: type, error: Any) -> str:
+    location = [part for part in error["loc"] if not (isinstance(part, str) and "[" in part)]
+    key = ".".join(str(part) for part in location)
+    if error["type"] in _UNKNOWN_KEY:
+        names = [field.name for field in dataclasses.fields(_type_at(type_, location[:-1]))]
+        nearest = difflib.get_close_matches(str(location[-1]), names, n=1, cutoff=0.4)
+        advice = f"did you mean `{nearest[0]}`?" if nearest else f"known keys: {', '.join(names)}"
+        return f"unknown key `{key}`; {advice}"
+    if error["type"] in ("missing", "missing_argument"):
+        return f"missing key `{key}`"
+    return f"`{key}` = {error['input']!r}: {error['msg'][0].lower()}{error['msg'][1:]}"
+
+
+def _type_at(type_: Any, location: list[Any]) -> Any:
+    """The dataclass that the path `location` leads to from `type_`."""
+    for part in location:
+        if isinstance(part, int):
+            type_ = get_args(type_)[0]
+        else:
+            type_ = next(field.type for field in dataclasses.fields(type_) if field.name == part)
+        if not dataclasses.is_dataclass(type_) and get_args(type_):
+            options = [option for option in get_args(type_) if dataclasses.is_dataclass(option)]
+            type_ = type_ if not options or type_.__class__.__name__ == "GenericAlias" else options[0]
+    return type_

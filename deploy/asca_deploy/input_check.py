@@ -1,0 +1,117 @@
+"""Does a scan look like those the model was trained on?
+
+A wrong reflectance scale or sensor height ruins detection without any error; here it becomes a sentence.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.pillarize import PillarCounts
+from asca_pillars.schema import Strict
+
+GROUND_RING_M = (4.0, 20.0)  # beyond the vehicle's own roof, before the beams become sparse
+GROUND_PERCENTILE = 10.0  # below it lie ditches and reflections
+GROUND_MIN_POINTS = 50
+SENSOR_HEIGHT_TOLERANCE_M = 0.5
+OUTSIDE_SHARE = 0.95
+SAMPLE_POINTS = 16_384  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
+
+
+@dataclass(frozen=True)
+class ExpectedInput(Strict):
+    """What the training scans looked like: (lowest, highest) over scans.
+
+    Attributes:
+        points_per_scan: finite points of a scan.
+        reflectance_mean: mean reflectance of a scan, 0..1.
+        ground_z_m: height of the ground near the sensor, LiDAR frame, metres (minus the sensor's height);
+            None where no training scan showed it.
+    """
+
+    points_per_scan: tuple[int, int]
+    reflectance_mean: tuple[float, float]
+    ground_z_m: tuple[float, float] | None
+
+
+class InputWarning(NamedTuple):
+    """One way in which a scan is far from the training scans; `about` names the way, `text` is for people."""
+
+    about: str
+    text: str
+
+
+def expected_input(scans: Iterable[NDArray[np.float32]]) -> ExpectedInput:
+    """Measure training scans, each (N, 4) x, y, z in metres and reflectance 0..1, with at least one point.
+
+    Raises:
+        ValueError: there is no scan.
+    """
+    measured = [(len(points), float(points[:, 3].mean()), ground_z_m(points)) for points in scans]
+    grounds = [ground for _, _, ground in measured if ground is not None]
+    return ExpectedInput(
+        points_per_scan=(min(m[0] for m in measured), max(m[0] for m in measured)),
+        reflectance_mean=(min(m[1] for m in measured), max(m[1] for m in measured)),
+        ground_z_m=(min(grounds), max(grounds)) if grounds else None,
+    )
+
+
+def ground_z_m(points: NDArray[np.float32]) -> float | None:
+    """Height of the ground around the sensor, metres: a low percentile of z in a near ring of the points.
+
+    Takes (N, 4); None if the ring holds too few points to tell.
+    """
+    x, y = points[:, 0], points[:, 1]
+    squared_range = x * x + y * y
+    ring = (squared_range > GROUND_RING_M[0] ** 2) & (squared_range < GROUND_RING_M[1] ** 2)
+    near_z = points[ring, 2]
+    return float(np.percentile(near_z, GROUND_PERCENTILE)) if len(near_z) >= GROUND_MIN_POINTS else None
+
+
+def check_input(
+    points: NDArray[np.float32], counts: PillarCounts, expected: ExpectedInput
+) -> list[InputWarning]:
+    """Compare a scan (N, 4) of finite points, and what pillarize counted in it, with the training scans."""
+    fewest, most = expected.points_per_scan
+    if len(points) < fewest / 10:
+        text = f"{len(points)} points, the training scans had {fewest} to {most}"
+        return [InputWarning("points", text)]  # too few to say anything else
+    sample = points[:: max(1, len(points) // SAMPLE_POINTS)]
+    warnings = [_reflectance_warning(sample[:, 3], expected), _height_warning(sample, expected)]
+    if counts.points_outside > OUTSIDE_SHARE * counts.points:
+        share = 100 * counts.points_outside / counts.points
+        text = f"{share:.1f} % of the points lie outside the grid: x is forward, y left, z up, in metres"
+        warnings.append(InputWarning("range", text))
+    return [warning for warning in warnings if warning]
+
+
+def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:
+    low, high = expected.reflectance_mean
+    largest, mean = float(reflectance.max()), float(reflectance.mean())
+    if largest > 1.5:
+        scale = 255 if largest <= 255 else 65535
+        text = f"reflectance reaches {largest:.4g}, the model was trained on 0..1: divide it by {scale}"
+        return InputWarning("reflectance", text)
+    if not low / 3 <= mean <= high * 3:
+        text = (
+            f"mean reflectance is {mean:.3g}, in training it was {low:.3g} to {high:.3g}: rescale it to 0..1"
+        )
+        return InputWarning("reflectance", text)
+    return None
+
+
+def _height_warning(points: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:
+    ground = ground_z_m(points)
+    if ground is None or expected.ground_z_m is None:
+        return None
+    low, high = expected.ground_z_m
+    if low - SENSOR_HEIGHT_TOLERANCE_M <= ground <= high + SENSOR_HEIGHT_TOLERANCE_M:
+        return None
+    text = (
+        f"the ground near the sensor lies at z = {ground:.2f} m, in training at {low:.2f} to {high:.2f} m: "
+        f"add {(low + high) / 2 - ground:+.2f} m to z"
+    )
+    return InputWarning("height", text)

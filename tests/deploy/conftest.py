@@ -1,0 +1,170 @@
+"""A tiny bundle made without PyTorch: two small graphs with random weights behind a real bundle.json."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from asca_deploy.bundle import Bundle, Graphs, Provenance, write_bundle_manifest
+from asca_deploy.input_check import ExpectedInput
+from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.geometry.pillarize import FEATURES, PillarLimits
+from asca_pillars.geometry.spec import DetectorSpec
+
+CHANNELS = 8
+# 8 + 16 + 32 columns of 0.32, 0.16 and 0.08 m by 24 rows: rectangular, off centre, with a positive minimum.
+SPEC = DetectorSpec(
+    grid=PillarGrid(x_range_m=(2.0, 9.68), y_range_m=(-1.28, 2.56), z_range_m=(-3.0, 1.0)),
+    limits=PillarLimits(max_pillars=300, max_points=8),
+)
+EXPECTED_INPUT = ExpectedInput(
+    points_per_scan=(900, 1100), reflectance_mean=(0.2, 0.6), ground_z_m=(-1.9, -1.6)
+)
+
+
+def encoder_graph(uses_counts: bool) -> onnx.ModelProto:
+    """max over a pillar's points of relu(W f + b), as ScatterND(max)."""
+    rng = np.random.default_rng(1)
+    weights = {
+        "weight": rng.normal(0, 0.5, (len(FEATURES), CHANNELS)).astype(np.float32),
+        "bias": rng.normal(0, 0.1, CHANNELS).astype(np.float32),
+        "channels": np.array([CHANNELS], np.int64),
+        "last": np.array([-1], np.int64),
+        "one": np.array([1], np.int64),
+    }
+    nodes = [
+        helper.make_node("Gemm", ["features", "weight", "bias"], ["linear"]),
+        helper.make_node("Relu", ["linear"], ["relu"]),
+        helper.make_node("Unsqueeze", ["pillar_index", "last"], ["index"]),
+    ]
+    inputs = [_info("features", ["M", len(FEATURES)]), _info("pillar_index", ["M"], TensorProto.INT64)]
+    if uses_counts:
+        inputs.append(_info("point_counts", ["P"], TensorProto.INT64))
+        nodes.append(helper.make_node("Shape", ["point_counts"], ["pillars"]))
+    else:  # pillar_index is ascending, so its last value says how many pillars there are
+        nodes += [
+            helper.make_node("Gather", ["pillar_index", "last"], ["highest"]),
+            helper.make_node("Add", ["highest", "one"], ["pillars"]),
+        ]
+    nodes += [
+        helper.make_node("Concat", ["pillars", "channels"], ["shape"], axis=0),
+        helper.make_node("ConstantOfShape", ["shape"], ["zeros"]),
+        helper.make_node("ScatterND", ["zeros", "index", "relu"], ["pillar_features"], reduction="max"),
+    ]
+    return _model(nodes, inputs, [_info("pillar_features", ["P", CHANNELS])], weights)
+
+
+def backbone_graph() -> onnx.ModelProto:
+    """One strided convolution, then the three heads."""
+    rng = np.random.default_rng(2)
+    anchors = SPEC.anchors.shape[2]
+    weights = {
+        "neck.weight": rng.normal(0, 0.15, (16, CHANNELS, 3, 3)).astype(np.float32),
+        "neck.bias": np.zeros(16, np.float32),
+    }
+    nodes = [
+        helper.make_node(
+            "Conv", ["canvas", "neck.weight", "neck.bias"], ["neck"], strides=[2, 2], pads=[1, 1, 1, 1]
+        ),
+        helper.make_node("Relu", ["neck"], ["relu"]),
+    ]
+    outputs = []
+    for name, count, bias, spread in (
+        ("scores", anchors, -3.0, 0.5),
+        ("boxes", 7 * anchors, 0.0, 0.05),
+        ("directions", 2 * anchors, 0.0, 0.5),
+    ):
+        weights[f"{name}.weight"] = rng.normal(0, spread, (count, 16, 1, 1)).astype(np.float32)
+        weights[f"{name}.bias"] = np.full(count, bias, np.float32)
+        nodes.append(helper.make_node("Conv", ["relu", f"{name}.weight", f"{name}.bias"], [name]))
+        outputs.append(_info(name, [1, count, *SPEC.grid.head_shape]))
+    canvas = _info("canvas", [1, CHANNELS, SPEC.grid.ny, SPEC.grid.nx])
+    return _model(nodes, [canvas], outputs, weights)
+
+
+def write_bundle(folder: Path, uses_counts: bool = True) -> Path:
+    """A valid bundle in `folder`."""
+    folder.mkdir(parents=True)
+    onnx.save(encoder_graph(uses_counts), folder / "encoder.onnx")
+    onnx.save(backbone_graph(), folder / "backbone.onnx")
+    provenance = Provenance(
+        command="asca train tiny.yaml",
+        created="2026-01-02",
+        git_revision=None,
+        trained_on="nothing, random weights",
+        seed=1,
+        steps=0,
+        versions={"onnx": onnx.__version__},
+        machine="test",
+    )
+    bundle = Bundle(
+        name="tiny",
+        spec=SPEC,
+        cpa="none",
+        channels=CHANNELS,
+        graphs=Graphs.of(folder),
+        parity=None,
+        expected_input=EXPECTED_INPUT,
+        provenance=provenance,
+        license="Apache-2.0",
+    )
+    write_bundle_manifest(folder, bundle)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good bundle that no test changes."""
+    return write_bundle(tmp_path_factory.mktemp("bundles") / "tiny")
+
+
+@pytest.fixture
+def bundle_copy(tiny_bundle: Path, tmp_path: Path) -> Path:
+    """A good bundle for the test to spoil."""
+    return Path(shutil.copytree(tiny_bundle, tmp_path / "tiny"))
+
+
+def make_scan(seed: int = 0, count: int = 1000) -> NDArray[np.float32]:
+    """A scan such as EXPECTED_INPUT describes: ground at -1.75 m, some things on it."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((2.0, -1.28, -1.8, 0.0), (9.68, 2.56, -1.7, 0.8), (count, 4))
+    points[: count // 4, 2] += rng.uniform(0, 1.5, count // 4)
+    return points.astype(np.float32)
+
+
+@pytest.fixture
+def scan() -> NDArray[np.float32]:
+    return make_scan()
+
+
+@pytest.fixture
+def scans() -> list[NDArray[np.float32]]:
+    """Three scans that fill different cells."""
+    return [make_scan(seed, count) for seed, count in ((0, 1000), (1, 200), (2, 1000))]
+
+
+@pytest.fixture
+def bundle_without_counts(tmp_path: Path) -> Path:
+    """The same model, exported without the input `point_counts`."""
+    return write_bundle(tmp_path / "without_counts", uses_counts=False)
+
+
+def _info(name: str, shape: list[int | str], kind: int = TensorProto.FLOAT) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, kind, shape)
+
+
+def _model(
+    nodes: list[onnx.NodeProto],
+    inputs: list[onnx.ValueInfoProto],
+    outputs: list[onnx.ValueInfoProto],
+    weights: dict[str, NDArray[np.generic]],
+) -> onnx.ModelProto:
+    initializers = [numpy_helper.from_array(value, name) for name, value in weights.items()]
+    graph = helper.make_graph(nodes, "tiny", inputs, outputs, initializers)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.checker.check_model(model, full_check=True)
+    return model

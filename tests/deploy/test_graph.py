@@ -1,0 +1,88 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import onnx
+import pytest
+
+from asca_deploy import Detector
+from asca_deploy.bundle import Graphs, load_bundle, write_bundle_manifest
+from asca_pillars.errors import BundleError
+
+
+def respoil(bundle: Path, graph: str, spoil: Callable[[onnx.ModelProto], None]) -> Path:
+    """Change a graph and sign it again, so that only its contents are wrong."""
+    good = load_bundle(bundle)
+    model = onnx.load(bundle / graph)
+    spoil(model)
+    onnx.save(model, bundle / graph)
+    write_bundle_manifest(bundle, replace(good, graphs=Graphs.of(bundle)))
+    return bundle
+
+
+def rename(model: onnx.ModelProto, old: str, new: str) -> None:
+    for value in (*model.graph.input, *model.graph.output):
+        value.name = new if value.name == old else value.name
+    for node in model.graph.node:
+        for names in (node.input, node.output):
+            names[:] = [new if name == old else name for name in names]
+
+
+def test_unknown_input(bundle_copy: Path) -> None:
+    respoil(bundle_copy, "encoder.onnx", lambda model: rename(model, "pillar_index", "pillar_of_point"))
+    with pytest.raises(BundleError, match=r"encoder\.onnx has an unknown input `pillar_of_point`"):
+        Detector(bundle_copy)
+
+
+def test_missing_output(bundle_copy: Path) -> None:
+    respoil(bundle_copy, "backbone.onnx", lambda model: rename(model, "directions", "yaw_bins"))
+    with pytest.raises(BundleError, match=r"backbone\.onnx has no output `directions`, only .*yaw_bins"):
+        Detector(bundle_copy)
+
+
+def test_outputs_are_found_by_name_not_by_order(bundle_copy: Path, tiny_bundle: Path, scan: object) -> None:
+    def turn_round(model: onnx.ModelProto) -> None:
+        outputs = list(model.graph.output)[::-1]
+        del model.graph.output[:]
+        model.graph.output.extend(outputs)
+
+    respoil(bundle_copy, "backbone.onnx", turn_round)
+    turned, straight = Detector(bundle_copy)(scan), Detector(tiny_bundle)(scan)  # type: ignore[arg-type]
+    assert len(straight) > 3
+    assert (turned.boxes == straight.boxes).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("channels", 16, r"`(canvas|pillar_features)` is .*8.*needs .*16"),
+        ("max_x", 17.36, r"backbone\.onnx: input `canvas` is .*24, 56.*needs .*24, 112"),
+    ],
+)
+def test_graphs_of_another_model(bundle_copy: Path, field: str, value: float, message: str) -> None:
+    good = load_bundle(bundle_copy)
+    if field == "channels":
+        other = replace(good, channels=int(value))
+    else:
+        other = replace(good, spec=replace(good.spec, grid=replace(good.spec.grid, x_range_m=(2.0, value))))
+    write_bundle_manifest(bundle_copy, other)
+    with pytest.raises(BundleError, match=message) as caught:
+        Detector(bundle_copy)
+    assert "\n" not in str(caught.value)
+
+
+def test_fewer_classes_than_the_head(bundle_copy: Path) -> None:
+    good = load_bundle(bundle_copy)
+    write_bundle_manifest(bundle_copy, replace(good, spec=replace(good.spec, classes=good.spec.classes[:1])))
+    with pytest.raises(BundleError, match=r"output `scores` is .*\(1, 6, 12, 28\).*needs .*\(1, 2, 12, 28\)"):
+        Detector(bundle_copy)
+
+
+def test_opset_from_the_future(bundle_copy: Path) -> None:
+    def raise_opset(model: onnx.ModelProto) -> None:
+        model.opset_import[0].version = 999
+
+    respoil(bundle_copy, "backbone.onnx", raise_opset)
+    with pytest.raises(BundleError, match=r"cannot run .*backbone\.onnx: .*Opset 999.*upgrade") as caught:
+        Detector(bundle_copy)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,55 @@
+"""The runtime works where PyTorch does not exist."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import asca_deploy
+
+DETECT = """
+import sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "lightning", "pytorch_lightning", "onnx", "onnxscript"):
+            raise ImportError(f"{name} must not be imported here")
+
+sys.meta_path.insert(0, NoTorch())
+import numpy as np
+import asca_deploy
+from asca_deploy.benchmark import benchmark
+
+bundle, scan = sys.argv[1:]
+points = np.load(scan)
+print(len(asca_deploy.Detector(bundle)(points)))
+benchmark(asca_deploy.Detector(bundle), [points], rounds=1, warmup=0)
+assert not any(name.split(".")[0] == "torch" for name in sys.modules)
+"""
+
+
+def test_detects_in_a_process_that_cannot_import_torch(
+    tiny_bundle: Path, scan: NDArray[np.float32], tmp_path: Path
+) -> None:
+    np.save(tmp_path / "scan.npy", scan)
+    command = [sys.executable, "-W", "error", "-c", DETECT, str(tiny_bundle), str(tmp_path / "scan.npy")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) == len(asca_deploy.Detector(tiny_bundle)(scan)) > 3
+
+
+def test_no_file_of_the_runtime_imports_torch() -> None:
+    files = sorted(Path(asca_deploy.__file__).parent.rglob("*.py"))
+    assert len(files) > 5
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            for name in names:
+                assert name.split(".")[0] not in ("torch", "lightning", "onnx", "asca_export"), (
+                    f"{file}: {name}"
+                )
