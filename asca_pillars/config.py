@@ -1,0 +1,176 @@
+"""The whole configuration as one typed tree. Its defaults are the paper's values (ASCA-PointPillars, section 4.1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.schema import Strict, parse
+
+CpaReading = Literal["none", "paper", "channel", "point"]
+
+
+@dataclass(frozen=True)
+class NetworkConfig(Strict):
+    """Widths and depths of the network.
+
+    Attributes:
+        cpa: reading of the correlative point attention, see docs/READING.md.
+        pillar_channels: C, features of one pillar.
+        block_channels: output channels of Block1..3 (Table 1).
+        block_convs: stride-1 convolutions that follow each block's strided one (Table 1: 3).
+        upsample_channels: output channels of each DeBlock (Table 1: 128).
+    """
+
+    cpa: CpaReading = "channel"
+    pillar_channels: int = 64
+    block_channels: tuple[int, int, int] = (64, 128, 256)
+    block_convs: tuple[int, int, int] = (3, 3, 3)
+    upsample_channels: int = 128
+
+
+@dataclass(frozen=True)
+class LossConfig(Strict):
+    """Eq. (13)-(15) with the residuals of PointPillars; `smooth_l1_beta` is SECOND's 1/9."""
+
+    box_weight: float = 2.0
+    class_weight: float = 1.0
+    direction_weight: float = 0.2
+    focal_alpha: float = 0.25
+    focal_gamma: float = 2.0
+    smooth_l1_beta: float = 1 / 9
+
+
+@dataclass(frozen=True)
+class AugmentConfig(Strict):
+    """Random changes of a training frame, each drawn anew for every sample and epoch.
+
+    Attributes:
+        flip_probability: of a mirror image about the x axis.
+        rotation_rad: the scene turns about z by up to this angle either way.
+        scale: (smallest, largest) global scaling.
+        shift_z_m: the scene rises or sinks by up to this, as another sensor height would show it.
+        object_rotation_rad: each object turns about its own axis by up to this angle either way.
+        object_shift_m: standard deviation of each object's shift along x, y and z.
+        point_dropout: largest share of a frame's points that is dropped at random.
+    """
+
+    flip_probability: float = 0.5
+    rotation_rad: float = 0.785398
+    scale: tuple[float, float] = (0.95, 1.05)
+    shift_z_m: float = 0.0
+    object_rotation_rad: float = 0.15708
+    object_shift_m: float = 0.25
+    point_dropout: float = 0.0
+
+
+@dataclass(frozen=True)
+class DataConfig(Strict):
+    """What is read from the KITTI-layout folder.
+
+    Attributes:
+        train_set, val_set: names of lists in ImageSets/.
+        camera_view: keep only points that the camera sees; KITTI labels nothing else.
+        min_points: an object with fewer points inside its box is neither a positive nor a negative.
+        workers: processes that load and augment.
+    """
+
+    train_set: str = "train"
+    val_set: str = "val"
+    camera_view: bool = True
+    min_points: int = 1
+    workers: int = 2
+
+
+@dataclass(frozen=True)
+class TrainConfig(Strict):
+    """The recipe. Defaults: section 4.1 of the paper.
+
+    Attributes:
+        schedule: `step` multiplies the rate by `decay` every `decay_epochs`; `one_cycle` rises to
+            `learning_rate` and falls to almost nothing over the run, step by step.
+        gradient_clip: largest norm of the whole gradient; 0 leaves it as it is.
+        precision: `32` or `bf16`.
+        checkpoint_steps: also save every so many steps, so that a kill costs minutes, not an epoch.
+    """
+
+    epochs: int = 160
+    batch_size: int = 6
+    learning_rate: float = 2e-4
+    weight_decay: float = 0.0
+    schedule: Literal["step", "one_cycle"] = "step"
+    decay: float = 0.8
+    decay_epochs: int = 15
+    gradient_clip: float = 10.0
+    precision: Literal["32", "bf16"] = "32"
+    checkpoint_steps: int = 500
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"train.{name} = {getattr(self, name)}: must be at least 1")
+
+
+@dataclass(frozen=True)
+class Config(Strict):
+    """One model a person would train: what it sees, what it is, how it learns."""
+
+    name: str = "asca_pointpillars"
+    detector: DetectorSpec = field(default_factory=DetectorSpec)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """Read a YAML file that holds what differs from the defaults.
+
+    Args:
+        path: the YAML file.
+        overrides: `key.subkey=value` texts, value in YAML notation; they win over the file.
+
+    Raises:
+        ConfigError: unreadable YAML, an unknown key anywhere (the nearest is named), an impossible value.
+    """
+    path = Path(path)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}); configs/ holds those that ship"
+        ) from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: expected `key: value` lines, found a {type(data).__name__}")
+    config = parse(Config, data, str(path))
+    if not overrides:
+        return config
+    for override in overrides:
+        _apply(data, override)
+    return parse(Config, data, f"{path} with {' '.join(overrides)}")
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    """Set `key.subkey=value` in the nested dictionary `data`."""
+    key, separator, text = override.partition("=")
+    if not separator or not key:
+        raise ConfigError(f"`{override}`: an override is written key.subkey=value, such as train.epochs=20")
+    *parents, leaf = key.strip().split(".")
+    for parent in parents:
+        data = data.setdefault(parent, {})
+        if not isinstance(data, dict):
+            raise ConfigError(f"`{override}`: `{parent}` is a value, it has no keys")
+    try:
+        data[leaf] = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigError(f"`{override}`: the value is not valid YAML") from None

@@ -1,0 +1,95 @@
+"""Random changes of a labelled frame, every one drawn from the generator that is passed in (section 4.1)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.config import AugmentConfig
+from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
+from asca_pillars.geometry.overlap import bev_intersection
+
+OBJECT_TRIES = 10  # draws of one object's new pose before it stays where it is
+
+
+@dataclass(frozen=True)
+class LabeledFrame:
+    """One frame of training data.
+
+    Attributes:
+        frame_id: name of the frame in its dataset.
+        points: (N, 4) float32 x, y, z, reflectance.
+        boxes: (M, 7) float32.
+        labels: (M,) int64 class index, or `models.targets.IGNORED`.
+    """
+
+    frame_id: str
+    points: NDArray[np.float32]
+    boxes: NDArray[np.float32]
+    labels: NDArray[np.int64]
+
+
+def augment(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Generator) -> LabeledFrame:
+    """Per-object noise, flip, rotation, scaling, height shift and point dropout, in this order.
+
+    The frame that is passed in stays as it was.
+    """
+    frame = replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
+    move_objects(frame, config, rng)
+    if rng.random() < config.flip_probability:
+        flip_y(frame)
+    rotate(frame, rng.uniform(-config.rotation_rad, config.rotation_rad))
+    scale(frame, rng.uniform(*config.scale))
+    shift_z_m = rng.uniform(-config.shift_z_m, config.shift_z_m)
+    frame.points[:, 2] += shift_z_m
+    frame.boxes[:, 2] += shift_z_m
+    kept = rng.random(len(frame.points)) >= rng.uniform(0, config.point_dropout)
+    return replace(frame, points=frame.points[kept])
+
+
+def flip_y(frame: LabeledFrame) -> None:
+    """Mirror the frame, in place, about the x axis: left becomes right."""
+    frame.points[:, 1] *= -1
+    frame.boxes[:, 1] *= -1
+    frame.boxes[:, 6] = wrap_angle(-frame.boxes[:, 6])
+
+
+def rotate(frame: LabeledFrame, angle_rad: float) -> None:
+    """Turn the frame, in place, counter-clockwise about the sensor's vertical axis."""
+    rotation = _rotation(angle_rad)
+    frame.points[:, :2] = frame.points[:, :2] @ rotation.T
+    frame.boxes[:, :2] = frame.boxes[:, :2] @ rotation.T
+    frame.boxes[:, 6] = wrap_angle(frame.boxes[:, 6] + angle_rad)
+
+
+def scale(frame: LabeledFrame, factor: float) -> None:
+    """Scale the frame, in place, about the sensor."""
+    frame.points[:, :3] *= factor
+    frame.boxes[:, :6] *= factor
+
+
+def move_objects(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Generator) -> None:
+    """Shift and turn each object with its points, in place, unless it would run into another one (SECOND, 3.2)."""
+    if not len(frame.boxes) or (config.object_shift_m == 0 and config.object_rotation_rad == 0):
+        return
+    inside = points_in_boxes(frame.points, frame.boxes)
+    for index in range(len(frame.boxes)):
+        others = np.delete(frame.boxes, index, axis=0)
+        for _ in range(OBJECT_TRIES):
+            shift_m = rng.normal(0, config.object_shift_m, 3)
+            turn_rad = rng.uniform(-config.object_rotation_rad, config.object_rotation_rad)
+            moved = frame.boxes[index].copy()
+            moved[:3] += shift_m
+            moved[6] = wrap_angle(moved[6] + turn_rad)
+            if not bev_intersection(moved[None], others).any():
+                own = inside[:, index]
+                local = frame.points[own, :3] - frame.boxes[index, :3]
+                local[:, :2] = local[:, :2] @ _rotation(turn_rad).T
+                frame.points[own, :3] = local + moved[:3]
+                frame.boxes[index] = moved
+                break
+
+
+def _rotation(angle_rad: float) -> NDArray[np.float32]:
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cosine, -sine], [sine, cosine]], dtype=np.float32)

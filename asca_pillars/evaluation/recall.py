@@ -1,0 +1,101 @@
+"""Recall and false detections per frame at a fixed score: what one watches while training.
+
+The official KITTI protocol ranks detections by score over a whole set; this one answers the question of somebody who
+runs the detector at its thresholds.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.overlap import bev_iou
+
+BEV_IOU = {"Car": 0.5}  # every other class is as small as a person: 0.25
+SMALL_BEV_IOU = 0.25
+
+
+class RecallRow(NamedTuple):
+    """Counts of one class, and what follows from them."""
+
+    objects: int
+    found: int
+    false: int
+    frames: int
+
+    @property
+    def recall(self) -> float:
+        """Share of the objects that were found; NaN without objects."""
+        return self.found / self.objects if self.objects else float("nan")
+
+    @property
+    def false_per_frame(self) -> float:
+        """Detections per frame that found nothing and excused nothing."""
+        return self.false / max(self.frames, 1)
+
+
+class RecallTally:
+    """Counts objects found and false detections, frame by frame.
+
+    Args:
+        class_names: names of labels 0, 1, ...
+        max_distance_m: only objects and detections whose centre is nearer (horizontally) are counted.
+    """
+
+    def __init__(self, class_names: Sequence[str], max_distance_m: float = np.inf) -> None:
+        self.class_names = class_names
+        self.max_distance_m = max_distance_m
+        self.counts = np.zeros((len(class_names), 3), dtype=np.int64)  # objects, found, false
+        self.frames = 0
+
+    def add(self, detections: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> None:
+        """Count one frame.
+
+        Args:
+            detections: of the frame, at the threshold in question.
+            boxes: (N, 7) labelled boxes.
+            labels: (N,) class index, negative for boxes that excuse a detection of any class but need not be found.
+        """
+        self.frames += 1
+        for index, name in enumerate(self.class_names):
+            of_class = detections[detections.labels == index]
+            chosen = (labels == index) | (labels < 0)
+            self.counts[index] += _count(
+                of_class.boxes,
+                boxes[chosen],
+                labels[chosen] == index,
+                BEV_IOU.get(name, SMALL_BEV_IOU),
+                self.max_distance_m,
+            )
+
+    def rows(self) -> dict[str, RecallRow]:
+        """One row per class."""
+        return {
+            name: RecallRow(int(objects), int(found), int(false), self.frames)
+            for name, (objects, found, false) in zip(self.class_names, self.counts, strict=True)
+        }
+
+
+def _count(
+    found_boxes: NDArray[np.float32],
+    boxes: NDArray[np.float32],
+    wanted: NDArray[np.bool_],
+    min_iou: float,
+    max_distance_m: float,
+) -> tuple[int, int, int]:
+    """Objects, found and false detections of one class in one frame; detections by descending score."""
+    iou = bev_iou(found_boxes, boxes)
+    near = np.hypot(boxes[:, 0], boxes[:, 1]) <= max_distance_m
+    free = np.ones(len(boxes), dtype=bool)
+    found = false = 0
+    for box, row in zip(found_boxes, iou, strict=True):
+        candidates = np.where(free, row, 0.0)
+        best = int(candidates.argmax()) if len(candidates) else -1
+        if best >= 0 and candidates[best] >= min_iou:
+            free[best] = False
+            found += bool(wanted[best] and near[best])
+        elif np.hypot(box[0], box[1]) <= max_distance_m:
+            false += 1
+    return int((wanted & near).sum()), found, false

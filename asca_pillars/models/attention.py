@@ -1,0 +1,105 @@
+"""Correlative point attention (CPA, section 3.2 of the paper, eq. 6-11) in the readings that its text allows.
+
+Letters: P pillars of one frame, M points, C channels, d attention width, N points of one pillar at most.
+Each reading ends with the residual connection of eq. (11).
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+
+class PaperAttention(nn.Module):
+    """Eq. (6)-(11) as printed: the MLPs mix the *pillar* axis, attention runs among the C channels.
+
+    The matrices are laid out for `max_pillars` pillars in flat-index order. A frame with fewer uses the first rows
+    and columns, which is exactly what zero-padding the frame to `max_pillars` would compute.
+    """
+
+    def __init__(self, channels: int, max_pillars: int, width: int = 64) -> None:
+        super().__init__()
+        bound = max_pillars**-0.5
+        self.scale = width**-0.5
+        self.query = nn.Parameter(torch.empty(max_pillars, width).uniform_(-bound, bound))
+        self.key = nn.Parameter(torch.empty(max_pillars, width).uniform_(-bound, bound))
+        self.value = nn.Parameter(torch.empty(max_pillars, channels).uniform_(-bound, bound))
+        self.bias = nn.ParameterDict(
+            {
+                "query": nn.Parameter(torch.zeros(width)),
+                "key": nn.Parameter(torch.zeros(width)),
+                "value": nn.Parameter(torch.zeros(channels)),
+                "restore": nn.Parameter(torch.zeros(max_pillars)),
+            }
+        )
+        bound = channels**-0.5
+        self.restore = nn.Parameter(torch.empty(channels, max_pillars).uniform_(-bound, bound))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
+        pillars = features.shape[0]
+        by_channel = features.T  # F of the paper, (C, P)
+        query = by_channel @ self.query[:pillars] + self.bias["query"]  # (C, d)
+        key = by_channel @ self.key[:pillars] + self.bias["key"]  # (C, d)
+        value = by_channel @ self.value[:pillars] + self.bias["value"]  # (C, C)
+        attention = torch.softmax(query @ key.T * self.scale, dim=-1) @ value  # A, (C, C)
+        restored = attention @ self.restore[:, :pillars] + self.bias["restore"][:pillars]  # F', (C, P)
+        return features + restored.T
+
+
+class ChannelAttention(nn.Module):
+    """The same C x C attention with projections per pillar, so that order and number of pillars do not matter.
+
+    Queries and keys are normalised along the pillars (cross-covariance attention, XCiT, arXiv 2106.09681), which
+    keeps the logits' scale the same for a frame of ten pillars and one of ten thousand.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.query = nn.Linear(channels, channels, bias=False)
+        self.key = nn.Linear(channels, channels, bias=False)
+        self.value = nn.Linear(channels, channels, bias=False)
+        self.restore = nn.Linear(channels, channels)
+        self.temperature = nn.Parameter(torch.ones(1))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(P, C) -> (P, C) for the pillars of one frame."""
+        query = F.normalize(self.query(features), dim=0)
+        key = F.normalize(self.key(features), dim=0)
+        attention = torch.softmax(query.T @ key * self.temperature, dim=-1)  # (C, C)
+        return features + self.restore(self.value(features) @ attention.T)
+
+
+class PointAttention(nn.Module):
+    """Self-attention among the points of one pillar, before the max: "associations among points within a pillar"."""
+
+    def __init__(self, channels: int, max_points: int) -> None:
+        super().__init__()
+        self.max_points = max_points
+        self.scale = channels**-0.5
+        self.query = nn.Linear(channels, channels, bias=False)
+        self.key = nn.Linear(channels, channels, bias=False)
+        self.value = nn.Linear(channels, channels, bias=False)
+        self.restore = nn.Linear(channels, channels)
+
+    def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+        """(M, C) point features -> (M, C); points attend to the points of their own pillar only.
+
+        Args:
+            features: (M, C), rows of one pillar adjacent.
+            pillar_index: (M,) pillar of each row, ascending.
+            point_counts: (P,) rows of each pillar.
+        """
+        pillars, channels = point_counts.shape[0], features.shape[1]
+        starts = torch.cumsum(point_counts, 0) - point_counts
+        rows = torch.arange(features.shape[0], device=features.device)
+        slot = pillar_index * self.max_points + rows - starts[pillar_index]  # row of the padded (P * N) table
+
+        def padded(flat: Tensor) -> Tensor:
+            table = flat.new_zeros(pillars * self.max_points, channels)
+            return table.index_put((slot,), flat).view(pillars, self.max_points, channels)
+
+        query, key, value = (padded(layer(features)) for layer in (self.query, self.key, self.value))
+        empty = torch.arange(self.max_points, device=features.device) >= point_counts[:, None]  # (P, N)
+        logits = (query @ key.transpose(1, 2) * self.scale).masked_fill(empty[:, None, :], float("-inf"))
+        attended = (torch.softmax(logits, dim=-1) @ value).view(-1, channels)[slot]  # back to (M, C)
+        return features + self.restore(attended)

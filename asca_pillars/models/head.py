@@ -1,0 +1,30 @@
+"""Detection head: single-shot (SSD), one 1x1 convolution per output (section 3.1 and 3.4 of the paper)."""
+
+import math
+
+from torch import Tensor, nn
+
+from asca_pillars.geometry.decode import HeadMaps
+
+POSITIVE_PRIOR = (
+    0.01  # what an untrained head says of every anchor: focal loss starts calm (arXiv 1708.02002, 4.1)
+)
+
+
+class SSDHead(nn.Module):
+    """Class logit, seven box residuals and two direction logits for each of A anchors per cell.
+
+    An anchor belongs to one class and is only ever matched with that class, so it carries one class logit.
+    """
+
+    def __init__(self, in_channels: int, anchors_per_cell: int) -> None:
+        super().__init__()
+        self.scores = nn.Conv2d(in_channels, anchors_per_cell, 1)
+        self.boxes = nn.Conv2d(in_channels, anchors_per_cell * 7, 1)
+        self.directions = nn.Conv2d(in_channels, anchors_per_cell * 2, 1)
+        nn.init.constant_(self.scores.bias, -math.log((1 - POSITIVE_PRIOR) / POSITIVE_PRIOR))  # type: ignore[arg-type]
+        nn.init.normal_(self.boxes.weight, std=0.001)
+
+    def forward(self, features: Tensor) -> HeadMaps[Tensor]:
+        """(B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W)."""
+        return HeadMaps(self.scores(features), self.boxes(features), self.directions(features))

@@ -1,0 +1,87 @@
+"""The training loss: eq. (13)-(15) of the paper, with the residuals of PointPillars."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+from asca_pillars.config import LossConfig
+from asca_pillars.geometry.decode import HeadMaps
+
+
+class TargetBatch(NamedTuple):
+    """`models.targets.Targets` of B frames.
+
+    Attributes:
+        state: (B, H, W, A) int8, 1 positive, 0 negative, -1 without part.
+        positives: (n,) flat indices into (B, H, W, A).
+        residuals: (n, 7).
+        directions: (n,) int64.
+    """
+
+    state: Tensor
+    positives: Tensor
+    residuals: Tensor
+    directions: Tensor
+
+
+class LossTerms(NamedTuple):
+    """Weighted terms of the loss, scalars; their sum is eq. (15)."""
+
+    box: Tensor
+    classification: Tensor
+    direction: Tensor
+
+    @property
+    def total(self) -> Tensor:
+        """Eq. (15)."""
+        return self.box + self.classification + self.direction
+
+
+def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossConfig) -> LossTerms:
+    """Eq. (15): focal loss over anchors, smooth L1 and direction over the positive ones, per positive anchor.
+
+    Args:
+        maps: scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W).
+        targets: what they should be.
+        config: weights and shape parameters.
+    """
+    positives = max(len(targets.positives), 1)
+    logits = maps.scores.float().permute(0, 2, 3, 1)  # (B, H, W, A)
+    classification = focal_loss(logits, targets.state, config.focal_alpha, config.focal_gamma)
+    residuals = _at_anchors(maps.boxes, targets.positives, values=7)
+    directions = _at_anchors(maps.directions, targets.positives, values=2)
+    box = box_loss(residuals, targets.residuals, config.smooth_l1_beta)
+    direction = F.cross_entropy(directions, targets.directions, reduction="sum")
+    return LossTerms(
+        config.box_weight * box / positives,
+        config.class_weight * classification / positives,
+        config.direction_weight * direction / positives,
+    )
+
+
+def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Tensor:
+    """Eq. (14), summed: binary focal loss (arXiv 1708.02002) where `state` is 1 or 0, nothing where it is -1."""
+    target = (state == 1).to(logits.dtype)
+    cross_entropy = F.binary_cross_entropy_with_logits(logits, target, reduction="none")
+    miss = torch.where(state == 1, torch.sigmoid(-logits), torch.sigmoid(logits))
+    weight = torch.where(state == 1, alpha, 1 - alpha) * (state >= 0)
+    return (weight * miss**gamma * cross_entropy).sum()
+
+
+def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
+    """Eq. (13), summed: smooth L1 of six residuals and of the sine of the yaw difference.
+
+    The sine makes a box and the same box turned by half a circle equal; the direction bins tell them apart.
+    """
+    position_size = F.smooth_l1_loss(residuals[:, :6], targets[:, :6], beta=beta, reduction="sum")
+    sine = torch.sin(residuals[:, 6] - targets[:, 6])
+    return position_size + F.smooth_l1_loss(sine, torch.zeros_like(sine), beta=beta, reduction="sum")
+
+
+def _at_anchors(maps: Tensor, anchor_index: Tensor, values: int) -> Tensor:
+    """Rows of `values` channels of the anchors `anchor_index` (flat in B, H, W, A): (B, A * values, H, W) -> (n, values)."""
+    batch, channels, height, width = maps.shape
+    by_anchor = maps.permute(0, 2, 3, 1).reshape(batch * height * width * channels // values, values)
+    return by_anchor[anchor_index].float()
