@@ -1,0 +1,56 @@
+"""What the simulator draws at random, and between which bounds. Every number here may be changed by a config file."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Ranges of the random streets. Pairs are bounds of a uniform draw unless said otherwise; metres and radians.
+
+    The class rates are mean numbers of objects placed ahead of the car, within `reach_m`; as many stand behind it.
+    The camera misses some at the sides, others hide them: about 65 % get a label. KITTI's labels hold 3.8 cars,
+    0.6 pedestrians and 0.2 cyclists per frame; the defaults give more people, who are short in training.
+    """
+
+    cars: float = 8.6
+    pedestrians: float = 2.7
+    cyclists: float = 1.7
+    vans: float = 0.55
+    trucks: float = 0.22
+    trams: float = 0.05
+    misc: float = 0.18
+    sitting: float = 0.10
+    dispersion: float = 1.6  # of the negative binomial counts: the smaller, the more often none or many
+    empty_share: float = 0.12  # scenes without any labelled type
+    reach_m: float = 76.0
+
+    pedestrian_uniform_heading: float = 0.45  # the others walk along the street
+    cyclist_crossing: float = 0.30
+
+    # Shares of street kinds: narrow with parked cars, wide in town, out of town, square or campus.
+    residential: float = 0.36
+    urban: float = 0.30
+    rural: float = 0.22
+    campus: float = 0.12
+    junction_share: float = 0.45
+    rails_share: float = 0.07
+    median_share: float = 0.10
+
+    sensor_height_m: tuple[float, float] = (1.66, 1.80)
+    heading_error_sigma_rad: float = 0.035  # of the car in its lane
+    bend_sigma_per_m: float = 0.0022  # curvature of the road
+    slope_x: tuple[float, float] = (0.007, 0.006)  # mean and standard deviation
+    slope_y: tuple[float, float] = (-0.006, 0.012)
+    relief_m: tuple[float, float] = (0.0, 1.5)
+    bank_slope: tuple[float, float] = (-0.05, 0.15)  # of the ground beyond the pavement
+    grass_m: tuple[float, float] = (0.02, 0.16)
+
+    clutter: tuple[float, float] = (10.0, 45.0)  # posts, signs, bins, shrubs and the like per 100 m of street
+    crown_density_per_m: tuple[float, float] = (0.25, 2.2)
+    dark_paint_share: float = 0.45
+
+    # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
+    min_points: int = 4
+    min_visible_share: float = 0.06
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads

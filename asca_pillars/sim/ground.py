@@ -1,0 +1,103 @@
+"""The ground: a carriageway with kerbs, a second one that crosses it, verges, banks, hills and tracks.
+
+Road coordinates: u along the main road, v to its left, v = 0 at its middle, in metres. They are turned and bent
+against the LiDAR frame, in which the car stands at the origin.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import groundcast
+from .groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M
+
+Floats = npt.NDArray[np.float64]
+
+@dataclass(frozen=True)
+class Ground:
+    """The surface under one scene.
+
+    Attributes:
+        shape: (20,) numbers of the street, as `street` writes them.
+        relief: (R,R) heights in metres on a square lattice of RELIEF_STEP_M around the car, x by rows.
+        reflectance: (5,) of asphalt, pavement, verge, marking, rail.
+        z_m: height of the ground under the car in the LiDAR frame.
+    """
+
+    shape: Floats
+    relief: Floats
+    reflectance: Floats
+    z_m: float
+
+    @property
+    def half_width_m(self) -> float:
+        return float(self.shape[groundcast.HALF_WIDTH])
+
+    @property
+    def pavement_m(self) -> float:
+        return float(self.shape[groundcast.WALK])
+
+    @property
+    def cross_u_m(self) -> float:
+        return float(self.shape[groundcast.CROSS_U])
+
+    @property
+    def cross_half_m(self) -> float:
+        """Half the width of the crossing road; 0 where there is none."""
+        return float(self.shape[groundcast.CROSS_HALF])
+
+    @property
+    def rails_v_m(self) -> float | None:
+        """Middle of the tracks in road coordinates, if there are any."""
+        v = float(self.shape[groundcast.RAILS_V])
+        return v if v > NO_RAILS else None
+
+    def to_lidar(self, u_m: float, v_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
+        """Road coordinates and a heading against the road -> x, y, heading in the LiDAR frame."""
+        yaw, bend = self.shape[groundcast.YAW], self.shape[groundcast.BEND]
+        across = v_m + self.shape[groundcast.OFFSET] + 0.5 * bend * u_m * u_m
+        x = u_m * np.cos(yaw) - across * np.sin(yaw)
+        y = u_m * np.sin(yaw) + across * np.cos(yaw)
+        return float(x), float(y), float(yaw + np.arctan(bend * u_m) + yaw_rad)
+
+    def cross_to_lidar(self, along_m: float, across_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
+        """The same for the crossing road: along it to the left of the main road, across it ahead."""
+        tilt = self.shape[groundcast.CROSS_TILT]
+        u = self.shape[groundcast.CROSS_U] + across_m * np.cos(tilt) - along_m * np.sin(tilt)
+        v = along_m * np.cos(tilt) + across_m * np.sin(tilt)
+        x, y, _ = self.to_lidar(u, v)
+        yaw = self.shape[groundcast.YAW] + tilt + np.pi / 2 + yaw_rad
+        return x, y, float(yaw)
+
+    def heights(self, xy: npt.ArrayLike) -> Floats:
+        """Height (N,) of the ground at (N,2) in the LiDAR frame, metres."""
+        points = np.asarray(xy, float).reshape(-1, 2)
+        return np.asarray(groundcast.heights(points, self.shape, self.relief, self.z_m))
+
+
+def street(**numbers: float) -> Floats:
+    """The `shape` of a Ground from its numbers by name (see the constants above); what is left out is 0 or absent."""
+    numbers = {"rails_v_m": NO_RAILS, **numbers}
+    order = ["yaw_rad", "bend_per_m", "offset_m", "half_width_m", "cross_u_m", "cross_half_m", "cross_tilt_rad", "kerb_m", "pavement_m", "lane_m", "bank_left", "bank_right", "rails_v_m", "median_half_m", "rough_m", "camber"]
+    unknown = set(numbers) - set(order)
+    if unknown:
+        raise TypeError(f"a street has no {sorted(unknown)}")
+    yaw, tilt = numbers.get("yaw_rad", 0.0), numbers.get("cross_tilt_rad", 0.0)
+    derived = [np.cos(yaw), np.sin(yaw), np.cos(tilt), np.sin(tilt)]
+    return np.array([numbers.get(name, 0.0) for name in order] + derived)
+
+
+def draw_relief(rng: np.random.Generator, slope: tuple[float, float], amplitude_m: float) -> Floats:
+    """Hills: a plane of `slope` (x, y) and a few long waves, flat under the car. Metres, (R,R)."""
+    axis = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    height: Any = slope[0] * x + slope[1] * y
+    for wavelength in (120.0, 70.0, 35.0, 18.0):
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        size = amplitude_m * wavelength / 120.0 * rng.normal(0.0, 0.6)
+        wave = np.sin((x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / wavelength + phase)
+        height = height + size * (wave - np.sin(phase))
+    near = len(axis) // 2
+    return np.asarray(height - height[near, near])

@@ -1,0 +1,171 @@
+"""The height of the ground, and rays against it (compiled by numba; see `bodycast` on why this is one file)."""
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+GROUND = -2  # owner of what the ground returns
+BANKS_M = 1.5  # how far kerbs and banks may rise above the hills
+RELIEF_STEP_M = 4.0
+RELIEF_HALF_M = 96.0
+NO_RAILS = -1000.0
+ASPHALT, PAVEMENT, VERGE, MARKING, RAIL = range(5)
+
+# Positions of the fields of Ground.shape: what numba reads has no names.
+YAW, BEND, OFFSET, HALF_WIDTH, CROSS_U, CROSS_HALF, CROSS_TILT, KERB, WALK, LANE = range(10)
+BANK_LEFT, BANK_RIGHT, RAILS_V, MEDIAN_HALF, ROUGH, CAMBER = range(10, 16)
+COS_YAW, SIN_YAW, COS_TILT, SIN_TILT = range(16, 20)  # derived, because heights are asked for by the million
+
+
+@numba.njit(cache=True)
+def heights(points: Floats, shape: Floats, relief: Floats, z_m: float) -> Floats:
+    result = np.empty(len(points))
+    for i in range(len(points)):
+        result[i] = ground_height(points[i, 0], points[i, 1], shape, relief, z_m)
+    return result
+
+
+@numba.njit(cache=True, inline="always")
+def road_distances(x: float, y: float, shape: Floats) -> tuple[float, float, float, float, float]:
+    """Road coordinates u, v, then how far outside the main road, the crossing road and either (negative inside)."""
+    cos, sin = shape[COS_YAW], shape[SIN_YAW]
+    u = x * cos + y * sin
+    v = y * cos - x * sin - shape[OFFSET] - 0.5 * shape[BEND] * u * u
+    main = abs(v) - shape[HALF_WIDTH]
+    cross = 1e3
+    if shape[CROSS_HALF] > 0.0:
+        cross = abs((u - shape[CROSS_U]) * shape[COS_TILT] + v * shape[SIN_TILT]) - shape[CROSS_HALF]
+    return u, v, main, cross, min(main, cross)
+
+
+@numba.njit(cache=True)
+def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float) -> float:
+    """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them."""
+    cells = relief.shape[0] - 1
+    row = min(max((x + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
+    col = min(max((y + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
+    i, j = int(row), int(col)
+    a, b = row - i, col - j
+    height = (relief[i, j] * (1 - a) + relief[i + 1, j] * a) * (1 - b)
+    height += (relief[i, j + 1] * (1 - a) + relief[i + 1, j + 1] * a) * b
+    u, v, main, cross, outside = road_distances(x, y, shape)
+    if outside <= 0.0:
+        height += shape[CAMBER] * min(-main, 4.0) if main < 0 else 0.0
+        if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF] and cross > 3.0:
+            height += shape[KERB]
+        rails = abs(abs(v - shape[RAILS_V]) - 0.75)
+        if shape[RAILS_V] > NO_RAILS and rails < 0.06:
+            height += 0.03
+    else:
+        height += shape[KERB] * min(outside / 0.05, 1.0)
+        beyond = outside - shape[WALK]
+        if beyond > 0.0 and cross > 2.0:
+            height += (shape[BANK_LEFT] if v > 0 else shape[BANK_RIGHT]) * min(beyond, 8.0)
+    return z_m + height
+
+
+@numba.njit(cache=True)
+def ground_material(x: float, y: float, shape: Floats) -> int:
+    """Material of the ground at (x, y)."""
+    u, v, main, cross, outside = road_distances(x, y, shape)
+    if outside > 0.0:
+        return VERGE if outside > shape[WALK] else PAVEMENT
+    if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF]:
+        return VERGE
+    if shape[RAILS_V] > NO_RAILS and abs(abs(v - shape[RAILS_V]) - 0.75) < 0.06:
+        return RAIL
+    lane = shape[LANE]
+    if lane > 0.0 and main < 0.0 and cross > 0.0:
+        to_line = abs(v / lane - np.round(v / lane)) * lane
+        if to_line < 0.07 and u - 9.0 * np.floor(u / 9.0) < 4.0:
+            return MARKING
+        if main > -0.32 and main < -0.18:
+            return MARKING
+    return ASPHALT
+
+
+@numba.njit(cache=True)
+def highest_within(relief: Floats) -> Floats:
+    """Highest relief (metres) within each multiple of RELIEF_STEP_M of the car; rays may start below it."""
+    half = relief.shape[0] // 2
+    highest = np.full(2 * half, relief[half, half])
+    for i in range(relief.shape[0]):
+        for j in range(relief.shape[1]):
+            # A lattice point shapes the cells around it, up to 1.5 steps nearer than itself.
+            ring = max(int(np.hypot(i - half, j - half) - 1.5), 0)
+            highest[ring] = max(highest[ring], relief[i, j])
+    for ring in range(1, len(highest)):
+        highest[ring] = max(highest[ring], highest[ring - 1])
+    return highest
+
+
+@numba.njit(cache=True)
+def cast_ground(shape, relief, materials, z_m, sensor, buffers, grass):  # type: ignore[no-untyped-def]
+    """Walk every ray down to the ground and keep the hit where nothing was nearer. Arguments as in `Ground`;
+    `grass` (K,C) in 0..1 says how far below the blades' tips a ray ends."""
+    slope, origin_z, phase, cos_az, sin_az, _, cast_columns, _ = sensor
+    rho, cosine, reflectance, owner, _, _ = buffers
+    highest = highest_within(relief)
+    rough = shape[ROUGH]
+    for k in range(len(slope)):
+        cos_p, sin_p = np.cos(phase[k]), np.sin(phase[k])
+        stretch = np.sqrt(1.0 + slope[k] ** 2)
+        start, ring = 1.5, 0
+        while ring + 1 < len(highest) and origin_z[k] + slope[k] * start > z_m + highest[ring] + BANKS_M:
+            # Up to the far edge of this ring of cells the ray stays above everything.
+            meet = (z_m + highest[ring] + BANKS_M - origin_z[k]) / slope[k] if slope[k] < 0.0 else 1e9
+            start = max(start, min(meet, (ring + 1) * RELIEF_STEP_M))
+            if meet <= (ring + 1) * RELIEF_STEP_M:
+                break
+            ring += 1
+        for j in range(len(cos_az)):
+            if not cast_columns[j]:
+                continue
+            dx = cos_az[j] * cos_p - sin_az[j] * sin_p
+            dy = sin_az[j] * cos_p + cos_az[j] * sin_p
+            limit = min(rho[k, j], 85.0)
+            near, reach, above = start, start, 0.0
+            gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
+            while gap > 0.0 and reach < limit:
+                near, above = reach, gap
+                # Ground steeper than this is a kerb or a bank, which is wider than the step that passes its foot.
+                reach = near + max(gap / (0.22 + max(-slope[k], 0.0)), 0.04 + 0.006 * near)
+                gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
+            if gap > 0.0:
+                continue
+            for _ in range(10):  # false position, halving the weight of an end that stays
+                if reach - near < 0.004 or above <= 0.0:
+                    break
+                middle = near + (reach - near) * above / (above - gap)
+                here = origin_z[k] + slope[k] * middle - ground_height(middle * dx, middle * dy, shape, relief, z_m)
+                if here > 0.0:
+                    near, above, gap = middle, here, 0.5 * gap
+                else:
+                    reach, gap, above = middle, here, 0.5 * above
+                if abs(here) < 0.001:
+                    reach = middle
+                    break
+            if reach >= limit:
+                continue
+            x, y = reach * dx, reach * dy
+            step = 0.05
+            height = origin_z[k] + slope[k] * reach
+            gx = (ground_height(x + step, y, shape, relief, z_m) - height) / step
+            gy = (ground_height(x, y + step, shape, relief, z_m) - height) / step
+            gx, gy = min(max(gx, -3.0), 3.0), min(max(gy, -3.0), 3.0)
+            facing = abs(slope[k] - gx * dx - gy * dy) / (np.sqrt(1.0 + gx * gx + gy * gy) * stretch)
+            material = ground_material(x, y, shape)
+            if material == VERGE:
+                # Blades of grass end the ray before the soil does, and stand up to it.
+                reach -= rough * grass[k, j] ** 2 / max(0.12, abs(slope[k]))
+                facing = max(facing, 0.08)
+                if reach < 1.5:
+                    continue
+            elif material == RAIL:
+                facing = max(facing, 0.3)
+            rho[k, j] = reach
+            owner[k, j] = GROUND
+            cosine[k, j] = min(max(facing, 0.004), 1.0)
+            reflectance[k, j] = materials[material]

@@ -1,0 +1,164 @@
+"""What a scene is made of: triangles and ellipsoids, with the surface that a laser meets.
+
+Vehicles and buildings are triangles; limbs, cushions and foliage are ellipsoids, which a ray meets exactly and
+cheaply. An ellipsoid may be a cloud: a ray goes on through it for an exponentially distributed way.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+BACKGROUND = -1  # owner of everything that is no labelled object
+
+_CUBE_FACES = np.array(
+    [[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7]]  # sides, top; the bottom is never seen
+)
+_QUAD = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+@dataclass(frozen=True)
+class Surface:
+    """How a material answers a laser.
+
+    Attributes:
+        reflectance: 0..1 at normal incidence.
+        gloss: the returned reflectance falls with cos(incidence) ** gloss; 0 is matte.
+        transparency: share of rays that pass through (triangles only).
+        density_per_m: of a cloud (ellipsoids only); 0 is solid.
+    """
+
+    reflectance: float
+    gloss: float = 0.2
+    transparency: float = 0.0
+    density_per_m: float = 0.0
+
+    @property
+    def row(self) -> Floats:
+        """(3,) as triangles carry it."""
+        return np.array([self.reflectance, self.gloss, self.transparency])
+
+
+@dataclass(frozen=True)
+class Primitives:
+    """Triangles (T,3,3) and ellipsoids (E): metres, LiDAR frame once placed."""
+
+    triangles: Floats  # (T,3,3)
+    triangle_surface: Floats  # (T,3) reflectance, gloss, transparency
+    centers: Floats  # (E,3)
+    unit_from_world: Floats  # (E,3,3): |unit_from_world (p - center)| = 1 on the surface
+    ellipsoid_surface: Floats  # (E,3) reflectance, gloss, density per metre
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        if not parts:
+            return cls(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+        return cls(
+            np.concatenate([part.triangles for part in parts]),
+            np.concatenate([part.triangle_surface for part in parts]),
+            np.concatenate([part.centers for part in parts]),
+            np.concatenate([part.unit_from_world for part in parts]),
+            np.concatenate([part.ellipsoid_surface for part in parts]),
+        )
+
+    def placed(self, x_m: float, y_m: float, z_m: float, yaw_rad: float) -> "Primitives":
+        """The same body turned about +z and moved."""
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        shift = np.array([x_m, y_m, z_m])
+        return Primitives(
+            self.triangles @ rotation.T + shift,
+            self.triangle_surface,
+            self.centers @ rotation.T + shift,
+            self.unit_from_world @ rotation.T,
+            self.ellipsoid_surface,
+        )
+
+
+def _only_triangles(triangles: Floats, surface: Floats) -> Primitives:
+    return Primitives(triangles, surface, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+
+
+def quads(corners: npt.ArrayLike, surface: Surface | Floats) -> Primitives:
+    """Flat quadrilaterals: corners (...,4,3) in order around each, one surface for all or a table (...,3) of each
+    one's reflectance, gloss, transparency."""
+    corners = np.asarray(corners, float).reshape(-1, 4, 3)
+    table = surface.row if isinstance(surface, Surface) else surface
+    table = np.broadcast_to(table, (len(corners), 3)) if table.ndim == 1 else table.reshape(-1, 3)
+    return _only_triangles(corners[:, _QUAD].reshape(-1, 3, 3), np.repeat(table, 2, axis=0))
+
+
+def cuboids(rows: npt.ArrayLike) -> Primitives:
+    """Boxes without a bottom: rows (N,10) of x, y, bottom z, length, width, height, yaw and a surface's
+    reflectance, gloss, transparency. 10 triangles each."""
+    rows = np.asarray(rows, float).reshape(-1, 10)
+    half = rows[:, 3:5] / 2
+    sign = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    local = sign[None] * half[:, None]  # (N,4,2)
+    cos, sin = np.cos(rows[:, 6, None]), np.sin(rows[:, 6, None])
+    x = rows[:, 0, None] + local[..., 0] * cos - local[..., 1] * sin
+    y = rows[:, 1, None] + local[..., 0] * sin + local[..., 1] * cos
+    bottom = np.stack([x, y, np.broadcast_to(rows[:, 2, None], x.shape)], axis=-1)
+    top = bottom + np.array([0.0, 0.0, 1.0]) * rows[:, 5, None, None]
+    corners = np.concatenate([bottom, top], axis=1)  # (N,8,3)
+    faces = corners[:, _CUBE_FACES].reshape(-1, 4, 3)
+    return _only_triangles(faces[:, _QUAD].reshape(-1, 3, 3), np.repeat(rows[:, 7:10], 10, axis=0))
+
+
+def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
+    """Upright round posts: rows (N,7) of x, y, bottom z, height, radius at the foot, radius at the top,
+    reflectance. 2 * `sides` triangles each, open at both ends (a lid is thinner than a laser's footprint)."""
+    rows = np.asarray(rows, float).reshape(-1, 7)
+    angle = np.arange(sides) * (2 * np.pi / sides)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    foot = np.concatenate(
+        [rows[:, None, :2] + ring * rows[:, 4, None, None], np.broadcast_to(rows[:, None, 2:3], (len(rows), sides, 1))],
+        axis=-1,
+    )
+    top = np.concatenate(
+        [
+            rows[:, None, :2] + ring * rows[:, 5, None, None],
+            np.broadcast_to((rows[:, 2] + rows[:, 3])[:, None, None], (len(rows), sides, 1)),
+        ],
+        axis=-1,
+    )
+    corners = np.stack([foot, np.roll(foot, -1, 1), np.roll(top, -1, 1), top], axis=2).reshape(-1, 4, 3)
+    surface = np.zeros((len(rows), 3))
+    surface[:, 0], surface[:, 1] = rows[:, 6], 0.3
+    return _only_triangles(corners[:, _QUAD].reshape(-1, 3, 3), np.repeat(surface, 2 * sides, axis=0))
+
+
+def ellipsoids(
+    centers: npt.ArrayLike, radii: npt.ArrayLike, surface: Floats, axes: npt.ArrayLike | None = None
+) -> Primitives:
+    """Ellipsoids: centers (E,3), radii (E,3) along the rows of `axes` (E,3,3; default: x, y, z),
+    surface (E,3) of reflectance, gloss, density per metre (0 is solid)."""
+    centers = np.asarray(centers, float).reshape(-1, 3)
+    radii = np.asarray(radii, float).reshape(-1, 3)
+    turned = np.broadcast_to(np.eye(3), (len(centers), 3, 3)) if axes is None else np.asarray(axes, float)
+    return Primitives(
+        np.zeros((0, 3, 3)), np.zeros((0, 3)), centers, turned / radii[:, :, None], surface.reshape(-1, 3)
+    )
+
+
+def limbs(
+    start: npt.ArrayLike, end: npt.ArrayLike, radii: npt.ArrayLike, surface: Floats, side: tuple[float, float, float]
+) -> Primitives:
+    """Long ellipsoids from `start` to `end` (N,3), with radii (N,2): along `side` and across it."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    radii = np.asarray(radii, float)
+    along = end - start
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = along / length
+    sideways = np.asarray(side) - along * (along @ np.asarray(side))[:, None]
+    # A limb that points sideways itself needs another second axis.
+    flat = np.linalg.norm(sideways, axis=1) < 0.2
+    sideways[flat] = np.cross(along[flat], (0.0, 0.0, 1.0)) + 1e-9
+    sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+    axes = np.stack([along, sideways, np.cross(along, sideways)], axis=1)
+    # Joints overlap, so that a body has no gaps where its ellipsoids taper.
+    half = length[:, 0] / 2 + 0.5 * radii.mean(axis=1)
+    return ellipsoids((start + end) / 2, np.column_stack([half, radii]), surface, axes)

@@ -1,0 +1,191 @@
+"""One random street: its ground, its objects, its background, its camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from asca_pillars.data.kitti import Calibration
+
+from .background import Background
+from .config import SceneConfig
+from .ground import Ground, draw_relief, street
+from .groundcast import NO_RAILS
+from .placement import Occupied, Placer, Target
+from .primitives import BACKGROUND, Primitives
+from .raycast import Bodies
+from .shapes import people, vehicles
+
+EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 2.6
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A street before it is scanned. LiDAR frame, metres."""
+
+    ground: Ground
+    targets: tuple[Target, ...]
+    background: Primitives
+    calibration: Calibration
+
+
+def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
+    """A random street with everything on it."""
+    shares = np.array([config.residential, config.urban, config.rural, config.campus])
+    kind = ("residential", "urban", "rural", "campus")[int(rng.choice(4, p=shares / shares.sum()))]
+    ground = _draw_ground(config, rng, kind)
+    occupied = Occupied()
+    occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
+    placer = Placer(rng, config, ground, occupied, kind)
+    if rng.random() >= config.empty_share:
+        for name, rate in _rates(config, kind):
+            for ahead in (True, False):
+                # A gamma-distributed rate makes the counts negative binomial.
+                for _ in range(rng.poisson(rate * rng.gamma(config.dispersion) / config.dispersion)):
+                    placer.place(name, ahead)
+    background = Background(rng, config, ground, occupied, kind)
+    background.line_street()
+    background.scatter()
+    return Scene(ground, tuple(placer.targets), background.primitives(), draw_calibration(rng))
+
+
+def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
+    """Mean numbers ahead for a kind of street; large objects come first, while there is room for them."""
+    car, people_, bike = {
+        "residential": (1.15, 0.75, 0.9), "urban": (1.0, 1.5, 1.2), "rural": (0.7, 0.25, 0.7), "campus": (0.8, 1.9, 1.4),
+    }[kind]  # fmt: skip
+    return (
+        ("Tram", config.trams * (3.0 if kind == "urban" else 0.2)),
+        ("Truck", config.trucks),
+        ("Van", config.vans),
+        ("Misc", config.misc),
+        ("Car", config.cars * car),
+        ("Cyclist", config.cyclists * bike),
+        ("Pedestrian", config.pedestrians * people_),
+        ("Person_sitting", config.sitting * people_),
+    )
+
+
+def _draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Ground:
+    half = float(
+        rng.uniform(*{"residential": (2.7, 4.3), "urban": (3.6, 8.0), "rural": (3.2, 8.0), "campus": (2.5, 6.0)}[kind])
+    )
+    lanes = max(int(half // 3.1), 1)
+    width = half / lanes
+    # The car keeps to a right-hand lane; the road's middle is then to its left.
+    offset = (int(rng.integers(lanes)) + 0.5) * width + rng.normal(0.0, 0.25)
+    junction = rng.random() < config.junction_share
+    kerb = 0.0 if rng.random() < 0.12 else float(rng.uniform(0.03, 0.17))
+    rails = rng.random() < config.rails_share
+    numbers = street(
+        yaw_rad=rng.normal(0.0, config.heading_error_sigma_rad) + (rng.uniform(-0.5, 0.5) if rng.random() < 0.12 else 0),
+        bend_per_m=rng.normal(0.0, config.bend_sigma_per_m),
+        offset_m=offset,
+        half_width_m=half,
+        cross_u_m=rng.uniform(-30.0, 55.0),
+        cross_half_m=rng.uniform(2.5, 6.0) if junction else 0.0,
+        cross_tilt_rad=rng.normal(0.0, 0.12),
+        kerb_m=kerb,
+        pavement_m=rng.uniform(*{"residential": (1.0, 3.0), "urban": (2.0, 5.0), "rural": (0.3, 2.0), "campus": (1.0, 5.0)}[kind]),
+        lane_m=width if kind in ("urban", "rural") and rng.random() < 0.8 else 0.0,
+        bank_left=_bank(config, rng, kind),
+        bank_right=_bank(config, rng, kind),
+        rails_v_m=rng.uniform(-0.3, 0.9) * half if rails else NO_RAILS,
+        median_half_m=rng.uniform(0.4, 1.5) if half > 6.0 and rng.random() < 5 * config.median_share else 0.0,
+        rough_m=rng.uniform(*config.grass_m),
+        camber=rng.uniform(0.0, 0.02),
+    )  # fmt: skip
+    asphalt = float(np.clip(rng.normal(0.26, 0.06), 0.12, 0.45))
+    reflectance = np.array(
+        [asphalt, asphalt * rng.uniform(0.85, 1.25), rng.uniform(0.22, 0.42), asphalt * rng.uniform(1.2, 1.9), 0.15]
+    )
+    slope = (rng.normal(*config.slope_x), rng.normal(*config.slope_y))
+    relief = draw_relief(rng, slope, rng.uniform(*config.relief_m))
+    return Ground(numbers, relief, reflectance, -float(rng.uniform(*config.sensor_height_m)))
+
+
+def _bank(config: SceneConfig, rng: np.random.Generator, kind: str) -> float:
+    """Slope of the ground beyond the pavement: mostly slight, steep beside some country roads."""
+    slope = float(rng.uniform(*config.bank_slope))
+    return slope if rng.random() < (0.5 if kind == "rural" else 0.1) else 0.15 * slope
+
+
+def draw_calibration(rng: np.random.Generator) -> Calibration:
+    """A camera like one of KITTI's four recording days, a little shaken."""
+    f, cx, cy, shift, pitch = (
+        (707.05, 604.08, 180.51, (-0.025, -0.061, -0.332), -0.001),
+        (721.54, 609.56, 172.85, (-0.004, -0.076, -0.272), 0.0148),
+        (718.34, 600.39, 181.51, (-0.007, -0.063, -0.267), 0.008),
+        (718.86, 607.19, 185.22, (-0.014, -0.055, -0.292), 0.008),
+    )[int(rng.choice(4, p=(0.12, 0.76, 0.07, 0.05)))]
+    p2 = np.array([[f, 0, cx, 44.9], [0, f, cy, 0.2], [0, 0, 1, 0.003]], float)
+    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)
+    tilt = np.array([rng.normal(pitch, 0.002), rng.normal(0.0, 0.004), rng.normal(0.0, 0.003)])
+    rotation = _rotation(tilt) @ axes
+    r0_rect = _rotation(np.array([-0.0043, -0.0074, -0.0099]))
+    return Calibration(p2, r0_rect, np.column_stack([rotation, shift]))
+
+
+def _rotation(turns: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Rotation about the camera's x, y and z axes, in this order."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(turns), np.sin(turns)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Primitives:
+    """The body of an object, placed: a little smaller than its label box, as KITTI's labels are loose."""
+    x, y, z, length, width, height, yaw = target.box
+    name = target.type
+    if name == "Car":
+        styles = vehicles.CAR_STYLES if height < 1.68 else ((vehicles.SUV, 0.45), (vehicles.MINIVAN, 0.55))
+        weights = np.array([weight for _, weight in styles])
+        profile = styles[int(rng.choice(len(styles), p=weights / weights.sum()))][0]
+        body = vehicles.car_body(rng, length - 0.08, width - 0.06, height - 0.07, profile, config.dark_paint_share)
+    elif name == "Van":
+        profile = vehicles.MINIVAN if height < 2.0 and rng.random() < 0.7 else vehicles.VAN
+        body = vehicles.car_body(rng, length - 0.08, width - 0.08, height - 0.08, profile, 0.2)
+    elif name == "Truck":
+        bus = rng.random() < 0.15
+        body = (vehicles.bus_body if bus else vehicles.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
+    elif name == "Tram":
+        body = vehicles.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
+    elif name == "Misc":
+        body = vehicles.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
+    elif name == "Pedestrian":
+        body = people.pedestrian_body(rng, height - 0.05, width, length)
+    elif name == "Person_sitting":
+        body = people.sitting_body(rng, height - 0.05)
+    else:
+        body = people.cyclist_body(rng, height - 0.08, width, length - 0.04)
+    return body.placed(x, y, z - height / 2, yaw)
+
+
+def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: float) -> Bodies:
+    """Primitives of a scene. Objects whose azimuth is beyond `within_rad` of straight ahead are left out;
+    the chance of the others does not change by that."""
+    parts, owners, salts, blob_owners, blob_salts = [scene.background], [], [], [], []
+    background = scene.background
+    owners.append(np.full(len(background.triangles), BACKGROUND))
+    salts.append(np.arange(len(background.triangles)))
+    blob_owners.append(np.full(len(background.centers), BACKGROUND))
+    blob_salts.append(len(background.triangles) + np.arange(len(background.centers)))
+    for index, target in enumerate(scene.targets):
+        distance = float(np.hypot(*target.box[:2]))
+        reach = np.pi if distance < target.box[3] else np.arctan(0.6 * target.box[3] / distance)
+        if abs(np.arctan2(target.box[1], target.box[0])) > within_rad + reach:
+            continue
+        body = body_of(target, config, np.random.default_rng([*seed, 1, index]))
+        first = 10_000_000 + index * 10_000
+        parts.append(body)
+        owners.append(np.full(len(body.triangles), index))
+        salts.append(first + np.arange(len(body.triangles)))
+        blob_owners.append(np.full(len(body.centers), index))
+        blob_salts.append(first + 8000 + np.arange(len(body.centers)))
+    return Bodies(
+        Primitives.join(parts),
+        np.concatenate(owners).astype(np.int64), np.concatenate(salts).astype(np.int64),
+        np.concatenate(blob_owners).astype(np.int64), np.concatenate(blob_salts).astype(np.int64),
+    )  # fmt: skip

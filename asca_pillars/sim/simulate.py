@@ -1,0 +1,131 @@
+"""Writing simulated frames in KITTI's layout."""
+
+import multiprocessing
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from rich.progress import track
+
+from asca_pillars.data.kitti import (
+    Calibration,
+    KittiObject,
+    KittiSplit,
+    in_image,
+    write_calibration,
+    write_image_set,
+    write_labels,
+)
+from asca_pillars.files import atomic_path
+
+from .config import SceneConfig
+from .labels import make_labels
+from .raycast import cast
+from .returns import measure
+from .scene import build, draw_scene
+from .sensor import Lidar, draw_firings
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """What to simulate.
+
+    Attributes:
+        field_of_view: "full" is a whole revolution like KITTI's files; "camera" keeps only what the camera sees,
+            casts a quarter of the rays and gives the same labels and the same points there.
+    """
+
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    lidar: Lidar = field(default_factory=Lidar)
+    field_of_view: Literal["full", "camera"] = "full"
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One labelled scan: points (N,4) float32 x, y, z metres in the LiDAR frame and reflectance 0..1."""
+
+    points: npt.NDArray[np.float32]
+    objects: list[KittiObject]
+    calibration: Calibration
+
+
+def simulate_frame(seed: int, index: int, config: SimulationConfig | None = None) -> Frame:
+    """Frame `index` of the data set `seed`: the same for every call, whatever other frames are made."""
+    config = config or SimulationConfig()
+    camera_only = config.field_of_view == "camera"
+    scene = draw_scene(config.scene, np.random.default_rng([seed, index, 0]))
+    firings = draw_firings(config.lidar, np.random.default_rng([seed, index, 2]), camera_only)
+    half_angle = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0)
+    bodies = build(scene, config.scene, (seed, index), half_angle if camera_only else np.pi)
+    noise = np.random.default_rng([seed, index, 3])
+    key = int(noise.integers(1 << 62))
+    hits = cast(bodies, len(scene.targets), scene.ground, firings, key)
+    returns = measure(hits, firings, noise)
+    objects = make_labels(scene.targets, hits, returns, scene.calibration, config.scene)
+    points = returns.points
+    if camera_only:
+        points = points[in_image(points, scene.calibration)]
+    return Frame(np.ascontiguousarray(points), objects, scene.calibration)
+
+
+def simulate(
+    out: str | Path,
+    frames: int,
+    seed: int = 0,
+    workers: int = 1,
+    config: SimulationConfig | None = None,
+    val_share: float = 0.1,
+    progress: bool = True,
+) -> Path:
+    """Write `frames` labelled frames below `out` in KITTI's layout; returns `out`.
+
+    training/{velodyne,label_2,calib}/000000.* and ImageSets/{train,val}.txt; the last `val_share` of the frames is
+    for validation. A frame depends on `seed` and its number alone: any number of workers writes the same bytes, and
+    a run that was interrupted goes on where it stopped: frames whose three files are there are left alone, so
+    use a new folder for another seed or configuration.
+    """
+    root = Path(out)
+    config = config or SimulationConfig()
+    split = KittiSplit(root)
+    todo = [index for index in range(frames) if not _is_complete(split, index)]
+    job = partial(_write_frame, root, seed, config)
+    if workers > 1 and len(todo) > 1:
+        # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
+        with multiprocessing.get_context("spawn").Pool(min(workers, len(todo))) as pool:
+            _watch(pool.imap_unordered(job, todo, chunksize=4), len(todo), progress)
+    else:
+        _watch(map(job, todo), len(todo), progress)
+    names = [frame_id(index) for index in range(frames)]
+    first_val = frames - round(frames * val_share)
+    write_image_set(root, "train", names[:first_val])
+    write_image_set(root, "val", names[first_val:])
+    return root
+
+
+def frame_id(index: int) -> str:
+    """KITTI's name of a frame: six digits."""
+    return f"{index:06d}"
+
+
+def _watch(results, total: int, progress: bool) -> None:  # type: ignore[no-untyped-def]
+    for _ in track(results, "Simulating", total=total, disable=not progress):
+        pass
+
+
+def _is_complete(split: KittiSplit, index: int) -> bool:
+    """The scan is written last: where it is, the frame is complete."""
+    return split.scan_path(frame_id(index)).exists()
+
+
+def _write_frame(root: Path, seed: int, config: SimulationConfig, index: int) -> None:
+    split, name = KittiSplit(root), frame_id(index)
+    frame = simulate_frame(seed, index, config)
+    write_calibration(split.calib_path(name), frame.calibration)
+    write_labels(split.label_path(name), frame.objects)
+    with atomic_path(split.scan_path(name)) as temporary:
+        frame.points.tofile(temporary)
