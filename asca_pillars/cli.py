@@ -1,0 +1,172 @@
+"""The command `asca`: thin, and each command imports what it needs when it runs, so that --help is instant."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from asca_pillars import __version__
+from asca_pillars.errors import AscaError
+
+app = typer.Typer(
+    help="LiDAR 3D detection: boxes from a point cloud on an ordinary CPU, and the pipeline that trains the model.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Bundle = Annotated[
+    Path | None,
+    typer.Option("--bundle", "-b", help="Model bundle (folder). Default: the one that comes with asca."),
+]
+ProviderName = Annotated[
+    str, typer.Option(help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")
+]
+Threads = Annotated[
+    int | None, typer.Option(help="CPU threads. Default: the physical cores granted to the process.")
+]
+
+
+def main() -> None:
+    """Run the command; what the user can mend is one line on stderr and exit code 2."""
+    try:
+        app()
+    except AscaError as error:
+        print(f"asca: {error}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"asca: {where}{error.strerror or error}", file=sys.stderr)
+        sys.exit(2)
+
+
+@app.callback(invoke_without_command=True)
+def _version(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+) -> None:
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def detect(
+    scans: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A scan (.bin .npy .pcd .ply) or a folder of them. Default: the sample that comes with asca."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and KITTI text.")] = Path(
+        "detections"
+    ),
+    bundle: Bundle = None,
+    score: Annotated[
+        float | None,
+        typer.Option(help="Report detections from this score on. Default: the bundle's, per class."),
+    ] = None,
+    provider: ProviderName = "cpu",
+    threads: Threads = None,
+) -> None:
+    """Find cars, pedestrians and cyclists; write a bird's-eye picture and a KITTI text file per scan."""
+    from asca_pillars.commands.detect import run
+
+    run(scans, out, bundle, score, provider, threads)
+
+
+@app.command()
+def bench(
+    scans: Annotated[
+        Path | None, typer.Argument(help="A scan or a folder of them. Default: the sample.")
+    ] = None,
+    bundle: Bundle = None,
+    provider: ProviderName = "cpu",
+    threads: Threads = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Timed passes over the scans.")] = 30,
+    json: Annotated[Path | None, typer.Option("--json", help="Also write the report to this file.")] = None,
+) -> None:
+    """Time every stage from points to boxes: p50, p95, FPS, cold start, memory, and the machine it ran on."""
+    from asca_pillars.commands.bench import run
+
+    run(scans, bundle, provider, threads, rounds, json)
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Argument(help="Folder for the KITTI-layout dataset.")],
+    frames: Annotated[int, typer.Option("--frames", "-n", min=1, help="Frames to write.")] = 100,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Same seed, same bytes, whatever the number of workers.")
+    ] = 0,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+    view: Annotated[
+        str,
+        typer.Option(
+            help="full: 360 degrees, as KITTI stores scans; camera: only what the camera sees, 6x smaller."
+        ),
+    ] = "full",
+    val_share: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of the frames listed in ImageSets/val.txt.")
+    ] = 0.1,
+) -> None:
+    """Write simulated street scans with labels in KITTI's layout."""
+    from asca_pillars.commands.simulate import run
+
+    run(out, frames, seed, workers, view, val_share)
+
+
+@app.command()
+def train(
+    config: Annotated[Path, typer.Argument(help="YAML of the model and its recipe; configs/ holds some.")],
+    data: Annotated[
+        Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder of the run; an interrupted run there is resumed.")
+    ],
+    override: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20"
+        ),
+    ] = None,
+    devices: Annotated[str, typer.Option(help="Devices on this machine: a number or auto.")] = "auto",
+    num_nodes: Annotated[
+        int, typer.Option(min=1, help="Machines that train together (torchrun or SLURM starts each).")
+    ] = 1,
+) -> None:
+    """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder."""
+    from asca_pillars.commands.train import run
+
+    run(config, data, out, override or [], devices, num_nodes)
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[Path, typer.Argument(help="RUN/checkpoints/best.ckpt or last.ckpt.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the bundle.")],
+    scans: Annotated[
+        Path | None,
+        typer.Option(help="Scans like those trained on, to prove parity on. Default: 8 simulated ones."),
+    ] = None,
+    trained_on: Annotated[
+        str, typer.Option(help="What the weights have seen, for the manifest.")
+    ] = "not stated",
+) -> None:
+    """Export to ONNX and prove on scans that the bundle is the same detector; fails if it is not."""
+    from asca_pillars.commands.export import run
+
+    run(checkpoint, out, scans, trained_on)
+
+
+@app.command()
+def doctor() -> None:
+    """Say what is installed, what can run here, and what to install for the rest."""
+    from asca_pillars.commands.doctor import run
+
+    run()
+
+
+if __name__ == "__main__":
+    main()

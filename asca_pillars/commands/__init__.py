@@ -1,0 +1,1 @@
+"""What each `asca` command does, one module per command."""

@@ -1,0 +1,19 @@
+"""`asca train`: a YAML and a dataset in, a run's folder out."""
+
+from pathlib import Path
+
+from rich.console import Console
+
+from asca_pillars.commands.extras import require
+
+
+def run(config: Path, data: Path, out: Path, overrides: list[str], devices: str, num_nodes: int) -> None:
+    """See `asca train --help`."""
+    from asca_pillars.config import load_config
+
+    settings = load_config(config, overrides)
+    require("train")
+    from asca_pillars.training import train
+
+    last = train(settings, data, out, devices=devices, num_nodes=num_nodes)
+    Console().print(f"Trained: {last}\nNext: asca export {last} -o {out / 'bundle'}")

@@ -1,0 +1,109 @@
+"""A checkpoint becomes a bundle, or a clear refusal."""
+
+import dataclasses
+import datetime
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from asca_deploy.bundle import (
+    BACKBONE,
+    ENCODER,
+    SCHEMA_VERSION,
+    Bundle,
+    Graphs,
+    Provenance,
+    write_bundle_manifest,
+)
+from asca_deploy.detector import Detector
+from asca_deploy.input_check import expected_input
+from asca_deploy.layout import layout_of
+from asca_export.graphs import export_backbone, export_encoder
+from asca_export.parity import prove_parity
+from asca_pillars.config import Config
+from asca_pillars.environment import git_revision, package_versions
+from asca_pillars.errors import ExportError
+from asca_pillars.files import atomic_directory
+from asca_pillars.machine import cpu_model
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.schema import to_dict
+
+MIN_SCANS = 8
+LICENSE = "Apache-2.0"
+
+
+def export_bundle(
+    checkpoint: Checkpoint,
+    out: str | Path,
+    scans: Sequence[NDArray[np.float32]],
+    *,
+    trained_on: str = "not stated",
+    command: str = "not stated",
+) -> Bundle:
+    """Write the two graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
+
+    Nothing appears at `out` unless the proof holds; a bundle that stood there stays until then.
+
+    Args:
+        checkpoint: from `load_checkpoint`.
+        out: the bundle's folder.
+        scans: at least MIN_SCANS scans (N, 4) like those trained on; the runtime later warns of scans unlike them.
+        trained_on: what the weights have seen, in words, for the manifest.
+        command: the command that trained them.
+
+    Raises:
+        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
+    """
+    if len(scans) < MIN_SCANS:
+        raise ExportError(
+            f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans"
+        )
+    config, detector, steps = checkpoint
+    with atomic_directory(out) as folder:
+        export_encoder(detector, folder / ENCODER)
+        export_backbone(detector, folder / BACKBONE)
+        for name in (ENCODER, BACKBONE):
+            _stamp(folder / name, config)
+        draft = Bundle(
+            name=config.name,
+            spec=config.detector,
+            cpa=config.network.cpa,
+            channels=config.network.pillar_channels,
+            graphs=Graphs.of(folder),
+            parity=None,
+            expected_input=expected_input(scans),
+            provenance=Provenance(
+                command=command,
+                created=datetime.datetime.now(datetime.UTC).date().isoformat(),
+                git_revision=git_revision(),
+                trained_on=trained_on,
+                seed=config.train.seed,
+                steps=steps,
+                versions=package_versions(),
+                machine=cpu_model(),
+            ),
+            license=LICENSE,
+        )
+        write_bundle_manifest(folder, draft)
+        bundle = dataclasses.replace(draft, parity=prove_parity(detector, Detector(folder), scans))
+        write_bundle_manifest(folder, bundle)
+    return bundle
+
+
+def _stamp(path: Path, config: Config) -> None:
+    """Repeat the manifest's essentials in the graph's own metadata, for whoever meets the file alone."""
+    essentials = {
+        "schema_version": SCHEMA_VERSION,
+        "name": config.name,
+        "cpa": config.network.cpa,
+        "license": LICENSE,
+        "spec": to_dict(config.detector),
+        "layout": layout_of(config.detector),
+    }
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in essentials.items()})
+    onnx.save(model, path)

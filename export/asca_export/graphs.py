@@ -1,0 +1,110 @@
+"""PyTorch modules -> the two ONNX graphs of a bundle. The scatter between them is not exported: it is an assignment."""
+
+import logging
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+from onnxscript import opset20 as op
+from torch import Tensor, nn
+
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.geometry.pillarize import FEATURES
+from asca_pillars.models.detector import PillarDetector
+
+OPSET = 20
+LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
+
+
+def export_encoder(detector: PillarDetector, path: Path) -> None:
+    """Write encoder.onnx: features (M, 9), pillar_index (M,), point_counts (P,) -> pillar_features (P, C).
+
+    M and P are dynamic. The `paper` reading takes P up to the limit that it was trained with.
+    """
+    points, pillars = 24, 6  # sizes of the example that the tracer sees; neither is kept
+    point_counts = torch.full((pillars,), points // pillars)
+    example = (
+        torch.rand(points, len(FEATURES)),
+        torch.arange(pillars).repeat_interleave(point_counts),
+        point_counts,
+    )
+    rows, cells = torch.export.Dim("points"), torch.export.Dim("pillars")
+    _export(
+        _Encoder(detector.encode),
+        example,
+        path,
+        input_names=["features", "pillar_index", "point_counts"],
+        output_names=["pillar_features"],
+        dynamic_shapes=({0: rows}, {0: rows}, {0: cells}),
+    )
+
+
+def export_backbone(detector: PillarDetector, path: Path) -> None:
+    """Write backbone.onnx: canvas (1, C, ny, nx) -> scores, boxes, directions, as `SSDHead` returns them."""
+    grid, channels = detector.grid, detector.encode.linear.out_features
+    _export(
+        _Backbone(detector),
+        (torch.zeros(1, channels, grid.ny, grid.nx),),
+        path,
+        input_names=["canvas"],
+        output_names=list(HeadMaps._fields),
+    )
+
+
+def _export(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)  # it reports every torchvision operator that is not installed
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch about torch
+            program = torch.onnx.export(
+                module.eval(),
+                tuple(example),
+                dynamo=True,
+                opset_version=OPSET,
+                custom_translation_table={torch.ops.asca.pillar_max.default: _scatter_max},
+                verbose=False,
+                **names,
+            )
+    finally:
+        logger.setLevel(level)
+    assert program is not None
+    model = program.model_proto
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, path)
+
+
+class _Encoder(nn.Module):
+    """One frame's encoder, with the three inputs that the runtime feeds."""
+
+    def __init__(self, encode: nn.Module) -> None:
+        super().__init__()
+        self.encode = encode
+
+    def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+        encoded: Tensor = self.encode(features, pillar_index, point_counts)
+        return encoded
+
+
+class _Backbone(nn.Module):
+    """Neck and head as one graph."""
+
+    def __init__(self, detector: PillarDetector) -> None:
+        super().__init__()
+        self.neck, self.head = detector.neck, detector.head
+
+    def forward(self, canvas: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return tuple(self.head(self.neck(canvas)))
+
+
+def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:
+    """`models.encoder.pillar_max` in ONNX: ScatterND with a max is the fast one of the forms that exist."""
+    shape = op.Concat(op.Shape(point_counts), op.Shape(features, start=1), axis=0)
+    lowest = op.Expand(op.Constant(value_float=LOWEST), shape)
+    return op.ScatterND(
+        lowest, op.Unsqueeze(pillar_index, op.Constant(value_ints=[1])), features, reduction="max"
+    )
