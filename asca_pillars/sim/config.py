@@ -1,6 +1,8 @@
 """What the simulator draws at random, and between which bounds. Every number here may be changed by a config file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from asca_pillars.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class SceneConfig:
     campus: float = 0.12
     junction_share: float = 0.45
     rails_share: float = 0.07
-    median_share: float = 0.10
+    median_share: float = 0.4  # of the wide streets
+    turning_share: float = 0.12  # the car stands at up to half a radian to the street
 
     sensor_height_m: tuple[float, float] = (1.66, 1.80)
     heading_error_sigma_rad: float = 0.035  # of the car in its lane
@@ -46,7 +49,7 @@ class SceneConfig:
     grass_m: tuple[float, float] = (0.02, 0.16)
 
     clutter: tuple[float, float] = (10.0, 45.0)  # posts, signs, bins, shrubs and the like per 100 m of street
-    crown_density_per_m: tuple[float, float] = (0.25, 2.2)
+    crown_density_per_m: tuple[float, float] = (0.15, 1.8)
     dark_paint_share: float = 0.45
 
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
@@ -54,3 +57,15 @@ class SceneConfig:
     min_visible_share: float = 0.06
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+
+    def __post_init__(self) -> None:
+        normal = ("slope_x", "slope_y")  # mean and standard deviation
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, tuple):
+                if item.name not in normal and value[0] > value[1]:
+                    raise ConfigError(f"{item.name} is {value}: the lower bound comes first")
+            elif value < 0:
+                raise ConfigError(f"{item.name} is {value}: it must not be negative")
+        if self.residential + self.urban + self.rural + self.campus <= 0 or self.dispersion <= 0:
+            raise ConfigError("the shares of the kinds of streets must not all be 0, nor the dispersion")

@@ -15,6 +15,7 @@ from .groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M
 
 Floats = npt.NDArray[np.float64]
 
+
 @dataclass(frozen=True)
 class Ground:
     """The surface under one scene.
@@ -80,7 +81,11 @@ class Ground:
 def street(**numbers: float) -> Floats:
     """The `shape` of a Ground from its numbers by name (see the constants above); what is left out is 0 or absent."""
     numbers = {"rails_v_m": NO_RAILS, **numbers}
-    order = ["yaw_rad", "bend_per_m", "offset_m", "half_width_m", "cross_u_m", "cross_half_m", "cross_tilt_rad", "kerb_m", "pavement_m", "lane_m", "bank_left", "bank_right", "rails_v_m", "median_half_m", "rough_m", "camber"]
+    order = (
+        *("yaw_rad", "bend_per_m", "offset_m", "half_width_m", "cross_u_m", "cross_half_m", "cross_tilt_rad"),
+        *("kerb_m", "pavement_m", "lane_m", "bank_left", "bank_right", "rails_v_m", "median_half_m", "rough_m"),
+        "camber",
+    )
     unknown = set(numbers) - set(order)
     if unknown:
         raise TypeError(f"a street has no {sorted(unknown)}")

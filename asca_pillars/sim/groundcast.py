@@ -21,6 +21,7 @@ COS_YAW, SIN_YAW, COS_TILT, SIN_TILT = range(16, 20)  # derived, because heights
 
 @numba.njit(cache=True)
 def heights(points: Floats, shape: Floats, relief: Floats, z_m: float) -> Floats:
+    """`ground_height` of many points (N,2)."""
     result = np.empty(len(points))
     for i in range(len(points)):
         result[i] = ground_height(points[i, 0], points[i, 1], shape, relief, z_m)
@@ -50,7 +51,7 @@ def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float)
     a, b = row - i, col - j
     height = (relief[i, j] * (1 - a) + relief[i + 1, j] * a) * (1 - b)
     height += (relief[i, j + 1] * (1 - a) + relief[i + 1, j + 1] * a) * b
-    u, v, main, cross, outside = road_distances(x, y, shape)
+    _, v, main, cross, outside = road_distances(x, y, shape)
     if outside <= 0.0:
         height += shape[CAMBER] * min(-main, 4.0) if main < 0 else 0.0
         if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF] and cross > 3.0:

@@ -13,13 +13,13 @@ import numpy.typing as npt
 
 from .bodycast import cast_ellipsoids, cast_triangles
 from .ground import Ground
-from .groundcast import GROUND, cast_ground
-from .primitives import BACKGROUND, Primitives
+from .groundcast import cast_ground
+from .primitives import Primitives
 from .sensor import Firings
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-NOTHING = -3  # owners of a hit besides an object's index and BACKGROUND
+NOTHING = -3  # owner of a firing that met nothing
 
 
 class Hits(NamedTuple):

@@ -7,16 +7,28 @@ import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
 
-from .background import Background
+from .builder import Builder
+from .clutter import scatter
 from .config import SceneConfig
 from .ground import Ground, draw_relief, street
 from .groundcast import NO_RAILS
 from .placement import Occupied, Placer, Target
 from .primitives import BACKGROUND, Primitives
 from .raycast import Bodies
+from .roadside import line_streets
 from .shapes import people, vehicles
 
 EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 2.6
+KINDS = ("residential", "urban", "rural", "campus")
+HALF_WIDTH_M = {"residential": (2.7, 4.3), "urban": (3.6, 8.0), "rural": (3.2, 8.0), "campus": (2.5, 6.0)}
+# Of cars, of people on foot and of cyclists.
+RATE_FACTORS = {
+    "residential": (1.15, 0.75, 0.9),
+    "urban": (1.0, 1.5, 1.2),
+    "rural": (0.7, 0.25, 0.7),
+    "campus": (0.8, 1.9, 1.4),
+}
+PAVEMENT_M = {"residential": (1.0, 3.0), "urban": (2.0, 5.0), "rural": (0.3, 2.0), "campus": (1.0, 5.0)}
 
 
 @dataclass(frozen=True)
@@ -32,7 +44,7 @@ class Scene:
 def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
     """A random street with everything on it."""
     shares = np.array([config.residential, config.urban, config.rural, config.campus])
-    kind = ("residential", "urban", "rural", "campus")[int(rng.choice(4, p=shares / shares.sum()))]
+    kind = KINDS[int(rng.choice(4, p=shares / shares.sum()))]
     ground = _draw_ground(config, rng, kind)
     occupied = Occupied()
     occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
@@ -43,17 +55,15 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
                 # A gamma-distributed rate makes the counts negative binomial.
                 for _ in range(rng.poisson(rate * rng.gamma(config.dispersion) / config.dispersion)):
                     placer.place(name, ahead)
-    background = Background(rng, config, ground, occupied, kind)
-    background.line_street()
-    background.scatter()
-    return Scene(ground, tuple(placer.targets), background.primitives(), draw_calibration(rng))
+    builder = Builder(rng, config, ground, occupied, kind)
+    line_streets(builder)
+    scatter(builder)
+    return Scene(ground, tuple(placer.targets), builder.primitives(), draw_calibration(rng))
 
 
 def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
     """Mean numbers ahead for a kind of street; large objects come first, while there is room for them."""
-    car, people_, bike = {
-        "residential": (1.15, 0.75, 0.9), "urban": (1.0, 1.5, 1.2), "rural": (0.7, 0.25, 0.7), "campus": (0.8, 1.9, 1.4),
-    }[kind]  # fmt: skip
+    car, walkers, bike = RATE_FACTORS[kind]
     return (
         ("Tram", config.trams * (3.0 if kind == "urban" else 0.2)),
         ("Truck", config.trucks),
@@ -61,15 +71,13 @@ def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
         ("Misc", config.misc),
         ("Car", config.cars * car),
         ("Cyclist", config.cyclists * bike),
-        ("Pedestrian", config.pedestrians * people_),
-        ("Person_sitting", config.sitting * people_),
+        ("Pedestrian", config.pedestrians * walkers),
+        ("Person_sitting", config.sitting * walkers),
     )
 
 
 def _draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Ground:
-    half = float(
-        rng.uniform(*{"residential": (2.7, 4.3), "urban": (3.6, 8.0), "rural": (3.2, 8.0), "campus": (2.5, 6.0)}[kind])
-    )
+    half = float(rng.uniform(*HALF_WIDTH_M[kind]))
     lanes = max(int(half // 3.1), 1)
     width = half / lanes
     # The car keeps to a right-hand lane; the road's middle is then to its left.
@@ -77,8 +85,10 @@ def _draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gr
     junction = rng.random() < config.junction_share
     kerb = 0.0 if rng.random() < 0.12 else float(rng.uniform(0.03, 0.17))
     rails = rng.random() < config.rails_share
+    median = half > 6.0 and rng.random() < config.median_share
+    turning = rng.random() < config.turning_share
     numbers = street(
-        yaw_rad=rng.normal(0.0, config.heading_error_sigma_rad) + (rng.uniform(-0.5, 0.5) if rng.random() < 0.12 else 0),
+        yaw_rad=rng.normal(0.0, config.heading_error_sigma_rad) + (rng.uniform(-0.5, 0.5) if turning else 0.0),
         bend_per_m=rng.normal(0.0, config.bend_sigma_per_m),
         offset_m=offset,
         half_width_m=half,
@@ -86,12 +96,12 @@ def _draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gr
         cross_half_m=rng.uniform(2.5, 6.0) if junction else 0.0,
         cross_tilt_rad=rng.normal(0.0, 0.12),
         kerb_m=kerb,
-        pavement_m=rng.uniform(*{"residential": (1.0, 3.0), "urban": (2.0, 5.0), "rural": (0.3, 2.0), "campus": (1.0, 5.0)}[kind]),
+        pavement_m=rng.uniform(*PAVEMENT_M[kind]),
         lane_m=width if kind in ("urban", "rural") and rng.random() < 0.8 else 0.0,
         bank_left=_bank(config, rng, kind),
         bank_right=_bank(config, rng, kind),
         rails_v_m=rng.uniform(-0.3, 0.9) * half if rails else NO_RAILS,
-        median_half_m=rng.uniform(0.4, 1.5) if half > 6.0 and rng.random() < 5 * config.median_share else 0.0,
+        median_half_m=rng.uniform(0.4, 1.5) if median else 0.0,
         rough_m=rng.uniform(*config.grass_m),
         camber=rng.uniform(0.0, 0.02),
     )  # fmt: skip

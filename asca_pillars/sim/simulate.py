@@ -1,7 +1,11 @@
 """Writing simulated frames in KITTI's layout."""
 
+import contextlib
+import json
 import multiprocessing
-from dataclasses import dataclass, field
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -19,6 +23,7 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
+from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path
 
 from .config import SceneConfig
@@ -85,18 +90,30 @@ def simulate(
     """Write `frames` labelled frames below `out` in KITTI's layout; returns `out`.
 
     training/{velodyne,label_2,calib}/000000.* and ImageSets/{train,val}.txt; the last `val_share` of the frames is
-    for validation. A frame depends on `seed` and its number alone: any number of workers writes the same bytes, and
-    a run that was interrupted goes on where it stopped: frames whose three files are there are left alone, so
-    use a new folder for another seed or configuration.
+    for validation. A frame depends on `seed`, `config` and its number alone: any number of workers writes the same
+    bytes. A run that was interrupted, or asked for fewer frames, goes on where it stopped; simulation.json in the
+    folder tells what it holds.
+
+    Raises:
+        ConfigError: a number of frames or workers below 1, or a share outside 0..1.
+        DatasetError: `out` holds frames of another seed or configuration.
     """
+    if frames < 1 or workers < 1:
+        raise ConfigError(f"frames is {frames} and workers is {workers}; both must be at least 1")
+    if not 0.0 <= val_share <= 1.0:
+        raise ConfigError(f"val_share is {val_share}; it must lie between 0 and 1")
     root = Path(out)
     config = config or SimulationConfig()
+    _claim_folder(root, seed, config)
     split = KittiSplit(root)
     todo = [index for index in range(frames) if not _is_complete(split, index)]
     job = partial(_write_frame, root, seed, config)
     if workers > 1 and len(todo) > 1:
         # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
-        with multiprocessing.get_context("spawn").Pool(min(workers, len(todo))) as pool:
+        with (
+            _one_thread_per_process(),
+            multiprocessing.get_context("spawn").Pool(min(workers, len(todo))) as pool,
+        ):
             _watch(pool.imap_unordered(job, todo, chunksize=4), len(todo), progress)
     else:
         _watch(map(job, todo), len(todo), progress)
@@ -112,7 +129,32 @@ def frame_id(index: int) -> str:
     return f"{index:06d}"
 
 
-def _watch(results, total: int, progress: bool) -> None:  # type: ignore[no-untyped-def]
+def _claim_folder(root: Path, seed: int, config: SimulationConfig) -> None:
+    """Note in simulation.json what the frames of a folder depend on; refuse a folder of other frames."""
+    path = root / "simulation.json"
+    text = json.dumps({"seed": seed, **asdict(config)}, indent=2) + "\n"
+    if not path.exists():
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    elif path.read_text(encoding="utf-8") != text:
+        raise DatasetError(f"{path}: the frames there have another seed or configuration; choose another folder")
+
+
+@contextlib.contextmanager
+def _one_thread_per_process() -> Iterator[None]:
+    """Linear algebra of the processes started inside uses one thread each: the processes are the parallelism."""
+    before = os.environ.get("OPENBLAS_NUM_THREADS")
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["OPENBLAS_NUM_THREADS"]
+        else:
+            os.environ["OPENBLAS_NUM_THREADS"] = before
+
+
+def _watch(results: Iterable[None], total: int, progress: bool) -> None:
     for _ in track(results, "Simulating", total=total, disable=not progress):
         pass
 

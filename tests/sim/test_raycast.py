@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.sim.ground import Ground, draw_relief, street
-from asca_pillars.sim.primitives import BACKGROUND, Primitives, Surface, cuboids, ellipsoids, prisms, quads
 from asca_pillars.sim.groundcast import GROUND
+from asca_pillars.sim.primitives import BACKGROUND, Primitives, Surface, cuboids, ellipsoids, prisms, quads
 from asca_pillars.sim.raycast import NOTHING, Bodies, cast
 from asca_pillars.sim.sensor import Firings, Lidar, draw_firings
 from asca_pillars.sim.shapes.vehicles import SALOON, car_body

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image, objects_3d
+from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import bev_intersection
 from asca_pillars.sim.config import SceneConfig
@@ -33,7 +34,7 @@ def test_the_number_of_workers_does_not_change_a_byte(tmp_path: Path) -> None:
     simulate(tmp_path / "one", 5, seed=3, workers=1, config=CAMERA, val_share=0.4, progress=False)
     simulate(tmp_path / "two", 5, seed=3, workers=2, config=CAMERA, val_share=0.4, progress=False)
     one, two = files(tmp_path / "one"), files(tmp_path / "two")
-    assert len(one) == 5 * 3 + 2
+    assert len(one) == 5 * 3 + 3  # and two lists, and what was simulated
     assert one == two
 
 
@@ -47,6 +48,28 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     simulate(tmp_path / "a", 3, seed=1, config=CAMERA, progress=False)
     assert files(tmp_path / "a") == before
     assert kept.stat().st_mtime_ns == stamp
+
+
+def test_frames_of_another_seed_or_configuration_are_not_mixed(tmp_path: Path) -> None:
+    simulate(tmp_path, 1, seed=1, config=CAMERA, progress=False)
+    with pytest.raises(DatasetError, match=r"simulation\.json.*another folder"):
+        simulate(tmp_path, 2, seed=2, config=CAMERA, progress=False)
+    with pytest.raises(DatasetError, match="another folder"):
+        simulate(tmp_path, 2, seed=1, progress=False)
+    simulate(tmp_path, 2, seed=1, config=CAMERA, progress=False)
+    assert KittiSplit(tmp_path).frame_ids == ("000000", "000001")
+
+
+def test_impossible_wishes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="frames is 0"):
+        simulate(tmp_path / "x", 0)
+    with pytest.raises(ConfigError, match=r"val_share is 1\.5"):
+        simulate(tmp_path / "x", 1, val_share=1.5)
+    with pytest.raises(ConfigError, match="cars is -1"):
+        SceneConfig(cars=-1)
+    with pytest.raises(ConfigError, match="lower bound comes first"):
+        SceneConfig(relief_m=(2.0, 1.0))
+    assert not (tmp_path / "x").exists()
 
 
 def test_written_frames_read_back_as_simulated(tmp_path: Path) -> None:
@@ -157,7 +180,7 @@ def test_nothing_stands_in_anything_else() -> None:
 
 def test_the_shares_of_the_configuration_are_kept() -> None:
     people_only = SceneConfig(
-        cars=0, vans=0, trucks=0, trams=0, misc=0, cyclists=0, sitting=0, empty_share=0.0, pedestrian_uniform_heading=1.0
+        cars=0, vans=0, trucks=0, trams=0, misc=0, cyclists=0, sitting=0, empty_share=0, pedestrian_uniform_heading=1
     )  # fmt: skip
     yaws, count = [], 0
     for index in range(60):

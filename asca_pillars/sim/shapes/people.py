@@ -15,6 +15,16 @@ def _cloth(rng: np.random.Generator, n: int) -> Floats:
     return np.column_stack([value, rng.uniform(0.05, 0.4, n), np.zeros(n)])
 
 
+# From, to, radius sideways, radius across, surface.
+Limb = tuple[npt.ArrayLike, npt.ArrayLike, float, float, Floats]
+
+
+def _jointed(rows: list[Limb]) -> Primitives:
+    starts, ends, sideways, across, surfaces = zip(*rows, strict=True)
+    radii = np.column_stack([sideways, across])
+    return limbs(np.array(starts), np.array(ends), radii, np.array(surfaces), (0.0, 1.0, 0.0))
+
+
 def pedestrian_body(rng: np.random.Generator, height: float, width: float, length: float) -> Primitives:
     """A standing or walking person. `width` bounds the shoulders and arms, `length` the step and the swing."""
     h = height
@@ -23,43 +33,33 @@ def pedestrian_body(rng: np.random.Generator, height: float, width: float, lengt
     phase = rng.choice([-1.0, 1.0])
     lean = rng.normal(0.02, 0.03) * h
     hip, chest, neck = 0.52 * h, 0.80 * h, 0.86 * h
-    upper, lower, cloth = _cloth(rng, 3)
+    upper, lower, shoe = _cloth(rng, 3)
     skin = np.array([rng.uniform(0.3, 0.55), 0.2, 0.0])
-    start, end, radii, surface = [], [], [], []
-
-    def limb(
-        a: tuple[float, float, float], b: tuple[float, float, float], side: float, across: float, s: Floats
-    ) -> None:
-        start.append(a)
-        end.append(b)
-        radii.append((side, across))
-        surface.append(s)
-
     thick = rng.uniform(0.85, 1.2)
-    limb((0, 0, hip), (lean, 0, chest), shoulder * 0.86, 0.115 * thick, upper)
-    limb((lean * 0.8, 0, 0.70 * h), (lean, 0, 0.84 * h), shoulder, 0.10 * thick, upper)
-    limb((0, 0, hip - 0.06 * h), (0, 0, hip + 0.04 * h), 0.16 * thick, 0.12 * thick, lower)
+    rows: list[Limb] = [
+        ((0, 0, hip), (lean, 0, chest), shoulder * 0.86, 0.115 * thick, upper),
+        ((lean * 0.8, 0, 0.70 * h), (lean, 0, 0.84 * h), shoulder, 0.10 * thick, upper),
+        ((0, 0, hip - 0.06 * h), (0, 0, hip + 0.04 * h), 0.16 * thick, 0.12 * thick, lower),
+        ((lean, 0, 0.82 * h), (lean + 0.01, 0, neck), 0.055, 0.06, skin),
+    ]
     for side in (1.0, -1.0):
         forward = stride * phase * side
-        knee_lift = abs(stride) * (0.25 if forward > 0 else 0.05)
+        knee = (0.55 * forward + 0.06 * (forward > 0) + 0.02, side * 0.10, 0.28 * h + 0.02 * (forward > 0))
         foot = (forward, side * 0.09, 0.05)
-        knee = (0.55 * forward + 0.06 * (forward > 0) + 0.02, side * 0.10, 0.28 * h + 0.1 * knee_lift)
-        limb((0, side * 0.09, hip), knee, 0.075 * thick, 0.085 * thick, lower)
-        limb(knee, foot, 0.055 * thick, 0.06 * thick, lower)
-        limb((forward - 0.07, side * 0.09, 0.04), (forward + 0.15, side * 0.10, 0.035), 0.045, 0.04, cloth)
         swing = -0.75 * forward + rng.normal(0.0, 0.04)
         bent = rng.uniform(0.0, 0.22) if rng.random() < 0.7 else rng.uniform(0.2, 0.35)
         top = (lean, side * (shoulder + 0.02), 0.81 * h)
         elbow = (lean + 0.45 * swing - 0.02, side * (shoulder + 0.05), 0.63 * h)
-        hand = (
-            elbow[0] + 0.4 * swing + bent,
-            side * (shoulder + 0.03 - 0.4 * bent * (bent > 0.2)),
-            0.50 * h + 0.5 * bent,
-        )
-        limb(top, elbow, 0.048 * thick, 0.05 * thick, upper)
-        limb(elbow, hand, 0.036 * thick, 0.038 * thick, upper if rng.random() < 0.7 else skin)
-    limb((lean, 0, 0.82 * h), (lean + 0.01, 0, neck), 0.055, 0.06, skin)
-    parts = [limbs(start, end, radii, np.array(surface), (0.0, 1.0, 0.0))]
+        inward = 0.4 * bent * (bent > 0.2)
+        hand = (elbow[0] + 0.4 * swing + bent, side * (shoulder + 0.03 - inward), 0.50 * h + 0.5 * bent)
+        rows += [
+            ((0, side * 0.09, hip), knee, 0.075 * thick, 0.085 * thick, lower),
+            (knee, foot, 0.055 * thick, 0.06 * thick, lower),
+            ((forward - 0.07, side * 0.09, 0.04), (forward + 0.15, side * 0.10, 0.035), 0.045, 0.04, shoe),
+            (top, elbow, 0.048 * thick, 0.05 * thick, upper),
+            (elbow, hand, 0.036 * thick, 0.038 * thick, upper if rng.random() < 0.7 else skin),
+        ]
+    parts = [_jointed(rows)]
     parts.append(ellipsoids([(lean + 0.02, 0, 0.935 * h)], [(0.098, 0.078, 0.066 * h)], np.array([[*skin[:2], 0.0]])))
     if rng.random() < 0.3:  # a skirt or a coat
         parts.append(
@@ -83,21 +83,15 @@ def sitting_body(rng: np.random.Generator, height: float) -> Primitives:
     h = height
     upper, lower = _cloth(rng, 2)
     seat = 0.36 * h
-    start, end, radii, surface = [], [], [], []
-    torso = [((-0.1, 0, seat), (-0.14, 0, 0.78 * h), 0.19, 0.12, upper)]
+    rows: list[Limb] = [((-0.1, 0, seat), (-0.14, 0, 0.78 * h), 0.19, 0.12, upper)]
     for side in (0.11, -0.11):
-        torso += [
+        rows += [
             ((-0.1, side, seat + 0.03), (0.32, side * 1.3, seat + 0.05), 0.08, 0.08, lower),
             ((0.32, side * 1.3, seat + 0.04), (0.34, side * 1.2, 0.06), 0.06, 0.06, lower),
             ((0.28, side * 1.2, 0.05), (0.48, side * 1.3, 0.04), 0.045, 0.04, lower),
             ((-0.12, side * 1.9, 0.76 * h), (0.02, side * 2.1, 0.55 * h), 0.05, 0.05, upper),
             ((0.02, side * 2.1, 0.55 * h), (0.25, side * 1.2, 0.52 * h), 0.04, 0.04, upper),
         ]
-    for a, b, across, deep, cloth in torso:
-        start.append(a)
-        end.append(b)
-        radii.append((across, deep))
-        surface.append(cloth)
     head = ellipsoids([(-0.1, 0, 0.91 * h)], [(0.10, 0.08, 0.09 * h)], np.array([[0.4, 0.2, 0.0]]))
     chair = Surface(0.2, 0.3)
     boards = quads(
@@ -112,7 +106,7 @@ def sitting_body(rng: np.random.Generator, height: float) -> Primitives:
         ],
         chair,
     )
-    return Primitives.join([limbs(start, end, radii, np.array(surface), (0.0, 1.0, 0.0)), head, boards])
+    return Primitives.join([_jointed(rows), head, boards])
 
 
 def bicycle(rng: np.random.Generator, length: float) -> Primitives:
@@ -154,25 +148,25 @@ def cyclist_body(rng: np.random.Generator, height: float, width: float, length: 
     neck = np.array([hips[0] + bend, 0.0, neck_z])
     reach = length / 2 - float(np.clip(0.19 * length, 0.26, 0.35)) - 0.28
     pedal = rng.uniform(0, 2 * np.pi)
-    rows = [(hips - (0, 0, 0.05), neck - (0, 0, 0.04), shoulder, 0.12, upper), (hips - (0.02, 0.0, 0.06), hips + (0.06, 0, 0.08), 0.16, 0.13, lower)]  # fmt: skip
+    rows: list[Limb] = [
+        (hips + np.array([0, 0, -0.05]), neck + np.array([0, 0, -0.04]), shoulder, 0.12, upper),
+        (hips + np.array([-0.02, 0, -0.06]), hips + np.array([0.06, 0, 0.08]), 0.16, 0.13, lower),
+    ]
     for side in (1.0, -1.0):
         turn = pedal + (np.pi if side > 0 else 0.0)
         foot = np.array([-0.08 + 0.17 * np.cos(turn), side * 0.11, 0.30 + 0.17 * np.sin(turn)])
         middle = 0.5 * (hips + foot)
         knee = np.array([middle[0] + 0.24, side * 0.12, middle[2] + 0.08])
         hand = np.array([reach, side * 0.27, 1.05])
-        elbow = 0.5 * (neck + hand) + (-0.04, side * 0.10, -0.06)
+        elbow = 0.5 * (neck + hand) + np.array([-0.04, side * 0.10, -0.06])
         rows += [
-            (hips + (0, side * 0.08, 0), knee, 0.08, 0.085, lower),
+            (hips + np.array([0, side * 0.08, 0]), knee, 0.08, 0.085, lower),
             (knee, foot, 0.058, 0.06, lower),
-            (foot - (0.08, 0, 0), foot + (0.14, 0, 0), 0.045, 0.04, lower),
-            (neck + (0, side * shoulder, -0.05), elbow, 0.05, 0.05, upper),
+            (foot + np.array([-0.08, 0, 0]), foot + np.array([0.14, 0, 0]), 0.045, 0.04, lower),
+            (neck + np.array([0, side * shoulder, -0.05]), elbow, 0.05, 0.05, upper),
             (elbow, hand, 0.038, 0.038, upper),
         ]
-    body = limbs(
-        [r[0] for r in rows], [r[1] for r in rows], [(r[2], r[3]) for r in rows], np.array([r[4] for r in rows]),
-        (0.0, 1.0, 0.0),
-    )  # fmt: skip
+    body = _jointed(rows)
     head = ellipsoids([(neck[0] + 0.05, 0, height - 0.13)], [(0.11, 0.085, 0.125)], skin[None])
     parts = [bike, body, head]
     if rng.random() < 0.25:

@@ -110,7 +110,10 @@ def car_body(
     plan = width / 2 * (1.0 - 0.17 * np.maximum(1 - x / 0.10, 0) ** 2 - 0.12 * np.maximum(1 - (1 - x) / 0.07, 0) ** 2)
     over_belt = np.clip((z_top - belt) / max((1 - profile.belt) * height, 1e-6), 0.0, 1.0)
     roof = plan * (0.93 + (profile.tumble - 0.93) * over_belt)
-    along = (0.5 - x) * length
+    # Bumpers are bowed: their corners stand back from the middle.
+    bow = float(rng.uniform(0.06, 0.2))
+    back = bow * (np.maximum(1 - (1 - x) / 0.08, 0) - np.maximum(1 - x / 0.08, 0))
+    along = (0.5 - x) * length + back
     half = np.stack([0.95 * plan, plan, 0.97 * plan, roof, 0.55 * roof], axis=1)
     high = np.stack([sill, waist, belt, z_top - 0.03 * over_belt, z_top], axis=1)
     section = np.stack([np.broadcast_to(along[:, None], half.shape), half, high], axis=2)  # (S,5,3), left side
@@ -128,18 +131,30 @@ def car_body(
     left = np.stack([section[:-1, :-1], section[1:, :-1], section[1:, 1:], section[:-1, 1:]], axis=2)  # (S-1,4,4,3)
     ridge = section[:, 4]
     lid = np.stack([ridge[:-1], ridge[1:], ridge[1:] * MIRROR, ridge[:-1] * MIRROR], axis=1)
-    ends = section[[0, -1]]
-    caps = np.stack([ends[:, :-1], ends[:, 1:], ends[:, 1:] * MIRROR, ends[:, :-1] * MIRROR], axis=2)  # (2,4,4,3)
-    cap_table = np.broadcast_to(paint.row, (2, 4, 3)).copy()
-    cap_table[:, 0] = trim.row
+    caps, cap_table = _bumpers(section, length, paint, trim)
     floor = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (0.45 * length, 0.45 * width)
     underside = np.column_stack([floor, np.full(4, clearance + 0.08)])
-    corners = [left.reshape(-1, 4, 3), (left * MIRROR).reshape(-1, 4, 3), lid, caps.reshape(-1, 4, 3), underside[None]]
-    surfaces = [table[:, :4].reshape(-1, 3)] * 2 + [table[:, 4], cap_table.reshape(-1, 3), trim.row[None]]
+    corners = [left.reshape(-1, 4, 3), (left * MIRROR).reshape(-1, 4, 3), lid, caps, underside[None]]
+    surfaces = [table[:, :4].reshape(-1, 3)] * 2 + [table[:, 4], cap_table, trim.row[None]]
     parts = [quads(np.concatenate(corners), np.concatenate(surfaces))]
     parts.append(wheels((0.5 - wheel_x) * length, width / 2 - 0.03, wheel_radius, rng))
     parts.append(_details(rng, length, width, height, profile, paint))
     return Primitives.join(parts)
+
+
+def _bumpers(section: Floats, length: float, paint: Surface, trim: Surface) -> tuple[Floats, Floats]:
+    """Front and rear of a body: corners (26,4,3) and surfaces (26,3), bowed from the end sections (5,3) outwards."""
+    corners, table = [], []
+    for outline, x in ((section[0], length / 2), (section[-1], -length / 2)):
+        inner = outline * (0.0, 0.55, 1.0) + (x, 0.0, 0.0)
+        flank = np.stack([outline[:-1], outline[1:], inner[1:], inner[:-1]], axis=1)
+        middle = np.stack([inner[:-1], inner[1:], inner[1:] * MIRROR, inner[:-1] * MIRROR], axis=1)
+        lip = np.stack([outline[-1], inner[-1], inner[-1] * MIRROR, outline[-1] * MIRROR])
+        corners += [flank, flank * MIRROR, middle, lip[None]]
+        surface = np.broadcast_to(paint.row, (13, 3)).copy()
+        surface[[0, 4, 8]] = trim.row  # the lowest strip
+        table.append(surface)
+    return np.concatenate(corners), np.concatenate(table)
 
 
 def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
@@ -164,7 +179,7 @@ def _details(
 ) -> Primitives:
     """Plates (they shine), lamps, mirrors, and seats, headrests and sometimes people behind the glass."""
     plate = min(0.45 * height, 0.75)
-    rows = [
+    rows: list[tuple[float, ...]] = [
         (length / 2 - 0.01, 0, 0.3 * height, 0.03, 0.52, 0.11, 0, 0.95, 0.3, 0),
         (-length / 2 + 0.01, 0, plate - 0.1, 0.03, 0.52, 0.11, 0, 0.95, 0.3, 0),
     ]
@@ -208,9 +223,9 @@ def truck_body(rng: np.random.Generator, length: float, width: float, height: fl
     pane = float(rng.uniform(0.6, 0.95))
     body = (length - cab - gap, -cab / 2 - gap / 2)
     rows = [
-        (front, 0, 0.45, cab, width * 0.96, cab_height * 0.5 - 0.45, 0, paint.reflectance, paint.gloss, 0),
+        (front, 0, 0.45, cab, width * 0.96, cab_height * 0.5 - 0.45, 0, *paint.row),
         (front - 0.05, 0, cab_height * 0.5, cab - 0.1, width * 0.94, cab_height * 0.32, 0, 0.2, 4.0, pane),
-        (front - 0.05, 0, cab_height * 0.82, cab - 0.1, width * 0.94, cab_height * 0.18, 0, paint.reflectance, paint.gloss, 0),
+        (front - 0.05, 0, cab_height * 0.82, cab - 0.1, width * 0.94, cab_height * 0.18, 0, *paint.row),
         (front - 0.6, 0, cab_height * 0.4, 0.4, width * 0.85, cab_height * 0.4, 0, 0.1, 0.4, 0),
         (body[1], 0, bed, body[0], width, load, 0, box.reflectance, min(box.gloss, 1.2), 0),
         (0, 0, 0.7, length - 0.3, 0.9, bed - 0.7, 0, 0.05, 0.5, 0),
@@ -225,12 +240,12 @@ def bus_body(rng: np.random.Generator, length: float, width: float, height: floa
     low = 0.25 if rail else 0.32
     waist, lintel = 0.42 * height, 0.80 * height
     pane = float(rng.uniform(0.5, 0.9))
-    rows = [
+    rows: list[tuple[float, ...]] = [
         (0, 0, low, length, width, waist - low, 0, paint.reflectance, paint.gloss, 0),
         (0, 0, waist, length - 0.06, width - 0.06, lintel - waist, 0, 0.15, 4.0, pane),
         (0, 0, lintel, length, width, height - lintel, 0, paint.reflectance, paint.gloss, 0),
     ]  # fmt: skip
-    for x in np.arange(-length / 2 + 0.1, length / 2, 1.5):
+    for x in np.arange(-length / 2 + 0.1, length / 2 - 0.8, 1.5):
         for sign in (1, -1):
             rows.append((x, sign * (width / 2 - 0.02), waist, 0.12, 0.06, lintel - waist, 0, paint.reflectance, 1.0, 0))
             rows.append((x + 0.7, sign * width * 0.3, waist - 0.2, 0.15, 0.9, 0.75, 0, 0.2, 0.4, 0))

@@ -1,0 +1,145 @@
+"""Collecting the unlabelled bodies of a street as rows of simple shapes, and setting them on the ground at once."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from .config import SceneConfig
+from .ground import Ground
+from .placement import Occupied
+from .primitives import Primitives, cuboids, ellipsoids, prisms
+
+Floats = npt.NDArray[np.float64]
+Material = tuple[float, float, float]  # reflectance, gloss, transparency
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A piece of one side of a road: from `start_m` on for `length_m` along it, `away_m` from its middle.
+
+    `side` is 1 left of the road and -1 right of it; `cross` means the crossing road.
+    """
+
+    start_m: float
+    length_m: float
+    side: float
+    away_m: float
+    cross: bool = False
+
+    @property
+    def middle_m(self) -> float:
+        return self.start_m + self.length_m / 2
+
+    def along(self, step_m: float) -> Floats:
+        """Middles of as many pieces of `step_m` as fit."""
+        return np.asarray(np.arange(self.start_m + step_m / 2, self.start_m + self.length_m - 0.45 * step_m, step_m))
+
+
+@dataclass
+class Builder:
+    """Bodies so far; heights are above the local ground until `primitives` sets them on it."""
+
+    rng: np.random.Generator
+    config: SceneConfig
+    ground: Ground
+    occupied: Occupied
+    kind: str
+    _kept_clear: Floats = field(init=False)  # footprints of the car and of the objects
+    _bodies: list[Primitives] = field(default_factory=list)
+    _boxes: list[tuple[float, ...]] = field(default_factory=list)  # as for `cuboids`
+    _posts: list[tuple[float, ...]] = field(default_factory=list)  # as for `prisms`
+    _blobs: list[Floats] = field(default_factory=list)  # rows of x y z, radii, yaw, reflectance, density
+
+    def __post_init__(self) -> None:
+        self._kept_clear = self.occupied.rows[: self.occupied.count].copy()
+
+    def to_lidar(self, along: float, across: float, cross: bool = False) -> tuple[float, float, float]:
+        """A place beside the main or the crossing road as x, y and the road's heading."""
+        return (self.ground.cross_to_lidar if cross else self.ground.to_lidar)(along, across)
+
+    def near_junction(self, start_m: float, end_m: float) -> bool:
+        """Whether a piece of the main road's side would stand on the crossing road."""
+        reach = self.ground.cross_half_m + self.ground.pavement_m + 1.0
+        middle = self.ground.cross_u_m
+        return self.ground.cross_half_m > 0 and start_m < middle + reach and end_m > middle - reach
+
+    def claim(self, along: float, across: float, length: float, width: float, cross: bool = False) -> bool:
+        """Take a place aligned with the road; whether it was free."""
+        x, y, yaw = self.to_lidar(along, across, cross)
+        return self.occupied.take(x, y, length, width, yaw)
+
+    def body(self, body: Primitives, along: float, across: float, yaw: float) -> None:
+        """Any body, at a place beside the main road and turned against it."""
+        x, y, heading = self.to_lidar(along, across)
+        z = float(self.ground.heights((x, y))[0])
+        self._bodies.append(body.placed(x, y, z, heading + yaw))
+
+    def box(
+        self, along: float, across: float, z: float, size: tuple[float, float, float], material: Material,
+        cross: bool = False, yaw: float = 0.0,
+    ) -> None:  # fmt: skip
+        """A box of `size` (along, across, up) whose bottom is z above the ground."""
+        x, y, heading = self.to_lidar(along, across, cross)
+        self._boxes.append((x, y, z, *size, heading + yaw, *material))
+
+    def post(
+        self, along: float, across: float, z: float, height: float, radius: float, reflectance: float,
+        cross: bool = False, taper: float = 1.0,
+    ) -> None:  # fmt: skip
+        """A round post whose radius at the top is `taper` times that at the foot."""
+        x, y, _ = self.to_lidar(along, across, cross)
+        self._posts.append((x, y, z, height, radius, taper * radius, reflectance))
+
+    def blob(
+        self, along: float, across: float, z: float, radii: tuple[float, float, float], reflectance: float,
+        density_per_m: float, cross: bool = False,
+    ) -> None:  # fmt: skip
+        """An ellipsoid around z above the ground: a cloud, or solid where the density is 0."""
+        x, y, yaw = self.to_lidar(along, across, cross)
+        self._blobs.append(np.array([[x, y, z, *radii, yaw, reflectance, density_per_m]]))
+
+    def foliage(
+        self, along: float, across: float, z: float, radius: float, blobs: int, density_per_m: float, cross: bool
+    ) -> None:
+        """Overlapping clouds of leaves: no two crowns alike, none a ball."""
+        rng = self.rng
+        x, y, _ = self.to_lidar(along, across, cross)
+        rows = np.empty((blobs, 9))
+        rows[:, :3] = rng.normal(0.0, 0.5, (blobs, 3)) * (radius, radius, 0.75 * radius) + (x, y, z)
+        rows[:, 3:6] = radius * rng.uniform(0.18, 0.75, (blobs, 3))
+        rows[:, 2] = np.maximum(rows[:, 2], 0.3 * rows[:, 5])
+        rows[:, 6] = rng.uniform(0.0, 3.1, blobs)
+        rows[:, 7] = rng.uniform(0.22, 0.55)
+        rows[:, 8] = density_per_m * np.exp(rng.normal(0.0, 0.6, blobs))
+        self._blobs.append(rows)
+
+    def primitives(self) -> Primitives:
+        """All bodies, set on the ground."""
+        parts = list(self._bodies)
+        if self._boxes:
+            parts.append(cuboids(self._grounded(np.array(self._boxes))))
+        if self._posts:
+            parts.append(prisms(self._grounded(np.array(self._posts)), sides=6))
+        if self._blobs:
+            rows = self._grounded(_without_intruders(np.concatenate(self._blobs), self._kept_clear))
+            cos, sin, zero = np.cos(rows[:, 6]), np.sin(rows[:, 6]), np.zeros(len(rows))
+            axes = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]).transpose(2, 0, 1)
+            surface = np.column_stack([rows[:, 7], zero + 0.3, rows[:, 8]])
+            parts.append(ellipsoids(rows[:, :3], rows[:, 3:6], surface, axes))
+        return Primitives.join(parts)
+
+    def _grounded(self, rows: Floats) -> Floats:
+        rows[:, 2] += self.ground.heights(rows[:, :2])
+        return rows
+
+
+def _without_intruders(blobs: Floats, footprints: Floats) -> Floats:
+    """Foliage without the clouds that would hang into the car (its sensor would see nothing else) or an object."""
+    dx, dy = (blobs[:, None, axis] - footprints[None, :, axis] for axis in (0, 1))
+    cos, sin = np.cos(footprints[:, 4]), np.sin(footprints[:, 4])
+    along = np.maximum(np.abs(dx * cos + dy * sin) - footprints[:, 2] / 2, 0.0)
+    across = np.maximum(np.abs(dy * cos - dx * sin) - footprints[:, 3] / 2, 0.0)
+    radius = blobs[:, 3:5].max(axis=1, keepdims=True)
+    low = (blobs[:, 2] - blobs[:, 5] < 2.2)[:, None]
+    return np.asarray(blobs[~((np.hypot(along, across) < radius) & low).any(axis=1)])

@@ -1,0 +1,77 @@
+"""Bodies fit the label boxes they are made for, and look the part."""
+
+import numpy as np
+import pytest
+
+from asca_pillars.sim.config import SceneConfig
+from asca_pillars.sim.placement import SIZES, Target, draw_size
+from asca_pillars.sim.primitives import Primitives, cuboids, ellipsoids, limbs, prisms
+from asca_pillars.sim.scene import body_of
+
+
+def extent(body: Primitives) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest x, y, z of a body."""
+    half = np.linalg.norm(np.linalg.inv(body.unit_from_world), axis=2)
+    points = np.concatenate([body.triangles.reshape(-1, 3), body.centers - half, body.centers + half])
+    return points.min(axis=0), points.max(axis=0)
+
+
+@pytest.mark.parametrize("name", sorted(SIZES))
+def test_a_body_fills_its_label_box_and_stays_in_it(name: str) -> None:
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        size = draw_size(rng, name)
+        box = np.array([0.0, 0.0, size[2] / 2, *size, 0.0])
+        low, high = extent(body_of(Target(name, box), SceneConfig(), rng))
+        # Walking people swing their limbs out of their box now and then, as KITTI's do; mirrors stand out of cars.
+        over = 0.35 if name in ("Pedestrian", "Person_sitting") else 0.12
+        assert (low[:2] > -size[:2] / 2 - over).all()
+        assert (high[:2] < size[:2] / 2 + over).all()
+        assert -0.02 < low[2] < 0.4
+        if name != "Truck":  # a flat bed does not reach the height of its cab
+            assert 0.02 < size[2] - high[2] < 0.30
+        if name not in ("Pedestrian", "Person_sitting"):
+            assert (high - low)[0] > 0.85 * size[0]
+
+
+@pytest.mark.parametrize("name", sorted(SIZES))
+def test_sizes_have_the_mean_and_spread_of_kitti(name: str) -> None:
+    rng = np.random.default_rng(1)
+    sizes = np.array([draw_size(rng, name) for _ in range(3000)])
+    statistics = SIZES[name]
+    low, high = np.array(statistics.low), np.array(statistics.high)
+    if name != "Pedestrian":  # children are smaller
+        assert (sizes >= low - 1e-9).all() and (sizes <= high + 1e-9).all()
+    # Clipping a broad distribution moves its mean; that of Misc and Tram most.
+    tolerance = 0.25 if name in ("Misc", "Tram") else 0.06
+    np.testing.assert_allclose(sizes.mean(axis=0), statistics.mean, rtol=tolerance)
+
+
+def test_placing_turns_and_moves_every_kind_of_primitive() -> None:
+    rng = np.random.default_rng(0)
+    parts = [
+        cuboids([(1.0, 0.5, 0.0, 2.0, 1.0, 1.5, 0.3, 0.5, 0.0, 0.0)]),
+        prisms([(0.0, 1.0, 0.0, 2.0, 0.2, 0.1, 0.4)]),
+        ellipsoids([(0.3, -0.2, 1.0)], [(0.9, 0.4, 0.2)], np.array([[0.4, 0.0, 1.0]]),
+                   np.linalg.qr(rng.normal(size=(3, 3)))[0][None]),
+    ]  # fmt: skip
+    body = Primitives.join(parts)
+    placed = body.placed(3.0, -2.0, 0.5, 0.7)
+    cos, sin = np.cos(0.7), np.sin(0.7)
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    np.testing.assert_allclose(placed.triangles, body.triangles @ turn.T + (3.0, -2.0, 0.5))
+    # A point of the surface stays a point of the surface.
+    point = body.centers[0] + np.linalg.inv(body.unit_from_world[0]) @ np.array([0.6, 0.0, 0.8])
+    moved = turn @ point + (3.0, -2.0, 0.5)
+    assert np.linalg.norm(placed.unit_from_world[0] @ (moved - placed.centers[0])) == pytest.approx(1.0)
+
+
+def test_limbs_reach_from_joint_to_joint() -> None:
+    starts = np.array([(0.0, 0.0, 1.0), (0.0, -0.3, 1.0), (1.0, 1.0, 0.0)])
+    ends = np.array([(0.2, 0.0, 0.2), (0.0, 0.3, 1.0), (1.0, 1.0, 0.9)])  # the second points sideways
+    body = limbs(starts, ends, np.full((3, 2), 0.05), np.zeros((3, 3)), (0.0, 1.0, 0.0))
+    np.testing.assert_allclose(body.centers, (starts + ends) / 2)
+    for joint in (starts, ends):
+        unit = np.einsum("nij,nj->ni", body.unit_from_world, joint - body.centers)
+        assert (np.linalg.norm(unit, axis=1) < 1.0).all()
+    assert np.isfinite(body.unit_from_world).all()
