@@ -20,12 +20,8 @@ Bundle = Annotated[
     Path | None,
     typer.Option("--bundle", "-b", help="Model bundle (folder). Default: the one that comes with asca."),
 ]
-ProviderName = Annotated[
-    str, typer.Option(help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")
-]
-Threads = Annotated[
-    int | None, typer.Option(help="CPU threads. Default: the physical cores granted to the process.")
-]
+ProviderName = Annotated[str, typer.Option(help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")]
+Threads = Annotated[int | None, typer.Option(help="CPU threads. Default: the physical cores granted to the process.")]
 
 
 def main() -> None:
@@ -58,9 +54,7 @@ def detect(
             help="A scan (.bin .npy .pcd .ply) or a folder of them. Default: the sample that comes with asca."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and KITTI text.")] = Path(
-        "detections"
-    ),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and KITTI text.")] = Path("detections"),
     bundle: Bundle = None,
     score: Annotated[
         float | None,
@@ -77,9 +71,7 @@ def detect(
 
 @app.command()
 def bench(
-    scans: Annotated[
-        Path | None, typer.Argument(help="A scan or a folder of them. Default: the sample.")
-    ] = None,
+    scans: Annotated[Path | None, typer.Argument(help="A scan or a folder of them. Default: the sample.")] = None,
     bundle: Bundle = None,
     provider: ProviderName = "cpu",
     threads: Threads = None,
@@ -96,15 +88,11 @@ def bench(
 def simulate(
     out: Annotated[Path, typer.Argument(help="Folder for the KITTI-layout dataset.")],
     frames: Annotated[int, typer.Option("--frames", "-n", min=1, help="Frames to write.")] = 100,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Same seed, same bytes, whatever the number of workers.")
-    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes, whatever the number of workers.")] = 0,
     workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
     view: Annotated[
         str,
-        typer.Option(
-            help="full: 360 degrees, as KITTI stores scans; camera: only what the camera sees, 6x smaller."
-        ),
+        typer.Option(help="full: 360 degrees, as KITTI stores scans; camera: only what the camera sees, 6x smaller."),
     ] = "full",
     val_share: Annotated[
         float, typer.Option(min=0, max=1, help="Share of the frames listed in ImageSets/val.txt.")
@@ -119,17 +107,11 @@ def simulate(
 @app.command()
 def train(
     config: Annotated[Path, typer.Argument(help="YAML of the model and its recipe; configs/ holds some.")],
-    data: Annotated[
-        Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder of the run; an interrupted run there is resumed.")
-    ],
+    data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an interrupted run there is resumed.")],
     override: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20"
-        ),
+        typer.Option("--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20"),
     ] = None,
     devices: Annotated[str, typer.Option(help="Devices on this machine: a number or auto.")] = "auto",
     num_nodes: Annotated[
@@ -150,9 +132,7 @@ def export(
         Path | None,
         typer.Option(help="Scans like those trained on, to prove parity on. Default: 8 simulated ones."),
     ] = None,
-    trained_on: Annotated[
-        str, typer.Option(help="What the weights have seen, for the manifest.")
-    ] = "not stated",
+    trained_on: Annotated[str, typer.Option(help="What the weights have seen, for the manifest.")] = "not stated",
 ) -> None:
     """Export to ONNX and prove on scans that the bundle is the same detector; fails if it is not."""
     from asca_pillars.commands.export import run

@@ -1,5 +1,6 @@
 """The whole configuration as one typed tree. Its defaults are the paper's values (ASCA-PointPillars, section 4.1)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,10 @@ class NetworkConfig(Strict):
     block_convs: tuple[int, int, int] = (3, 3, 3)
     upsample_channels: int = 128
 
+    def __post_init__(self) -> None:
+        _require("network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
+        _require("network", self, ("block_convs",), low=0)
+
 
 @dataclass(frozen=True)
 class LossConfig(Strict):
@@ -43,6 +48,11 @@ class LossConfig(Strict):
     focal_alpha: float = 0.25
     focal_gamma: float = 2.0
     smooth_l1_beta: float = 1 / 9
+
+    def __post_init__(self) -> None:
+        weights = ("box_weight", "class_weight", "direction_weight")
+        _require("loss", self, (*weights, "focal_gamma", "smooth_l1_beta"), low=0)
+        _require("loss", self, ("focal_alpha",), low=0, high=1)
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,12 @@ class AugmentConfig(Strict):
     object_shift_m: float = 0.25
     point_dropout: float = 0.0
 
+    def __post_init__(self) -> None:
+        _require("augment", self, ("flip_probability", "point_dropout"), low=0, high=1)
+        _require("augment", self, ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m"), low=0)
+        if not 0 < self.scale[0] <= self.scale[1] < math.inf:
+            raise ConfigError(f"augment.scale = {list(self.scale)}: must be two positive numbers, the smaller first")
+
 
 @dataclass(frozen=True)
 class DataConfig(Strict):
@@ -84,6 +100,9 @@ class DataConfig(Strict):
     camera_view: bool = True
     min_points: int = 1
     workers: int = 2
+
+    def __post_init__(self) -> None:
+        _require("data", self, ("min_points", "workers"), low=0)
 
 
 @dataclass(frozen=True)
@@ -111,9 +130,8 @@ class TrainConfig(Strict):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"train.{name} = {getattr(self, name)}: must be at least 1")
+        _require("train", self, ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"), low=1)
+        _require("train", self, ("learning_rate", "weight_decay", "decay", "gradient_clip", "seed"), low=0)
 
 
 @dataclass(frozen=True)
@@ -143,10 +161,8 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); configs/ holds those that ship"
-        ) from None
-    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); configs/ holds those that ship") from None
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date like 2026-99-99
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if data is None:
         data = {}
@@ -158,6 +174,16 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     for override in overrides:
         _apply(data, override)
     return parse(Config, data, f"{path} with {' '.join(overrides)}")
+
+
+def _require(section: str, settings: Strict, names: Sequence[str], *, low: float, high: float = math.inf) -> None:
+    """Refuse numbers, alone or in a tuple, below `low`, above `high` or not finite."""
+    for name in names:
+        value = getattr(settings, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if not (math.isfinite(number) and low <= number <= high):
+                bounds = f"be at least {low:g}" if high == math.inf else f"lie between {low:g} and {high:g}"
+                raise ConfigError(f"{section}.{name} = {number:g}: must {bounds}")
 
 
 def _apply(data: dict[str, Any], override: str) -> None:
@@ -172,5 +198,5 @@ def _apply(data: dict[str, Any], override: str) -> None:
             raise ConfigError(f"`{override}`: `{parent}` is a value, it has no keys")
     try:
         data[leaf] = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError):
         raise ConfigError(f"`{override}`: the value is not valid YAML") from None

@@ -22,7 +22,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o666 & ~_umask())
-        os.replace(temporary, target)
+        temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -41,11 +41,11 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o777 & ~_umask())
         if target.exists():
-            os.replace(target, retired)
-        os.replace(temporary, target)
+            target.replace(retired)
+        temporary.replace(target)
     finally:
         if retired.exists() and not target.exists():
-            os.replace(retired, target)
+            retired.replace(target)
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(retired, ignore_errors=True)
 

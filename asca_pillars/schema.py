@@ -2,9 +2,7 @@
 
 import dataclasses
 import difflib
-import functools
-from collections.abc import Hashable
-from typing import Any, ClassVar, TypeVar, cast, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 import pydantic
 
@@ -33,7 +31,7 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
         ConfigError: an unknown key (the nearest one that exists is named), a missing or an unusable value.
     """
     try:
-        return _adapter(cast(Hashable, type_)).validate_python(data)
+        return pydantic.TypeAdapter(type_).validate_python(data)
     except ConfigError as error:  # a dataclass that checks its own values
         raise ConfigError(f"{source}: {error}") from None
     except pydantic.ValidationError as error:
@@ -44,19 +42,17 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
 
 def to_dict(settings: Any) -> dict[str, Any]:
     """Plain values (dict, list, str, int, float, bool, None) of a settings dataclass, for YAML or JSON."""
-    plain: dict[str, Any] = _adapter(cast(Hashable, type(settings))).dump_python(settings, mode="json")
+    plain: dict[str, Any] = pydantic.TypeAdapter(type(settings)).dump_python(settings, mode="json")
     return plain
 
 
-@functools.cache
-def _adapter(type_: Hashable) -> pydantic.TypeAdapter[Any]:
-    return pydantic.TypeAdapter(type_)
-
-
 def _explain(type_: type, error: Any) -> str:
-    location = [part for part in error["loc"] if not (isinstance(part, str) and "[" in part)]
+    unknown = error["type"] in _UNKNOWN_KEY
+    location = list(error["loc"])
+    if location[-1:] == ["[key]"] and not unknown:  # pydantic's mark of a mapping's key, as against its value
+        location.pop()
     key = ".".join(str(part) for part in location)
-    if error["type"] in _UNKNOWN_KEY:
+    if unknown:
         names = [field.name for field in dataclasses.fields(_type_at(type_, location[:-1]))]
         nearest = difflib.get_close_matches(str(location[-1]), names, n=1, cutoff=0.4)
         advice = f"did you mean `{nearest[0]}`?" if nearest else f"known keys: {', '.join(names)}"

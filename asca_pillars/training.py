@@ -89,9 +89,7 @@ def train(
         # Of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")
         # EpochSampler starts at the step where the checkpoint stopped, which Lightning cannot know.
-        warnings.filterwarnings(
-            "ignore", message="You're resuming from a checkpoint that ended before the epoch"
-        )
+        warnings.filterwarnings("ignore", message="You're resuming from a checkpoint that ended before the epoch")
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         # Advice on workers and logging that does not fit two cores and small data.
         warnings.filterwarnings("ignore", category=PossibleUserWarning)
@@ -264,9 +262,7 @@ class EpochSampler(Sampler[list[tuple[int, int]]]):
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Checkpoints that a kill cannot leave half written under their name."""
 
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None
-    ) -> None:
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
         with atomic_path(path) as temporary:
             torch.save(checkpoint, temporary)
 
@@ -297,9 +293,7 @@ def _claim(out: Path, config: Config) -> None:
 def _first_difference(found: Any, wanted: Any, key: str = "") -> str | None:
     if isinstance(found, dict) and isinstance(wanted, dict):
         for name in wanted | found:
-            if difference := _first_difference(
-                found.get(name), wanted.get(name), f"{key}.{name}".lstrip(".")
-            ):
+            if difference := _first_difference(found.get(name), wanted.get(name), f"{key}.{name}".lstrip(".")):
                 return difference
         return None
     return None if found == wanted else f"{key} = {found}, now {key} = {wanted}"

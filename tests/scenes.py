@@ -32,7 +32,9 @@ def make_scene(seed: int, names: tuple[str, ...] = ("Car", "Car", "Pedestrian", 
     for index, name in enumerate(names):
         x = 8 + 16 * (index + rng.uniform(0.1, 0.9)) / len(names)  # one behind the other, so that none collide
         length, width, height = np.array(SIZES[name]) * rng.uniform(0.9, 1.1, 3)
-        boxes.append([x, rng.uniform(-3, 3), GROUND_Z_M + height / 2, length, width, height, rng.uniform(-np.pi, np.pi)])
+        boxes.append(
+            [x, rng.uniform(-3, 3), GROUND_Z_M + height / 2, length, width, height, rng.uniform(-np.pi, np.pi)]
+        )
     array = np.array(boxes, dtype=np.float32).reshape(-1, 7)
     surfaces = [_surface(box, rng) for box in array]
     ground = np.column_stack(

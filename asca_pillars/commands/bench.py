@@ -38,14 +38,8 @@ def run(
 
 
 def _table(report: BenchmarkReport) -> Table:
-    points = (
-        f"{min(report.points)}"
-        if len(set(report.points)) == 1
-        else f"{min(report.points)}-{max(report.points)}"
-    )
-    table = Table(
-        title=f"{report.bundle}: {report.frames} warm frames, {report.scans} scan(s) of {points} points"
-    )
+    points = f"{min(report.points)}" if len(set(report.points)) == 1 else f"{min(report.points)}-{max(report.points)}"
+    table = Table(title=f"{report.bundle}: {report.frames} warm frames, {report.scans} scan(s) of {points} points")
     for column in ("stage", "p50 ms", "p95 ms", "min ms"):
         table.add_column(column, justify="left" if column == "stage" else "right")
     for name, times in [*report.stages_ms.items(), ("total", report.total_ms)]:

@@ -52,14 +52,10 @@ def run(
     console.print(f"Pictures and results: {out}/")
 
 
-def _write(
-    out: Path, path: Path, points: NDArray[np.float32], detections: Detections, detector: Detector
-) -> None:
+def _write(out: Path, path: Path, points: NDArray[np.float32], detections: Detections, detector: Detector) -> None:
     """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
     with atomic_path(out / f"{path.stem}.json") as temporary:
-        temporary.write_text(
-            json.dumps(_to_json(path, detections, _report(detector)), indent=1), encoding="utf-8"
-        )
+        temporary.write_text(json.dumps(_to_json(path, detections, _report(detector)), indent=1), encoding="utf-8")
     write_png(out / f"{path.stem}_bev.png", draw_bev(points, detections, detector.spec.grid))
     calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
     if path.parent.name != "velodyne" or not calib_path.exists():
@@ -69,15 +65,14 @@ def _write(
     image = cv2.imread(str(image_path)) if image_path.exists() else None
     _write_kitti(out / f"{path.stem}.txt", detections, calibration, image)
     if image is not None:
-        write_png(out / f"{path.stem}_image.png", draw_on_image(image, detections, calibration))
+        drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
+        write_png(out / f"{path.stem}_image.png", drawn)
 
 
 def _write_kitti(path: Path, detections: Detections, calibration: Calibration, image: Any) -> None:
     """What the camera sees, as KITTI's tools want it: they know no boxes outside the image."""
     size = {} if image is None else {"image_size_wh": (image.shape[1], image.shape[0])}
-    objects = objects_from_boxes(
-        detections.boxes, detections.names, calibration, scores=detections.scores, **size
-    )
+    objects = objects_from_boxes(detections.boxes, detections.names, calibration, scores=detections.scores, **size)
     write_labels(path, [item for item in objects if item.bbox[2] > item.bbox[0]])
 
 
@@ -135,8 +130,8 @@ def _timing(reports: list[FrameReport], detector: Detector) -> str:
     total_ms = statistics.median(report.total_ms for report in reports)
     stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
     return (
-        f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan (median of {len(reports)} warm frames, {detector.provider}, "
-        f"{detector.threads} threads): {stages} ms"
+        f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan (median of {len(reports)} warm frames, "
+        f"{detector.provider}, {detector.threads} threads): {stages} ms"
     )
 
 

@@ -29,10 +29,11 @@ def run(checkpoint: Path, out: Path, scans: Path | None, trained_on: str) -> Non
         bundle = export_bundle(
             loaded, out, points, trained_on=trained_on, command=environment.get("command", "not recorded")
         )
-    assert bundle.parity is not None
+    parity = bundle.parity
+    assert parity is not None, "export_bundle proves it"
     console.print(
-        f"{out}: parity on {bundle.parity.scans} scans: head maps within {bundle.parity.head_maps_max_abs_error:.2g}, "
-        f"boxes within {bundle.parity.box_max_error_m:.2g} m and {np.rad2deg(bundle.parity.yaw_max_error_rad):.2g} degrees"
+        f"{out}: parity on {parity.scans} scans: head maps within {parity.head_maps_max_abs_error:.2g}, "
+        f"boxes within {parity.box_max_error_m:.2g} m and {np.rad2deg(parity.yaw_max_error_rad):.2g} degrees"
     )
 
 

@@ -59,7 +59,7 @@ def rotate(frame: LabeledFrame, angle_rad: float) -> None:
     rotation = _rotation(angle_rad)
     frame.points[:, :2] = frame.points[:, :2] @ rotation.T
     frame.boxes[:, :2] = frame.boxes[:, :2] @ rotation.T
-    frame.boxes[:, 6] = wrap_angle(frame.boxes[:, 6] + angle_rad)
+    frame.boxes[:, 6] = wrap_angle(frame.boxes[:, 6] + np.float32(angle_rad))
 
 
 def scale(frame: LabeledFrame, factor: float) -> None:
@@ -72,7 +72,6 @@ def move_objects(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Gene
     """Shift and turn each object with its points, in place, unless it would run into another one (SECOND, 3.2)."""
     if not len(frame.boxes) or (config.object_shift_m == 0 and config.object_rotation_rad == 0):
         return
-    inside = points_in_boxes(frame.points, frame.boxes)
     for index in range(len(frame.boxes)):
         others = np.delete(frame.boxes, index, axis=0)
         for _ in range(OBJECT_TRIES):
@@ -82,7 +81,8 @@ def move_objects(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Gene
             moved[:3] += shift_m
             moved[6] = wrap_angle(moved[6] + turn_rad)
             if not bev_intersection(moved[None], others).any():
-                own = inside[:, index]
+                # Looked up only now: where labelled boxes overlap, a point goes with the first that takes it.
+                own = points_in_boxes(frame.points, frame.boxes[index : index + 1])[:, 0]
                 local = frame.points[own, :3] - frame.boxes[index, :3]
                 local[:, :2] = local[:, :2] @ _rotation(turn_rad).T
                 frame.points[own, :3] = local + moved[:3]

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import Dataset
 
 from asca_pillars.config import Config
 from asca_pillars.data.augment import LabeledFrame, augment
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image
 from asca_pillars.data.scans import read_scan
+from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.pillarize import Pillars
 from asca_pillars.models.detector import PillarBatch, batch_pillars
@@ -52,8 +52,14 @@ class Batch:
 
     def to(self, device: Any) -> "Batch":
         """Move the tensors, in place, as Lightning expects of a batch."""
-        *tensors, frame_pillars = self.pillars
-        self.pillars = PillarBatch(*(part.to(device) for part in tensors), frame_pillars)
+        pillars = self.pillars
+        self.pillars = PillarBatch(
+            pillars.features.to(device),
+            pillars.pillar_index.to(device),
+            pillars.point_counts.to(device),
+            pillars.cells.to(device),
+            pillars.frame_pillars,
+        )
         self.targets = TargetBatch(*(part.to(device) for part in self.targets))
         return self
 
@@ -94,15 +100,23 @@ def read_frame(split: KittiSplit, frame_id: str, config: Config) -> LabeledFrame
 
     Objects of other types are left out; neighbours of a class (KITTI's Van for Car) and objects with too few points
     become IGNORED.
+
+    Raises:
+        DatasetError: a missing or damaged file, or an object of a class without a 3D box.
     """
     calibration = split.calibration(frame_id)
     points = read_scan(split.scan_path(frame_id)).points
     if config.data.camera_view:
         points = points[in_image(points, calibration, split.image_size_wh(frame_id))]
     names = config.detector.class_names
-    known = {name: index for index, name in enumerate(names)}
-    known |= {NEIGHBOR_TYPES[name]: IGNORED for name in names if name in NEIGHBOR_TYPES}
+    known = {NEIGHBOR_TYPES[name]: IGNORED for name in names if name in NEIGHBOR_TYPES}
+    known |= {name: index for index, name in enumerate(names)}
     objects = [item for item in split.objects(frame_id) if item.type in known]
+    if flat := [item.type for item in objects if not item.has_box_3d]:
+        raise DatasetError(
+            f"{split.label_path(frame_id)}: a {flat[0]} has no 3D box, its sizes are not all positive; "
+            "complete the line, or make it DontCare"
+        )
     boxes = boxes_from_objects(objects, calibration)
     labels = np.array([known[item.type] for item in objects], dtype=np.int64)
     labels[points_in_boxes(points, boxes).sum(axis=0) < config.data.min_points] = IGNORED

@@ -82,9 +82,7 @@ def batch_pillars(frames: Sequence[Pillars]) -> PillarBatch:
 def build_detector(config: Config) -> PillarDetector:
     """The network that `config` describes, with fresh random weights."""
     network, spec = config.network, config.detector
-    neck = RPNNeck(
-        network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels
-    )
+    neck = RPNNeck(network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels)
     return PillarDetector(
         grid=spec.grid,
         encode=PillarEncoder(network.pillar_channels, network.cpa, spec.limits),

@@ -6,9 +6,7 @@ from torch import Tensor, nn
 
 from asca_pillars.geometry.decode import HeadMaps
 
-POSITIVE_PRIOR = (
-    0.01  # what an untrained head says of every anchor: focal loss starts calm (arXiv 1708.02002, 4.1)
-)
+POSITIVE_PRIOR = 0.01  # what an untrained head says of every anchor: focal loss starts calm (arXiv 1708.02002, 4.1)
 
 
 class SSDHead(nn.Module):

@@ -81,7 +81,7 @@ def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
 
 
 def _at_anchors(maps: Tensor, anchor_index: Tensor, values: int) -> Tensor:
-    """Rows of `values` channels of the anchors `anchor_index` (flat in B, H, W, A): (B, A * values, H, W) -> (n, values)."""
+    """Values of the anchors `anchor_index`, flat in (B, H, W, A): (B, A * values, H, W) -> (n, values)."""
     batch, channels, height, width = maps.shape
     by_anchor = maps.permute(0, 2, 3, 1).reshape(batch * height * width * channels // values, values)
     return by_anchor[anchor_index].float()

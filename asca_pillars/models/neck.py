@@ -36,9 +36,7 @@ class RPNNeck(nn.Module):
             self.deblocks.append(_deblock(channels, upsample_channels, stride // HEAD_STRIDE))
             in_channels = channels
         if stride != NECK_STRIDE:
-            raise ValueError(
-                f"{len(block_channels)} blocks end at stride {stride}, the grid is made for {NECK_STRIDE}"
-            )
+            raise ValueError(f"{len(block_channels)} blocks end at stride {stride}, the grid is made for {NECK_STRIDE}")
         self.out_channels = upsample_channels * len(self.blocks)
 
     def forward(self, canvas: Tensor) -> Tensor:

@@ -168,9 +168,7 @@ def _read_manifest(manifest: Path) -> dict[str, Any]:
         raise BundleError(f"{manifest} is damaged ({error}); {_EXPORT_AGAIN}") from None
     version = data.get("schema_version") if isinstance(data, dict) else None
     if type(version) is not int:
-        raise BundleError(
-            f"{manifest} is not a bundle's manifest: `schema_version` is {version!r}; {_EXPORT_AGAIN}"
-        )
+        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {version!r}; {_EXPORT_AGAIN}")
     if version > SCHEMA_VERSION:
         raise BundleError(
             f"{manifest}: schema_version {version} is newer than {SCHEMA_VERSION}, which this version reads; "

@@ -14,13 +14,13 @@ from asca_deploy.bundle import Bundle, default_bundle_path, load_bundle
 from asca_deploy.canvas import Canvas
 from asca_deploy.graph import Graph, Tensor
 from asca_deploy.input_check import check_input
-from asca_pillars.machine import default_threads
 from asca_deploy.providers import select_providers
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.pillarize import FEATURES, PillarCounts, Pillars
 from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.machine import default_threads
 
 STAGES = ("input", "pillarize", "encode", "scatter", "neck+head", "decode")
 

@@ -43,9 +43,7 @@ class Graph:
         found = {node.name: Tensor(node.type, tuple(node.shape)) for node in self._session.get_outputs()}
         for name in outputs:
             if name not in found:
-                raise BundleError(
-                    f"{path} has no output `{name}`, only {', '.join(found)}; export the bundle again"
-                )
+                raise BundleError(f"{path} has no output `{name}`, only {', '.join(found)}; export the bundle again")
         _compare(path, "output", {name: found[name] for name in outputs}, outputs)
 
     def run(self, **inputs: NDArray[np.generic]) -> list[NDArray[np.float32]]:

@@ -71,9 +71,7 @@ def ground_z_m(points: NDArray[np.float32]) -> float | None:
     return float(np.percentile(near_z, GROUND_PERCENTILE)) if len(near_z) >= GROUND_MIN_POINTS else None
 
 
-def check_input(
-    points: NDArray[np.float32], counts: PillarCounts, expected: ExpectedInput
-) -> list[InputWarning]:
+def check_input(points: NDArray[np.float32], counts: PillarCounts, expected: ExpectedInput) -> list[InputWarning]:
     """Compare a scan (N, 4) of finite points, and what pillarize counted in it, with the training scans."""
     fewest, most = expected.points_per_scan
     if len(points) < fewest / 10:
@@ -96,9 +94,7 @@ def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInp
         text = f"reflectance reaches {largest:.4g}, the model was trained on 0..1: divide it by {scale}"
         return InputWarning("reflectance", text)
     if not low / 3 <= mean <= high * 3:
-        text = (
-            f"mean reflectance is {mean:.3g}, in training it was {low:.3g} to {high:.3g}: rescale it to 0..1"
-        )
+        text = f"mean reflectance is {mean:.3g}, in training it was {low:.3g} to {high:.3g}: rescale it to 0..1"
         return InputWarning("reflectance", text)
     return None
 

@@ -50,9 +50,7 @@ PROVIDERS = {
         f"{_CUDA_REMEDY}, and TensorRT: `pip install tensorrt`",
         helpers=("cuda",),
     ),
-    "openvino": Provider(
-        "OpenVINOExecutionProvider", "it needs a build of onnxruntime >= 1.25 that contains OpenVINO"
-    ),
+    "openvino": Provider("OpenVINOExecutionProvider", "it needs a build of onnxruntime >= 1.25 that contains OpenVINO"),
     "coreml": Provider("CoreMLExecutionProvider", "it comes with onnxruntime on macOS"),
 }
 
@@ -112,9 +110,7 @@ def _open(graph: Path, name: str, threads: int) -> onnxruntime.InferenceSession:
     except Exception as error:  # onnxruntime's exceptions share no other base
         reason = str(error).splitlines()[0]
         if name != "cpu":
-            raise ProviderError(
-                f"provider {name} cannot run {graph}: {reason}; {PROVIDERS[name].remedy}"
-            ) from error
+            raise ProviderError(f"provider {name} cannot run {graph}: {reason}; {PROVIDERS[name].remedy}") from error
         raise BundleError(
             f"onnxruntime {onnxruntime.__version__} cannot run {graph}: {reason}; "
             "upgrade with `pip install --upgrade onnxruntime`, or export the bundle again"

@@ -22,7 +22,7 @@ from asca_deploy.bundle import (
 from asca_deploy.detector import Detector
 from asca_deploy.input_check import expected_input
 from asca_deploy.layout import layout_of
-from asca_export.graphs import export_backbone, export_encoder
+from asca_export import graphs
 from asca_export.parity import prove_parity
 from asca_pillars.config import Config
 from asca_pillars.environment import git_revision, package_versions
@@ -59,13 +59,11 @@ def export_bundle(
         ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
     """
     if len(scans) < MIN_SCANS:
-        raise ExportError(
-            f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans"
-        )
+        raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector, steps = checkpoint
     with atomic_directory(out) as folder:
-        export_encoder(detector, folder / ENCODER)
-        export_backbone(detector, folder / BACKBONE)
+        graphs.export_encoder(detector, folder / ENCODER)
+        graphs.export_backbone(detector, folder / BACKBONE)
         for name in (ENCODER, BACKBONE):
             _stamp(folder / name, config)
         draft = Bundle(

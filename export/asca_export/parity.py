@@ -1,7 +1,8 @@
 """The proof that a bundle is the trained model: PyTorch and onnxruntime on the same scans, stage by stage."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from asca_deploy.bundle import Parity
 from asca_deploy.detector import Detector
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.decode import HeadMaps, decode
+from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.geometry.spec import DetectorSpec
@@ -20,15 +21,12 @@ from asca_pillars.models.detector import PillarDetector, batch_pillars
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a pillar feature or a head map
 BOX_TOLERANCE_M = 0.01
 YAW_TOLERANCE_RAD = np.deg2rad(0.5)
-COMPARED_ANCHORS = (
-    100  # per class and scan: the best ones, whatever their score, so that there is always something
-)
+COMPARED_ANCHORS = 100  # per class and scan: the best ones, whatever their score, so that there is always something
 
 Maps = HeadMaps[NDArray[np.float32]]
 
 
-@dataclass(frozen=True)
-class BoxDifference:
+class BoxDifference(NamedTuple):
     """Largest differences between the boxes of two detectors that belong together."""
 
     center_size_m: float
@@ -54,9 +52,7 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
         with torch.inference_mode():
             expected_features = detector.encode(batch.features, batch.pillar_index, batch.point_counts)
             expected_canvas = detector.scatter(expected_features, batch.cells, batch.frame_pillars)
-            expected_maps: Maps = HeadMaps(
-                *(m[0].numpy() for m in detector.head(detector.neck(expected_canvas)))
-            )
+            expected_maps: Maps = HeadMaps(*(m[0].numpy() for m in detector.head(detector.neck(expected_canvas))))
         features = runtime.encode(pillars)
         canvas = runtime.scatter(features, pillars.cells)
         maps = runtime.neck_and_head(canvas)
@@ -64,9 +60,7 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
             ("encode", expected_features.numpy(), features),
             ("scatter", expected_canvas.numpy(), canvas),
         ]
-        stages += [
-            (f"head `{name}`", a, b) for name, a, b in zip(HeadMaps._fields, expected_maps, maps, strict=True)
-        ]
+        stages += [(f"head `{name}`", a, b) for name, a, b in zip(HeadMaps._fields, expected_maps, maps, strict=True)]
         for stage, expected, found in stages:
             error = float(np.abs(expected - found).max(initial=0.0))
             if not error <= MAP_TOLERANCE:
@@ -81,26 +75,27 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
 
 
 def compare_boxes(expected: Maps, found: Maps, spec: DetectorSpec, scan: int = 0) -> BoxDifference:
-    """Decode both maps and pair the boxes; every box needs a partner within the tolerances.
+    """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
-    Thresholds are lowered until the best COMPARED_ANCHORS of each class take part.
+    Thresholds are lowered until the best COMPARED_ANCHORS of each class take part. Before suppression nothing but
+    the thresholds can excuse a difference; after it, which of two overlapping boxes of equal score survives can.
 
     Raises:
-        ExportError: a box without a partner that no tie between scores explains.
+        ExportError: a box without a partner within the tolerances that no tie between scores explains.
     """
+    by_class = expected.scores.reshape(len(spec.classes), -1)
     classes = tuple(
-        replace(
-            spec_,
-            score_threshold=min(spec_.score_threshold, _score_of_rank(expected.scores[2 * i : 2 * i + 2])),
-        )
-        for i, spec_ in enumerate(spec.classes)
+        replace(class_, score_threshold=min(class_.score_threshold, _score_of_rank(logits)))
+        for class_, logits in zip(spec.classes, by_class, strict=True)
     )
-    ours, theirs = (decode(maps, spec.anchors, classes, spec.post) for maps in (expected, found))
-    forward = _pair(ours, theirs, spec, scan)
-    backward = _pair(theirs, ours, spec, scan)
-    return BoxDifference(
-        max(forward.center_size_m, backward.center_size_m), max(forward.yaw_rad, backward.yaw_rad)
-    )
+    everything = replace(spec.post, nms_iou=1.0, max_detections=spec.post.candidates * len(classes))
+    worst = BoxDifference(0.0, 0.0)
+    for post in (everything, spec.post):
+        lowered = replace(spec, classes=classes, post=post)
+        ours, theirs = lowered.decode(expected), lowered.decode(found)
+        for difference in (_pair(ours, theirs, lowered, scan), _pair(theirs, ours, lowered, scan)):
+            worst = BoxDifference(*map(max, zip(worst, difference, strict=True)))
+    return worst
 
 
 def _score_of_rank(logits: NDArray[np.float32]) -> float:
@@ -120,22 +115,23 @@ def _pair(boxes: Detections, partners: Detections, spec: DetectorSpec, scan: int
         if close.any():
             best = np.flatnonzero(close)[lengths[close].argmin()]
             worst_m, worst_rad = max(worst_m, float(lengths[best])), max(worst_rad, float(yaws[best]))
-        elif not _is_tie(box, float(score), same, partners, spec):
+        elif not _is_tie(boxes, index, same, partners, spec):
             raise ExportError(
                 f"scan {scan}: stage decode: the {boxes.names[index]} at x = {box[0]:.2f}, y = {box[1]:.2f} m with "
-                f"score {score:.3f} has no partner within {BOX_TOLERANCE_M} m and {np.rad2deg(YAW_TOLERANCE_RAD)} degrees"
+                f"score {score:.3f} has no partner within {BOX_TOLERANCE_M} m "
+                f"and {np.rad2deg(YAW_TOLERANCE_RAD)} degrees"
             )
     return BoxDifference(worst_m, worst_rad)
 
 
-def _is_tie(
-    box: NDArray[np.float32], score: float, same: Detections, partners: Detections, spec: DetectorSpec
-) -> bool:
-    """Whether the other detector may rightly have another box here: scores equal within the maps' tolerance.
+def _is_tie(boxes: Detections, index: int, same: Detections, partners: Detections, spec: DetectorSpec) -> bool:
+    """Whether the other detector may rightly lack box `index`: two scores that decide are equal within the tolerance.
 
-    Either an overlapping box of the same score took its place, or the cut after the best so many fell between them.
+    Its own and the class's threshold, or that of the last box that was reported, or that of an overlapping box.
     """
-    rivals = same[bev_iou(box[None], same.boxes)[0] > spec.post.nms_iou]
-    if (np.abs(rivals.scores - score) <= MAP_TOLERANCE).any():
-        return True
-    return len(partners) > 0 and abs(float(partners.scores.min()) - score) <= MAP_TOLERANCE
+    score = boxes.scores[index]
+    rivals = same[bev_iou(boxes.boxes[index][None], same.boxes)[0] > spec.post.nms_iou]
+    deciding = [spec.classes[boxes.labels[index]].score_threshold, *rivals.scores]
+    if len(partners) == spec.post.max_detections:
+        deciding.append(partners.scores[-1])
+    return bool((np.abs(np.array(deciding) - score) <= MAP_TOLERANCE).any())

@@ -21,9 +21,7 @@ SPEC = DetectorSpec(
     grid=PillarGrid(x_range_m=(2.0, 9.68), y_range_m=(-1.28, 2.56), z_range_m=(-3.0, 1.0)),
     limits=PillarLimits(max_pillars=300, max_points=8),
 )
-EXPECTED_INPUT = ExpectedInput(
-    points_per_scan=(900, 1100), reflectance_mean=(0.2, 0.6), ground_z_m=(-1.9, -1.6)
-)
+EXPECTED_INPUT = ExpectedInput(points_per_scan=(900, 1100), reflectance_mean=(0.2, 0.6), ground_z_m=(-1.9, -1.6))
 
 
 def encoder_graph(uses_counts: bool) -> onnx.ModelProto:
@@ -67,9 +65,7 @@ def backbone_graph() -> onnx.ModelProto:
         "neck.bias": np.zeros(16, np.float32),
     }
     nodes = [
-        helper.make_node(
-            "Conv", ["canvas", "neck.weight", "neck.bias"], ["neck"], strides=[2, 2], pads=[1, 1, 1, 1]
-        ),
+        helper.make_node("Conv", ["canvas", "neck.weight", "neck.bias"], ["neck"], strides=[2, 2], pads=[1, 1, 1, 1]),
         helper.make_node("Relu", ["neck"], ["relu"]),
     ]
     outputs = []

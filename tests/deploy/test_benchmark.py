@@ -42,16 +42,12 @@ def test_a_warm_detector_has_no_cold_frame(tiny_bundle: Path, scan: NDArray[np.f
 
 
 def test_the_input_hash_tells_scans_apart(tiny_bundle: Path, scans: list[NDArray[np.float32]]) -> None:
-    hashes = [
-        benchmark(Detector(tiny_bundle), [s], rounds=1, warmup=0).input_sha256 for s in (*scans, scans[0])
-    ]
+    hashes = [benchmark(Detector(tiny_bundle), [s], rounds=1, warmup=0).input_sha256 for s in (*scans, scans[0])]
     assert len(set(hashes)) == 3
     assert hashes[0] == hashes[3]
 
 
 @pytest.mark.parametrize(("count", "rounds"), [(0, 3), (1, 0)])
-def test_nothing_to_measure(
-    tiny_bundle: Path, scans: list[NDArray[np.float32]], count: int, rounds: int
-) -> None:
+def test_nothing_to_measure(tiny_bundle: Path, scans: list[NDArray[np.float32]], count: int, rounds: int) -> None:
     with pytest.raises(ValueError, match="at least one of each"):
         benchmark(Detector(tiny_bundle), scans[:count], rounds=rounds)

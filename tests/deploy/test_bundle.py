@@ -112,9 +112,7 @@ def test_no_layout(bundle_copy: Path) -> None:
         (lambda data: data["expected_input"].update(ground_z_m=[1.0]), r"expected_input\.ground_z_m"),
     ],
 )
-def test_wrong_keys_and_values(
-    bundle_copy: Path, change: Callable[[dict[str, Any]], object], message: str
-) -> None:
+def test_wrong_keys_and_values(bundle_copy: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
     edit(bundle_copy, change)
     assert_refused(bundle_copy, f"{message}.*export the bundle again")
 
@@ -154,9 +152,7 @@ def test_a_missing_graph(bundle_copy: Path) -> None:
     assert_refused(bundle_copy, r"backbone\.onnx is missing")
 
 
-@pytest.mark.parametrize(
-    "name", ["../encoder.onnx", "/etc/passwd", "a/b.onnx", "..", "", "c:x.onnx", "..\\x"]
-)
+@pytest.mark.parametrize("name", ["../encoder.onnx", "/etc/passwd", "a/b.onnx", "..", "", "c:x.onnx", "..\\x"])
 def test_graph_names_stay_inside_the_folder(bundle_copy: Path, name: str) -> None:
     edit(bundle_copy, lambda data: data["graphs"]["encoder"].update(file=name))
     assert_refused(bundle_copy, "is not a file name")

@@ -40,9 +40,7 @@ def test_selection(requested: str, available: list[str], selected: list[str]) ->
     ],
 )
 def test_a_missing_provider_says_what_to_install(requested: str, remedy: str) -> None:
-    with pytest.raises(
-        ProviderError, match=f"provider {requested} is not in this onnxruntime .*{remedy}"
-    ) as caught:
+    with pytest.raises(ProviderError, match=f"provider {requested} is not in this onnxruntime .*{remedy}") as caught:
         select_providers(requested, ["AzureExecutionProvider", CPU])
     assert "\n" not in str(caught.value)
 

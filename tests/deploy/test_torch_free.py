@@ -50,6 +50,4 @@ def test_no_file_of_the_runtime_imports_torch() -> None:
             if isinstance(node, ast.ImportFrom):
                 names = [node.module or ""]
             for name in names:
-                assert name.split(".")[0] not in ("torch", "lightning", "onnx", "asca_export"), (
-                    f"{file}: {name}"
-                )
+                assert name.split(".")[0] not in ("torch", "lightning", "onnx", "asca_export"), f"{file}: {name}"

@@ -92,9 +92,7 @@ def test_point_reading_does_not_see_its_padding() -> None:
     features, pillar_index, point_counts = _points()
     tight, loose = PointAttention(CHANNELS, max_points=5), PointAttention(CHANNELS, max_points=64)
     loose.load_state_dict(tight.state_dict())
-    torch.testing.assert_close(
-        tight(features, pillar_index, point_counts), loose(features, pillar_index, point_counts)
-    )
+    torch.testing.assert_close(tight(features, pillar_index, point_counts), loose(features, pillar_index, point_counts))
 
 
 def test_point_reading_equals_attention_pillar_by_pillar() -> None:

@@ -52,9 +52,7 @@ def test_a_batch_is_its_frames(cpa: str) -> None:
 def test_point_order_within_a_pillar_does_not_matter(cpa: str) -> None:
     encoder = PillarEncoder(16, cpa, LIMITS).eval()
     features, pillar_index, point_counts = _frame(12)
-    order = torch.cat(
-        [torch.flip(rows, (0,)) for rows in torch.arange(len(features)).split(point_counts.tolist())]
-    )
+    order = torch.cat([torch.flip(rows, (0,)) for rows in torch.arange(len(features)).split(point_counts.tolist())])
     torch.testing.assert_close(
         encoder(features[order], pillar_index, point_counts), encoder(features, pillar_index, point_counts)
     )
