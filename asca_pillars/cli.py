@@ -106,7 +106,7 @@ def simulate(
 
 @app.command()
 def train(
-    config: Annotated[Path, typer.Argument(help="YAML of the model and its recipe; configs/ holds some.")],
+    config: Annotated[Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")],
     data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an interrupted run there is resumed.")],
     override: Annotated[

@@ -147,21 +147,30 @@ class Config(Strict):
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
+def shipped_configs() -> dict[str, Path]:
+    """The configurations that come along, by name: those of the installed package, or of the checkout."""
+    package = Path(__file__).parent
+    folders = (package / "configs", package.parent / "configs")
+    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+
+
 def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     """Read a YAML file that holds what differs from the defaults.
 
     Args:
-        path: the YAML file.
+        path: the YAML file, or the name of one that ships.
         overrides: `key.subkey=value` texts, value in YAML notation; they win over the file.
 
     Raises:
         ConfigError: unreadable YAML, an unknown key anywhere (the nearest is named), an impossible value.
     """
-    path = Path(path)
+    path = shipped_configs().get(str(path), Path(path))
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); configs/ holds those that ship") from None
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}); these ship: {', '.join(shipped_configs())}"
+        ) from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date like 2026-99-99
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if data is None:

@@ -2,22 +2,22 @@
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import lightning as L  # noqa: N812  (Lightning's own convention)
-import numpy as np
 import torch
 import yaml
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.fabric.utilities.warnings import PossibleUserWarning
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader
 
 from asca_pillars.config import Config
 from asca_pillars.data.dataset import Batch, KittiTrainingSet
+from asca_pillars.data.sampler import EpochSampler
 from asca_pillars.environment import describe_environment
 from asca_pillars.errors import TrainingError
 from asca_pillars.evaluation.recall import RecallTally
@@ -72,14 +72,14 @@ def train(
         precision="bf16-mixed" if config.train.precision == "bf16" else "32-true",
         gradient_clip_val=config.train.gradient_clip or None,
         num_sanity_val_steps=SANITY_STEPS,
-        sync_batchnorm=True,
+        sync_batchnorm=torch.cuda.is_available(),  # there is no such thing on a CPU
         use_distributed_sampler=False,
         enable_model_summary=False,
         log_every_n_steps=10,
         plugins=[AtomicCheckpointIO()],
         logger=TensorBoardLogger(out, name="", version="tensorboard"),
         callbacks=[
-            RichProgressBar(),
+            ProgressBar(),
             LearningRateMonitor("step"),
             _checkpoint(checkpoints, "last", every_n_train_steps=config.train.checkpoint_steps),
             _checkpoint(checkpoints, "best", monitor="val/loss"),
@@ -125,9 +125,13 @@ class DetectionModule(L.LightningModule):
             self.recall.add(detections, boxes, labels)
 
     def on_validation_epoch_end(self) -> None:
-        for name, row in self.recall.rows().items():
+        rows = self.recall.rows()
+        for name, row in rows.items():
             self.log(f"val/recall/{name}", row.recall, sync_dist=True)
             self.log(f"val/false_per_frame/{name}", row.false_per_frame, sync_dist=True)
+        if not self.trainer.sanity_checking:
+            found = ", ".join(f"{name} {row.recall:.2f} ({row.false_per_frame:.2f})" for name, row in rows.items())
+            self.print(f"epoch {self.current_epoch}: recall (false per frame): {found}")
         self.recall = RecallTally(self.config.detector.class_names)
 
     def configure_optimizers(self) -> Any:
@@ -212,51 +216,11 @@ class DetectionData(L.LightningDataModule):
         )
 
 
-class EpochSampler(Sampler[list[tuple[int, int]]]):
-    """Batches of (epoch, frame number), whose order depends on the seed and the optimizer's step alone.
+class ProgressBar(RichProgressBar):
+    """Lightning's bar without the number of a version that we do not have."""
 
-    A resumed run starts at the batch after the last one that the checkpoint knew. Every rank gets the same number
-    of batches; frames that do not fill a batch on every rank wait for the next epoch's order.
-
-    Args:
-        frames: number of frames.
-        batch_size: frames per batch and rank.
-        seed: of the order.
-        step: tells the optimizer steps done so far; None walks once through all frames in order (validation).
-    """
-
-    def __init__(
-        self,
-        frames: int,
-        batch_size: int,
-        seed: int,
-        step: Callable[[], int] | None,
-        *,
-        rank: int = 0,
-        world_size: int = 1,
-    ) -> None:
-        if step is not None and frames < batch_size * world_size:
-            raise TrainingError(
-                f"{frames} training frames do not fill one batch of {batch_size} on {world_size} device(s); "
-                "lower train.batch_size or add frames"
-            )
-        self.frames, self.batch_size, self.seed, self.step = frames, batch_size, seed, step
-        self.rank, self.world_size = rank, world_size
-
-    def __len__(self) -> int:
-        if self.step is None:
-            return -(-len(range(self.rank, self.frames, self.world_size)) // self.batch_size)
-        return self.frames // (self.batch_size * self.world_size)
-
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        step = self.step() if self.step is not None else 0
-        epoch, start = divmod(step, len(self)) if self.step is not None else (0, 0)
-        order = np.arange(self.frames)
-        if self.step is not None:
-            order = np.random.default_rng((self.seed, epoch)).permutation(self.frames)
-        own = order[self.rank :: self.world_size].tolist()
-        batches = [own[i * self.batch_size : (i + 1) * self.batch_size] for i in range(start, len(self))]
-        return iter([[(epoch, number) for number in batch] for batch in batches])
+    def get_metrics(self, *arguments: Any) -> dict[str, Any]:
+        return {name: value for name, value in super().get_metrics(*arguments).items() if name != "v_num"}
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

@@ -96,9 +96,10 @@ def test_equals_a_plain_loop_over_all_anchors(labelled: tuple[np.ndarray, np.nda
 def test_positives_by_hand_in_the_third_zone() -> None:
     """A pedestrian on the centre of row 9, column 20: x = 7.12 + 8.5 * 0.16, y = -1.92 + 9.5 * 0.32.
 
-    It has the anchor's size. IoU of 0.8 x 0.6 with itself d further along x: (0.8 - d) / (0.8 + d) = 0.667, 0.429,
-    0.25 for d = 0.16, 0.32, 0.48. With the anchor turned by 90 degrees, which shares min(0.6, 0.7 - d) x 0.6 of 0.96: 0.6, 0.509, 0.311 for
-    d = 0, 0.16, 0.32. One row further, 0.32 along y: 0.304 and 0.311. Positive from 0.5, negative below 0.35.
+    It has the anchor's size. The IoU of 0.8 x 0.6 with itself d further along x is (0.8 - d) / (0.8 + d): 0.667,
+    0.429, 0.25 for d = 0.16, 0.32, 0.48. With the anchor turned by 90 degrees it shares s = min(0.6, 0.7 - d) * 0.6,
+    s / (0.96 - s): 0.6, 0.509, 0.311 for d = 0, 0.16, 0.32. One row further, 0.32 along y, 0.304 and 0.311.
+    Positive from 0.5, negative below 0.35.
     """
     targets = assign((PEDESTRIAN, [8.48, 1.12, -0.9, 0.8, 0.6, 1.73, 0.0]))
     assert places(targets, 1) == {(9, column, anchor) for column in (19, 20, 21) for anchor in (2, 3)}

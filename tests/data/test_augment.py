@@ -1,0 +1,299 @@
+"""Augmentation: objects keep their points, headings and distances from each other, and nothing else moves."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.config import AugmentConfig
+from asca_pillars.data.augment import LabeledFrame, augment, flip_y, move_objects, rotate, scale
+from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.overlap import bev_intersection
+from tests.scenes import make_scene
+
+STILL = AugmentConfig(
+    flip_probability=0,
+    rotation_rad=0,
+    scale=(1, 1),
+    shift_z_m=0,
+    object_rotation_rad=0,
+    object_shift_m=0,
+    point_dropout=0,
+)
+STRONG = AugmentConfig(
+    rotation_rad=math.pi, scale=(0.8, 1.25), shift_z_m=0.5, object_rotation_rad=1.0, object_shift_m=0.5
+)
+POINTS_PER_BOX = 25
+
+
+def copy_of(frame: LabeledFrame) -> LabeledFrame:
+    return replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
+
+
+def points_of(frame: LabeledFrame, index: int) -> np.ndarray:
+    """The points that `frames` put into a box: the reflectance says which."""
+    return frame.points[frame.points[:, 3] == np.float32(index + 1) / 100]
+
+
+def local(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """x, y, z along the box's length, width and height."""
+    dx, dy, dz = (points[:, :3].astype(np.float64) - box[:3].astype(np.float64)).T
+    cos, sin = math.cos(box[6]), math.sin(box[6])
+    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, dz], axis=1)
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> LabeledFrame:
+    """Boxes of any size and heading in cells of 7 m, each full of points of its own, and ground around them."""
+    cells = draw(st.lists(st.tuples(st.integers(-2, 7), st.integers(-4, 4)), max_size=6, unique=True))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    boxes, points = [], []
+    for index, (column, row) in enumerate(cells):
+        size = rng.uniform((0.5, 0.5, 1.0), (4.5, 2.0, 2.0))
+        yaw = draw(st.one_of(st.sampled_from([-math.pi, math.pi, math.pi / 2, 0.0]), st.floats(-math.pi, math.pi)))
+        yaw = float(np.clip(np.float32(yaw), np.float32(-3.1415925), np.float32(3.1415925)))
+        box = np.array(
+            [7 * column + rng.uniform(-1, 1), 7 * row + rng.uniform(-1, 1), rng.uniform(-1.5, 0), *size, yaw]
+        )
+        inside = rng.uniform(-0.45, 0.45, (POINTS_PER_BOX, 3)) * size
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        inside[:, :2] = inside[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+        points.append(np.column_stack([inside + box[:3], np.full(POINTS_PER_BOX, (index + 1) / 100)]))
+        boxes.append(box)
+    array = np.array(boxes, np.float32).reshape(-1, 7)
+    ground = rng.uniform((-20, -35, -2, 0.5), (60, 35, -1.5, 1.0), (200, 4)).astype(np.float32)
+    ground = ground[~points_in_boxes(ground, array, margin_m=0.05).any(axis=1)]
+    cloud = np.concatenate([ground, *points]).astype(np.float32)
+    order = rng.permutation(len(cloud))
+    return LabeledFrame("000007", cloud[order], array, np.arange(len(array)) % 4 - 1)
+
+
+def assert_objects_kept(before: LabeledFrame, after: LabeledFrame, mirrored: bool = False, factor: float = 1.0) -> None:
+    """Every box has its own points where they were in it, and a yaw in [-pi, pi)."""
+    assert len(after.boxes) == len(before.boxes) and np.array_equal(after.labels, before.labels)
+    np.testing.assert_allclose(after.boxes[:, 3:6], factor * before.boxes[:, 3:6], rtol=1e-6)
+    assert (after.boxes[:, 6] >= -math.pi).all() and (after.boxes[:, 6].astype(np.float64) < math.pi).all()
+    for index, (old, new) in enumerate(zip(before.boxes, after.boxes, strict=True)):
+        expected = local(points_of(before, index), old) * factor
+        if mirrored:
+            expected[:, 1] *= -1
+        np.testing.assert_allclose(local(points_of(after, index), new), expected, atol=1e-4)
+        assert points_in_boxes(points_of(after, index), after.boxes)[:, index].all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(frames())
+def test_flip(frame: LabeledFrame) -> None:
+    flipped = copy_of(frame)
+    flip_y(flipped)
+    assert_objects_kept(frame, flipped, mirrored=True)
+    mirror = np.array([1, -1, 1, 1], np.float32)
+    assert np.array_equal(flipped.points, frame.points * mirror)
+    assert np.array_equal(flipped.boxes[:, :3], frame.boxes[:, :3] * mirror[:3])
+
+
+@settings(max_examples=30, deadline=None)
+@given(frames(), st.floats(-2 * math.pi, 2 * math.pi), st.booleans())
+def test_rotation(frame: LabeledFrame, angle_rad: float, numpy_scalar: bool) -> None:
+    turned = copy_of(frame)
+    rotate(turned, np.float64(angle_rad) if numpy_scalar else angle_rad)
+    assert_objects_kept(frame, turned)
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    for before, after in ((frame.points, turned.points), (frame.boxes, turned.boxes)):
+        x, y = before[:, :2].astype(np.float64).T
+        np.testing.assert_allclose(after[:, :2], np.stack([cos * x - sin * y, sin * x + cos * y], 1), atol=2e-5)
+        assert np.array_equal(after[:, 2], before[:, 2])
+
+
+@pytest.mark.parametrize("kind", [float, np.float64])
+def test_half_a_turn_ends_below_pi(kind: type) -> None:
+    """The float32 next to pi lies above it: no yaw may round to it."""
+    frame = LabeledFrame("0", np.empty((0, 4), np.float32), np.zeros((1, 7), np.float32), np.zeros(1, np.int64))
+    for angle_rad in (math.pi, -math.pi, np.nextafter(math.pi, 0), math.pi - 1e-8):
+        turned = copy_of(frame)
+        rotate(turned, kind(angle_rad))
+        assert -math.pi <= float(turned.boxes[0, 6]) < math.pi
+
+
+def test_directions_by_hand() -> None:
+    """A car ahead to the left that drives to the left, and a point at its front."""
+    point, box = [10.0, 7.0, -1.0, 0.5], [10.0, 5.0, -1.0, 4.0, 1.8, 1.5, math.pi / 2]
+    frame = LabeledFrame("0", np.array([point], np.float32), np.array([box], np.float32), np.zeros(1, np.int64))
+    flipped, turned, scaled = copy_of(frame), copy_of(frame), copy_of(frame)
+    flip_y(flipped)
+    np.testing.assert_allclose(flipped.boxes[0], [10, -5, -1, 4, 1.8, 1.5, -math.pi / 2], rtol=1e-6)
+    np.testing.assert_allclose(flipped.points[0], [10, -7, -1, 0.5])
+    rotate(turned, math.pi / 2)  # counter-clockwise: what was ahead is to the left, what drove left drives back
+    np.testing.assert_allclose(turned.boxes[0, :6], [-5, 10, -1, 4, 1.8, 1.5], rtol=1e-6)
+    assert abs(turned.boxes[0, 6]) == pytest.approx(math.pi, abs=1e-6)
+    np.testing.assert_allclose(turned.points[0], [-7, 10, -1, 0.5], rtol=1e-6)
+    scale(scaled, 1.1)
+    np.testing.assert_allclose(scaled.boxes[0], [11, 5.5, -1.1, 4.4, 1.98, 1.65, math.pi / 2], rtol=1e-6)
+    np.testing.assert_allclose(scaled.points[0], [11, 7.7, -1.1, 0.5], rtol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(frames(), st.floats(0.5, 2.0))
+def test_scaling(frame: LabeledFrame, factor: float) -> None:
+    scaled = copy_of(frame)
+    scale(scaled, factor)
+    assert_objects_kept(frame, scaled, factor=factor)
+    np.testing.assert_allclose(scaled.points[:, :3], frame.points[:, :3] * factor, rtol=1e-6)
+    assert np.array_equal(scaled.points[:, 3], frame.points[:, 3])
+
+
+@settings(max_examples=30, deadline=None)
+@given(frames(), st.integers(0, 2**32 - 1), st.floats(0, 1.5), st.floats(0, math.pi))
+def test_moved_objects(frame: LabeledFrame, seed: int, shift_m: float, turn_rad: float) -> None:
+    moved = copy_of(frame)
+    move_objects(
+        moved, AugmentConfig(object_shift_m=shift_m, object_rotation_rad=turn_rad), np.random.default_rng(seed)
+    )
+    assert_objects_kept(frame, moved)
+    shared = bev_intersection(moved.boxes, moved.boxes)
+    assert not shared[~np.eye(len(shared), dtype=bool)].any()
+    background = frame.points[:, 3] >= 0.5
+    assert np.array_equal(moved.points[background], frame.points[background])
+    if shift_m == turn_rad == 0:
+        assert np.array_equal(moved.boxes, frame.boxes)
+
+
+def test_objects_move_as_far_as_asked() -> None:
+    shifts, turns = [], []
+    box = np.array([[20, 3, -1, 4, 2, 1.5, 0.5]], np.float32)
+    config = AugmentConfig(object_shift_m=0.3, object_rotation_rad=0.2)
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        frame = LabeledFrame("0", np.empty((0, 4), np.float32), box.copy(), np.zeros(1, np.int64))
+        move_objects(frame, config, rng)
+        shifts.append(frame.boxes[0, :3] - box[0, :3])
+        turns.append(frame.boxes[0, 6] - 0.5)
+    # Normal with sigma 0.3 along each axis; uniform within 0.2, whose standard deviation is 0.2 / sqrt(3).
+    np.testing.assert_allclose(np.std(shifts, axis=0), 0.3, rtol=0.15)
+    np.testing.assert_allclose(np.mean(shifts, axis=0), 0, atol=0.06)
+    assert 0.19 < np.abs(turns).max() <= 0.2001 and np.std(turns) == pytest.approx(0.2 / math.sqrt(3), rel=0.15)
+
+
+def test_objects_in_a_crowd_do_not_collide() -> None:
+    """Nine people 0.3 m apart, drawn to shift by as much as their own size: some draws collide, none is taken."""
+    x, y = np.meshgrid([10.0, 10.9, 11.8], [-0.9, 0.0, 0.9])
+    boxes = np.column_stack([x.ravel(), y.ravel(), np.tile([-0.8, 0.6, 0.6, 1.7, 0.1], (9, 1))]).astype(np.float32)
+    config = AugmentConfig(object_shift_m=0.5, object_rotation_rad=1.0)
+    moves = 0
+    for seed in range(20):
+        frame = LabeledFrame("0", np.empty((0, 4), np.float32), boxes.copy(), np.zeros(9, np.int64))
+        move_objects(frame, config, np.random.default_rng(seed))
+        shared = bev_intersection(frame.boxes, frame.boxes)
+        assert not shared[~np.eye(9, dtype=bool)].any()
+        moves += int((frame.boxes != boxes).any(axis=1).sum())
+    assert 100 < moves <= 180
+
+
+def test_an_object_without_room_stays() -> None:
+    """A post in the middle of a house: wherever it is drawn to, it is inside."""
+    boxes = np.array([[10, 0, 0, 0.5, 0.5, 2, 0.3], [10, 0, 0, 60, 60, 3, 0]], np.float32)
+    points = np.array([[10, 0, 0, 0.01], [14, 3, 0, 0.9]], np.float32)
+    frame = LabeledFrame("0", points.copy(), boxes.copy(), np.zeros(2, np.int64))
+    move_objects(frame, AugmentConfig(), np.random.default_rng(0))
+    assert np.array_equal(frame.boxes, boxes) and np.array_equal(frame.points, points)
+
+
+def test_points_of_overlapping_boxes_are_not_torn_off() -> None:
+    """A point in two labelled boxes goes with the first; the second, when it moves, does not take it away again."""
+    boxes = np.array([[10, 0, 0, 4, 2, 2, 0], [10, 1.5, 0, 4, 2, 2, 0]], np.float32)
+    points = np.array([[11, 0.75, 0.5, 0.01], [9, -0.5, 0, 0.01], [9, 2.0, 0, 0.02]], np.float32)
+    frame = LabeledFrame("0", points.copy(), boxes.copy(), np.zeros(2, np.int64))
+    move_objects(frame, AugmentConfig(object_shift_m=1.5), np.random.default_rng(1))
+    assert (frame.boxes != boxes).any(axis=1).all()
+    assert_objects_kept(LabeledFrame("0", points, boxes, np.zeros(2, np.int64)), frame)
+
+
+@settings(max_examples=30, deadline=None)
+@given(frames(), st.integers(0, 2**32 - 1))
+def test_augmented_objects_keep_their_points(frame: LabeledFrame, seed: int) -> None:
+    points, boxes = frame.points.copy(), frame.boxes.copy()
+    for array in (frame.points, frame.boxes, frame.labels):
+        array.flags.writeable = False
+    after = augment(frame, STRONG, np.random.default_rng(seed))
+    assert np.array_equal(frame.points, points) and np.array_equal(frame.boxes, boxes)
+    again = augment(frame, STRONG, np.random.default_rng(seed))
+    assert np.array_equal(after.points, again.points) and np.array_equal(after.boxes, again.boxes)
+
+    assert after.frame_id == "000007"
+    assert (after.points.dtype, after.boxes.dtype, after.labels.dtype) == (np.float32, np.float32, np.int64)
+    assert np.array_equal(after.points[:, 3], frame.points[:, 3])
+    if len(boxes):
+        factor = float(after.boxes[0, 3] / boxes[0, 3])
+        old = local(points_of(frame, 0), boxes[0])[:, 1]
+        mirrored = float(old @ local(points_of(after, 0), after.boxes[0])[:, 1]) < 0
+        assert 0.8 <= factor <= 1.25
+        assert_objects_kept(frame, after, mirrored=mirrored, factor=factor)
+
+
+def test_seeds_differ_and_half_are_mirrored() -> None:
+    points, boxes, _ = make_scene(0)
+    frame = LabeledFrame("0", points, boxes, np.zeros(len(boxes), np.int64))
+    results = [augment(frame, replace(STILL, flip_probability=0.5), np.random.default_rng(seed)) for seed in range(100)]
+    mirrored = [bool(np.array_equal(result.points[:, 1], -points[:, 1])) for result in results]
+    plain = [bool(np.array_equal(result.points, points)) for result in results]
+    assert mirrored == [not same for same in plain] and 30 < sum(mirrored) < 70
+    first, second = (augment(frame, AugmentConfig(), np.random.default_rng(seed)) for seed in (1, 2))
+    assert not np.array_equal(first.points, second.points) and not np.array_equal(first.boxes, second.boxes)
+
+
+def test_nothing_asked_changes_nothing() -> None:
+    points, boxes, _ = make_scene(1)
+    after = augment(LabeledFrame("0", points, boxes, np.zeros(4, np.int64)), STILL, np.random.default_rng(0))
+    assert np.array_equal(after.points, points) and np.array_equal(after.boxes, boxes)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "low", "high"),
+    [
+        ("rotation_rad", 0.3, -0.3, 0.3),
+        ("scale", (0.9, 1.3), 0.9, 1.3),
+        ("shift_z_m", 0.2, -0.2, 0.2),
+    ],
+)
+def test_draws_fill_their_bounds(name: str, value: object, low: float, high: float) -> None:
+    box = np.array([[10, 0, 0, 1, 1, 1, 0]], np.float32)
+    frame = LabeledFrame("0", np.array([[10, 0, 0, 0.5]], np.float32), box, np.zeros(1, np.int64))
+    config = replace(STILL, **{name: value})  # type: ignore[arg-type]
+    rng = np.random.default_rng(0)
+    boxes = np.array([augment(frame, config, rng).boxes[0] for _ in range(200)])
+    drawn = {"rotation_rad": boxes[:, 6], "scale": boxes[:, 3], "shift_z_m": boxes[:, 2]}
+    for other, values in drawn.items():
+        if other == name:
+            assert low - 1e-6 <= values.min() < low + 0.05 * (high - low)
+            assert high - 0.05 * (high - low) < values.max() <= high + 1e-6
+        else:
+            assert np.ptp(values) == 0
+
+
+def test_the_share_of_dropped_points_is_itself_drawn() -> None:
+    """Between 0 and `point_dropout`, so half of that on average; boxes stay, the kept points keep their order."""
+    points = np.random.default_rng(0).uniform(-20, 20, (4000, 4)).astype(np.float32)
+    points[:, 3] = np.arange(4000) / 4000
+    boxes = make_scene(2)[1]
+    frame = LabeledFrame("0", points, boxes, np.zeros(4, np.int64))
+    config = replace(STILL, point_dropout=0.6)
+    shares = []
+    for seed in range(60):
+        after = augment(frame, config, np.random.default_rng(seed))
+        assert np.array_equal(after.boxes, boxes)
+        kept = np.isin(points[:, 3], after.points[:, 3])
+        assert np.array_equal(after.points, points[kept])
+        shares.append(1 - len(after.points) / 4000)
+    # 0.6 / sqrt(12) = 0.17 is the spread of the draw; 60 draws tell the mean to 0.022.
+    assert min(shares) < 0.1 and 0.5 < max(shares) < 0.63 and np.mean(shares) == pytest.approx(0.3, abs=0.08)
+
+
+@pytest.mark.parametrize(("points", "boxes"), [(0, 0), (0, 2), (5, 0)])
+def test_empty_frames(points: int, boxes: int) -> None:
+    cloud, array, _ = make_scene(3)
+    frame = LabeledFrame("0", cloud[:points], array[:boxes], np.zeros(boxes, np.int64))
+    after = augment(frame, replace(STRONG, point_dropout=0.3, flip_probability=1), np.random.default_rng(0))
+    assert after.points.shape[1:] == (4,) and len(after.points) <= points and after.boxes.shape == (boxes, 7)
