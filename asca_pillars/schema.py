@@ -54,7 +54,7 @@ def _explain(type_: type, error: Any) -> str:
     key = ".".join(str(part) for part in location)
     if unknown:
         names = [field.name for field in dataclasses.fields(_type_at(type_, location[:-1]))]
-        nearest = difflib.get_close_matches(str(location[-1]), names, n=1, cutoff=0.4)
+        nearest = difflib.get_close_matches(str(location[-1]), names, n=1, cutoff=0.5)
         advice = f"did you mean `{nearest[0]}`?" if nearest else f"known keys: {', '.join(names)}"
         return f"unknown key `{key}`; {advice}"
     if error["type"] in ("missing", "missing_argument"):

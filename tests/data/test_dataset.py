@@ -166,7 +166,8 @@ def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
 def samples(root: Path) -> list[Sample]:
     """Three frames of different size; the one in the middle has no points and nothing to find."""
     frames = KittiTrainingSet(write_dataset(root, 3, val_frames=2), CONFIG, training=False)
-    empty = LabeledFrame("none", *(np.empty(shape, np.float32) for shape in ((0, 4), (0, 7))), np.empty(0, np.int64))
+    no_points, no_boxes = np.empty((0, 4), np.float32), np.empty((0, 7), np.float32)
+    empty = LabeledFrame("none", no_points, no_boxes, np.empty(0, np.int64))
     nothing = assign_targets(SPEC.anchors, SPEC.classes, empty.boxes, empty.labels)
     return [frames[0, 0], Sample(empty, SPEC.pillarize(empty.points), nothing), frames[0, 1]]
 

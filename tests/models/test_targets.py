@@ -53,12 +53,12 @@ def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[
     for index, row in enumerate(overlap):
         label, spec = class_of[index], KITTI_CLASSES[class_of[index]]
         own = [box for box in range(len(boxes)) if labels[box] == label]
-        best = max(own, key=lambda box: row[box], default=None)
+        best = max(own, key=lambda box: row[box], default=-1)
         forced = [box for box in own if 0 < row[box] == best_of_box[box]]
-        if forced or (best is not None and row[best] >= spec.positive_iou):
+        if forced or (best >= 0 and row[best] >= spec.positive_iou):
             states.append(1)
             matches[index] = forced[-1] if forced else best
-        elif best is not None and row[best] >= spec.negative_iou:
+        elif best >= 0 and row[best] >= spec.negative_iou:
             states.append(-1)
         else:
             excused = any(labels[box] == IGNORED and row[box] >= spec.negative_iou for box in range(len(boxes)))
@@ -74,7 +74,7 @@ def labelled_boxes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
     for label in labels:
         like = label if label != IGNORED else draw(st.sampled_from([CAR, PEDESTRIAN, CYCLIST]))
         stretch = [draw(st.floats(0.6, 1.8)) for _ in range(3)]
-        centre = draw(st.floats(0.0, 12.0)), draw(st.floats(-4.0, 5.0)), draw(st.floats(-2.0, 0.5))
+        centre = draw(st.floats(-2.0, 14.0)), draw(st.floats(-5.0, 6.0)), draw(st.floats(-2.0, 0.5))
         boxes.append([*centre, *np.multiply(SIZES[like], stretch), draw(st.floats(-math.pi, 3.14))])
     return np.array(boxes, np.float32).reshape(-1, 7), np.array(labels, np.int64)
 

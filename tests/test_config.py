@@ -1,0 +1,281 @@
+"""The configuration: the paper's values, and mistakes in a file or an override that are told in one line."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from asca_pillars.config import (
+    AugmentConfig,
+    Config,
+    LossConfig,
+    NetworkConfig,
+    TrainConfig,
+    load_config,
+    shipped_configs,
+)
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.anchors import ClassSpec
+from asca_pillars.models.detector import build_detector
+from asca_pillars.schema import parse, to_dict
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "model.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(path: Path, *overrides: str) -> str:
+    """The one line that the file or an override is refused with; it names the file."""
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, overrides)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_defaults_are_the_paper_s() -> None:
+    """DESIGN's reading of section 3 and 4.1: grid, limits, anchors, widths of Table 1, losses, recipe."""
+    config = Config()
+    spec = config.detector
+    assert (spec.grid.x_range_m, spec.grid.y_range_m, spec.grid.z_range_m) == ((0, 69.12), (-39.68, 39.68), (-3, 1))
+    assert (spec.grid.v_max_m, spec.grid.v_y_m, spec.grid.zones) == (0.32, 0.16, 3)
+    assert (spec.grid.nx, spec.grid.ny) == (72 + 144 + 288, 496)
+    assert (spec.limits.max_pillars, spec.limits.max_points) == (12000, 64)
+    assert [dataclasses.astuple(item)[:-1] for item in spec.classes] == [
+        ("Car", 3.9, 1.6, 1.56, -1.0, 0.6, 0.45),
+        ("Pedestrian", 0.8, 0.6, 1.73, -0.6, 0.5, 0.35),
+        ("Cyclist", 1.76, 0.6, 1.73, -0.6, 0.5, 0.35),
+    ]
+    network = config.network
+    assert (network.pillar_channels, network.block_channels, network.block_convs) == (64, (64, 128, 256), (3, 3, 3))
+    assert 3 * network.upsample_channels == 384
+    loss = config.loss
+    assert (loss.box_weight, loss.class_weight, loss.direction_weight) == (2, 1, 0.2)
+    assert (loss.focal_alpha, loss.focal_gamma, loss.smooth_l1_beta) == (0.25, 2, 1 / 9)
+    train = config.train
+    assert (train.epochs, train.batch_size, train.learning_rate) == (160, 6, 2e-4)
+    assert (train.schedule, train.decay, train.decay_epochs, train.weight_decay) == ("step", 0.8, 15, 0)
+    augment = config.augment
+    assert augment.flip_probability == 0.5 and augment.rotation_rad == pytest.approx(math.pi / 4, abs=1e-6)
+    assert augment.scale == (0.95, 1.05) and augment.shift_z_m == augment.point_dropout == 0
+    assert augment.object_rotation_rad > 0 and augment.object_shift_m > 0
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_configs_that_ship_load_and_build(path: Path) -> None:
+    config = load_config(path)
+    assert load_config(path.stem) == config, "found by its name too"
+    with torch.device("meta"):  # layers and shapes, without the time that random weights take
+        detector = build_detector(config)
+    assert detector.grid == config.detector.grid
+    scores = detector.head.scores.weight
+    assert scores.shape == (2 * len(config.detector.classes), 3 * config.network.upsample_channels, 1, 1)
+
+
+def test_there_are_configs() -> None:
+    names = {path.stem for path in CONFIGS}
+    assert {"asca_pointpillars_kitti", "pointpillars_kitti"} <= names == set(shipped_configs())
+
+
+def test_the_baseline_is_pointpillars() -> None:
+    """DESIGN 4.1: K = 1 and V_max = 0.16 m are PointPillars, 432 x 496 pillars without attention."""
+    config = load_config(next(path for path in CONFIGS if path.stem == "pointpillars_kitti"))
+    assert (config.detector.grid.nx, config.detector.grid.ny, config.network.cpa) == (432, 496, "none")
+
+
+def sections(settings: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], object]]:
+    """The dataclass `settings` and all that it holds, also in tuples, each with the keys that lead to it."""
+    yield path, settings
+    for item in dataclasses.fields(settings):  # type: ignore[arg-type]
+        value = getattr(settings, item.name)
+        if dataclasses.is_dataclass(value):
+            yield from sections(value, (*path, item.name))
+        elif isinstance(value, tuple):
+            for index, part in enumerate(value):
+                if dataclasses.is_dataclass(part):
+                    yield from sections(part, (*path, item.name, index))
+
+
+SECTIONS = dict(sections(Config()))
+
+
+def test_every_level_is_tested_below() -> None:
+    names = {".".join(map(str, path)) for path in SECTIONS}
+    assert names == {
+        *("", "detector", "detector.grid", "detector.limits", "detector.post", "network", "loss", "augment", "data"),
+        *("detector.classes.0", "detector.classes.1", "detector.classes.2", "train"),
+    }
+
+
+@pytest.mark.parametrize("path", SECTIONS, ids=lambda path: ".".join(map(str, path)) or "top")
+def test_unknown_keys_at_every_level_name_the_nearest(path: tuple[str | int, ...]) -> None:
+    """Each key of each level with a letter too much; and one that is like none of them."""
+    for item in dataclasses.fields(SECTIONS[path]):  # type: ignore[arg-type]
+        for wrong, advice in ((f"{item.name}x", f"did you mean `{item.name}`?"), ("Q", "known keys: ")):
+            data = to_dict(Config())
+            level: Any = data
+            for part in path:
+                level = level[part]
+            level[wrong] = level.get(item.name)
+            with pytest.raises(ConfigError) as caught:
+                parse(Config, data, "model.yaml")
+            key = ".".join(map(str, (*path, wrong)))
+            assert str(caught.value).startswith(f"model.yaml: unknown key `{key}`; {advice}")
+
+
+@pytest.mark.parametrize("path", SECTIONS, ids=lambda path: ".".join(map(str, path)) or "top")
+def test_values_of_the_wrong_type_at_every_level_name_their_key(path: tuple[str | int, ...]) -> None:
+    for item in dataclasses.fields(SECTIONS[path]):  # type: ignore[arg-type]
+        data = to_dict(Config())
+        level: Any = data
+        for part in path:
+            level = level[part]
+        level[item.name] = [{"nonsense": None}]
+        key = ".".join(map(str, (*path, item.name)))
+        with pytest.raises(ConfigError, match=rf"^model\.yaml: .*`{re.escape(key)}[.`0-9a-z_]* ?"):
+            parse(Config, data, "model.yaml")
+
+
+def test_round_trip_through_yaml() -> None:
+    config = dataclasses.replace(
+        Config(name="small"),
+        network=NetworkConfig(cpa="point", block_channels=(8, 16, 32)),
+        augment=AugmentConfig(scale=(0.9, 1.2)),
+        train=TrainConfig(learning_rate=1e-3, schedule="one_cycle"),
+    )
+    assert parse(Config, yaml.safe_load(yaml.safe_dump(to_dict(config))), "model.yaml") == config
+
+
+def test_a_file_holds_what_differs(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, "train: {epochs: 3, learning_rate: 1e-3}\ndetector:\n  grid: {zones: 1}\n"))
+    assert config.train == TrainConfig(epochs=3, learning_rate=1e-3) and config.detector.grid.zones == 1
+    assert config.loss == LossConfig() and config.detector.classes == Config().detector.classes
+    assert load_config(write(tmp_path, "# only a comment\n")) == Config()
+
+
+def test_classes_of_one_s_own(tmp_path: Path) -> None:
+    text = """
+detector:
+  classes:
+    - {name: Truck, length_m: 9, width_m: 2.5, height_m: 3.2, z_m: -0.2, positive_iou: 0.6, negative_iou: 0.45}
+"""
+    config = load_config(write(tmp_path, text))
+    assert config.detector.classes == (ClassSpec("Truck", 9, 2.5, 3.2, -0.2, 0.6, 0.45),)
+    assert "`detector.classes.0.lengthm`; did you mean `length_m`" in refusal(
+        write(tmp_path, text.replace("length_m", "lengthm"))
+    )
+
+
+def test_overrides_win(tmp_path: Path) -> None:
+    path = write(tmp_path, "train: {epochs: 3, batch_size: 2}\n")
+    overrides = (
+        "train.epochs=5",
+        "network.cpa=none",
+        "detector.grid.zones = 1",
+        "detector.grid.v_max_m=0.16",
+        "augment.scale=[0.9, 1.1]",
+        "data.camera_view=false",
+        "name=a=b",
+        "train.epochs=7",
+    )
+    config = load_config(path, overrides)
+    assert (config.train.epochs, config.train.batch_size) == (7, 2)  # the last of two wins, the others stay
+    assert (config.network.cpa, config.augment.scale, config.data.camera_view) == ("none", (0.9, 1.1), False)
+    assert (config.detector.grid.nx, config.name) == (432, "a=b")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("train.epoch=3", "unknown key `train.epoch`; did you mean `epochs`?"),
+        ("trian.epochs=3", "unknown key `trian`; did you mean `train`?"),
+        ("detector.grid.zone=2", "unknown key `detector.grid.zone`; did you mean `zones`?"),
+        ("epochs=3", "unknown key `epochs`; known keys: name, detector"),
+        ("train.epochs", "`train.epochs`: an override is written key.subkey=value, such as train.epochs=20"),
+        ("=3", "an override is written key.subkey=value"),
+        ("train.seed.first=3", "`seed` is a value, it has no keys"),
+        ("train.epochs.first=3", "`train.epochs` = {'first': 3}: input should be a valid integer"),
+        ("train.epochs=", "`train.epochs` = None: input should be a valid integer"),
+        ("train.epochs=[", "`train.epochs=[`: the value is not valid YAML"),
+        ("name=2026-99-99", "`name=2026-99-99`: the value is not valid YAML"),
+        ("train.epochs=0", "train.epochs = 0: must be at least 1"),
+        ("train.precision=64", "`train.precision` = 64: input should be '32' or 'bf16'"),
+        ("detector.grid.zones=9", "zones 9 must lie between 1 and 5"),
+    ],
+)
+def test_overrides_that_cannot_be(tmp_path: Path, override: str, message: str) -> None:
+    line = refusal(write(tmp_path, "train: {seed: 1}\n"), "loss.box_weight=1", override)
+    assert message in line and override in line
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("train: {epochs: [", "not valid YAML: "),
+        ("train:\n\tepochs: 3\n", "not valid YAML: "),
+        ("name: 2026-99-99\n", "not valid YAML: "),
+        ("- train\n- detector\n", "expected `key: value` lines, found a list"),
+        ("just words\n", "expected `key: value` lines, found a str"),
+        ("train:\n", "`train` = None: input should be a dictionary"),
+        ("train: {epochs: many}\n", "`train.epochs` = 'many': input should be a valid integer"),
+        ("network: {block_channels: [64, 128]}\n", "missing key `network.block_channels.2`"),
+        ("network: {cpa: chanel}\n", "`network.cpa` = 'chanel': input should be 'none', 'paper', 'channel' or 'point'"),
+        ("detector: {grid: {zones: 9}}\n", "zones 9 must lie between 1 and 5"),
+        ("detector: {grid: {x_range_m: [0, 70]}}\n", "x_range_m [0, 70] must be a multiple of 7.68 m"),
+        ("detector: {classes: []}\n", "classes is empty"),
+    ],
+)
+def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text)
+    assert refusal(path).startswith(f"{path}: {message}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("network.pillar_channels", "0", "must be at least 1"),
+        ("network.block_channels", "[64, 0, 256]", "must be at least 1"),
+        ("network.block_convs", "[3, -1, 3]", "must be at least 0"),
+        ("loss.box_weight", "-1", "must be at least 0"),
+        ("loss.focal_alpha", "1.5", "must lie between 0 and 1"),
+        ("loss.smooth_l1_beta", "-0.1", "must be at least 0"),
+        ("augment.flip_probability", "2", "must lie between 0 and 1"),
+        ("augment.point_dropout", "-0.1", "must lie between 0 and 1"),
+        ("augment.object_shift_m", "-0.1", "must be at least 0"),
+        ("augment.rotation_rad", ".inf", "must be at least 0"),
+        ("augment.scale", "[1.05, 0.95]", "must be two positive numbers, the smaller first"),
+        ("augment.scale", "[0, 1]", "must be two positive numbers, the smaller first"),
+        ("augment.scale", "[.nan, 1]", "must be two positive numbers, the smaller first"),
+        ("data.min_points", "-1", "must be at least 0"),
+        ("data.workers", "-1", "must be at least 0"),
+        ("train.epochs", "0", "must be at least 1"),
+        ("train.batch_size", "0", "must be at least 1"),
+        ("train.decay_epochs", "0", "must be at least 1"),
+        ("train.checkpoint_steps", "0", "must be at least 1"),
+        ("train.learning_rate", "-1e-3", "must be at least 0"),
+        ("train.learning_rate", ".nan", "must be at least 0"),
+        ("train.weight_decay", "-1", "must be at least 0"),
+        ("train.seed", "-1", "must be at least 0"),
+    ],
+)
+def test_impossible_numbers(tmp_path: Path, key: str, value: str, message: str) -> None:
+    section, name = key.split(".")
+    path = write(tmp_path, f"{section}:\n  {name}: {value}\n")
+    assert re.fullmatch(rf"{re.escape(str(path))}: {re.escape(key)} = .+: {message}.*", refusal(path))
+
+
+def test_files_that_are_not_text(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_bytes(b"name: caf\xe9\n")
+    assert refusal(path).startswith(f"{path}: not valid YAML: ")
+    assert "cannot be read (No such file or directory); these ship: asca_" in refusal(tmp_path / "missing.yaml")
+    assert "cannot be read (Is a directory)" in refusal(tmp_path)
