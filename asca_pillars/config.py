@@ -113,7 +113,7 @@ class TrainConfig(Strict):
         schedule: `step` multiplies the rate by `decay` every `decay_epochs`; `one_cycle` rises to
             `learning_rate` and falls to almost nothing over the run, step by step.
         gradient_clip: largest norm of the whole gradient; 0 leaves it as it is.
-        precision: `32` or `bf16`.
+        precision: `fp32` or `bf16`.
         checkpoint_steps: also save every so many steps, so that a kill costs minutes, not an epoch.
     """
 
@@ -125,7 +125,7 @@ class TrainConfig(Strict):
     decay: float = 0.8
     decay_epochs: int = 15
     gradient_clip: float = 10.0
-    precision: Literal["32", "bf16"] = "32"
+    precision: Literal["fp32", "bf16"] = "fp32"
     checkpoint_steps: int = 500
     seed: int = 0
 

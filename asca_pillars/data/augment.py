@@ -1,32 +1,16 @@
 """Random changes of a labelled frame, every one drawn from the generator that is passed in (section 4.1)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import AugmentConfig
+from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import bev_intersection
 
 OBJECT_TRIES = 10  # draws of one object's new pose before it stays where it is
-
-
-@dataclass(frozen=True)
-class LabeledFrame:
-    """One frame of training data.
-
-    Attributes:
-        frame_id: name of the frame in its dataset.
-        points: (N, 4) float32 x, y, z, reflectance.
-        boxes: (M, 7) float32.
-        labels: (M,) int64 class index, or `models.targets.IGNORED`.
-    """
-
-    frame_id: str
-    points: NDArray[np.float32]
-    boxes: NDArray[np.float32]
-    labels: NDArray[np.int64]
 
 
 def augment(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Generator) -> LabeledFrame:

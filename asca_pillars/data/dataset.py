@@ -10,18 +10,13 @@ import torch
 from torch.utils.data import Dataset
 
 from asca_pillars.config import Config
-from asca_pillars.data.augment import LabeledFrame, augment
-from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image
-from asca_pillars.data.scans import read_scan
-from asca_pillars.errors import DatasetError
-from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.data.augment import augment
+from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
+from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.geometry.pillarize import Pillars
 from asca_pillars.models.detector import PillarBatch, batch_pillars
 from asca_pillars.models.loss import TargetBatch
-from asca_pillars.models.targets import IGNORED, Targets, assign_targets
-
-# What KITTI's protocol treats as neither right nor wrong for a class.
-NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
+from asca_pillars.models.targets import Targets, assign_targets
 
 
 @dataclass(frozen=True)
@@ -87,40 +82,19 @@ class KittiTrainingSet(Dataset[Sample]):
     def __getitem__(self, index: tuple[int, int]) -> Sample:
         epoch, number = index
         rng = np.random.default_rng((self.config.train.seed, epoch, number)) if self.training else None
-        frame = read_frame(self.split, self.frame_ids[number], self.config)
+        data, spec = self.config.data, self.config.detector
+        frame = read_frame(
+            self.split,
+            self.frame_ids[number],
+            spec.class_names,
+            camera_view=data.camera_view,
+            min_points=data.min_points,
+        )
         if rng is not None:
             frame = augment(frame, self.config.augment, rng)
-        spec = self.config.detector
+        frame = within_grid(frame, spec.grid)
         pillars = spec.pillarize(frame.points, rng)
         return Sample(frame, pillars, assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels))
-
-
-def read_frame(split: KittiSplit, frame_id: str, config: Config) -> LabeledFrame:
-    """Points and labelled boxes of one frame, as DataConfig wants them.
-
-    Objects of other types are left out; neighbours of a class (KITTI's Van for Car) and objects with too few points
-    become IGNORED.
-
-    Raises:
-        DatasetError: a missing or damaged file, or an object of a class without a 3D box.
-    """
-    calibration = split.calibration(frame_id)
-    points = read_scan(split.scan_path(frame_id)).points
-    if config.data.camera_view:
-        points = points[in_image(points, calibration, split.image_size_wh(frame_id))]
-    names = config.detector.class_names
-    known = {NEIGHBOR_TYPES[name]: IGNORED for name in names if name in NEIGHBOR_TYPES}
-    known |= {name: index for index, name in enumerate(names)}
-    objects = [item for item in split.objects(frame_id) if item.type in known]
-    if flat := [item.type for item in objects if not item.has_box_3d]:
-        raise DatasetError(
-            f"{split.label_path(frame_id)}: a {flat[0]} has no 3D box, its sizes are not all positive; "
-            "complete the line, or make it DontCare"
-        )
-    boxes = boxes_from_objects(objects, calibration)
-    labels = np.array([known[item.type] for item in objects], dtype=np.int64)
-    labels[points_in_boxes(points, boxes).sum(axis=0) < config.data.min_points] = IGNORED
-    return LabeledFrame(frame_id, points, boxes, labels)
 
 
 def _collate_targets(frames: Sequence[Targets]) -> TargetBatch:

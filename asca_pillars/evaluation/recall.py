@@ -50,20 +50,30 @@ class RecallTally:
         self.counts = np.zeros((len(class_names), 3), dtype=np.int64)  # objects, found, false
         self.frames = 0
 
-    def add(self, detections: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> None:
+    def add(
+        self,
+        detections: Detections,
+        boxes: NDArray[np.float32],
+        labels: NDArray[np.int64],
+        excused: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Count one frame.
 
         Args:
-            detections: of the frame, at the threshold in question.
+            detections: of the frame, at the threshold in question, by descending score.
             boxes: (N, 7) labelled boxes.
             labels: (N,) class index, negative for boxes that excuse a detection of any class but need not be found.
+            excused: which detections are not false though they find nothing, as on KITTI's DontCare areas.
         """
+        if excused is None:
+            excused = np.zeros(len(detections), dtype=bool)
         self.frames += 1
         for index, name in enumerate(self.class_names):
-            of_class = detections[detections.labels == index]
+            own = detections.labels == index
             chosen = (labels == index) | (labels < 0)
             self.counts[index] += _count(
-                of_class.boxes,
+                detections.boxes[own],
+                excused[own],
                 boxes[chosen],
                 labels[chosen] == index,
                 BEV_IOU.get(name, SMALL_BEV_IOU),
@@ -80,6 +90,7 @@ class RecallTally:
 
 def _count(
     found_boxes: NDArray[np.float32],
+    excused: NDArray[np.bool_],
     boxes: NDArray[np.float32],
     wanted: NDArray[np.bool_],
     min_iou: float,
@@ -90,12 +101,12 @@ def _count(
     near = np.hypot(boxes[:, 0], boxes[:, 1]) <= max_distance_m
     free = np.ones(len(boxes), dtype=bool)
     found = false = 0
-    for box, row in zip(found_boxes, iou, strict=True):
+    for box, excuse, row in zip(found_boxes, excused, iou, strict=True):
         candidates = np.where(free, row, 0.0)
         best = int(candidates.argmax()) if len(candidates) else -1
         if best >= 0 and candidates[best] >= min_iou:
             free[best] = False
             found += bool(wanted[best] and near[best])
-        elif np.hypot(box[0], box[1]) <= max_distance_m:
+        elif not excuse and np.hypot(box[0], box[1]) <= max_distance_m:
             false += 1
     return int((wanted & near).sum()), found, false

@@ -54,7 +54,7 @@ class ClassSpec:
                 raise ConfigError(f"{field} {getattr(self, field):g} of class {self.name} must be positive")
         if not math.isfinite(self.z_m):
             raise ConfigError(f"z_m {self.z_m:g} of class {self.name} must be finite")
-        if not 0 <= self.negative_iou <= self.positive_iou <= 1:
+        if not 0 <= self.negative_iou <= self.positive_iou <= 1 or self.positive_iou == 0:
             raise ConfigError(
                 f"negative_iou {self.negative_iou:g} and positive_iou {self.positive_iou:g} of class "
                 f"{self.name} must lie between 0 and 1, the negative one no higher than the positive"

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.data.frames import IGNORED
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, ClassSpec, encode_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
-
-IGNORED = -1  # class id of a labelled box that is neither to be found nor to be missed
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,9 @@ def assign_targets(
     """Match anchors with boxes by the overlap of their axis-aligned bird's-eye footprints.
 
     An anchor is positive when it overlaps a box of its own class by at least `positive_iou`, or when no anchor
-    overlaps that box more (each box gets one, however small); negative below `negative_iou` with all of them;
-    ignored in between, and wherever it overlaps an IGNORED box by `negative_iou` without being positive.
+    overlaps that box more, so that a small one is not missed (of two boxes with the same best anchor the later has
+    it); negative below `negative_iou` with all of them; ignored in between, and wherever it overlaps an IGNORED box
+    by `negative_iou` without being positive.
 
     Args:
         anchors: (H, W, A, 7), class-major along A, see `geometry.anchors.make_anchors`.

@@ -9,18 +9,24 @@ import pytest
 import torch
 
 from asca_pillars.config import AugmentConfig, Config, DataConfig
-from asca_pillars.data.augment import LabeledFrame
-from asca_pillars.data.dataset import Batch, KittiTrainingSet, Sample, read_frame
+from asca_pillars.data.dataset import Batch, KittiTrainingSet, Sample
+from asca_pillars.data.frames import IGNORED, LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.scans import write_scan
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.spec import DetectorSpec
-from asca_pillars.models.targets import IGNORED, assign_targets
+from asca_pillars.models.targets import assign_targets
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
 
 CONFIG = Config(detector=SPEC, data=DataConfig(train_set="train", val_set="val", workers=0))
 DONT_CARE = KittiObject("DontCare", -1, -1, -10, (500, 150, 540, 190), -1, -1, -1, -1000, -1000, -1000, -10)
+
+
+def read(split: KittiSplit, config: Config, frame_id: str = "000000") -> LabeledFrame:
+    data = config.data
+    names = config.detector.class_names
+    return read_frame(split, frame_id, names, camera_view=data.camera_view, min_points=data.min_points)
 
 
 def with_data(**changes: object) -> Config:
@@ -40,7 +46,7 @@ def one_frame(root: Path, names: tuple[str, ...], extra: tuple[KittiObject, ...]
 def test_types_that_are_classes_neighbors_and_others(tmp_path: Path) -> None:
     names = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
     split, boxes = one_frame(tmp_path, names, extra=(DONT_CARE,))
-    frame = read_frame(split, "000000", CONFIG)
+    frame = read(split, CONFIG)
     assert frame.labels.tolist() == [0, IGNORED, 1, IGNORED, 2] and frame.labels.dtype == np.int64
     # The label file has two decimals.
     np.testing.assert_allclose(frame.boxes, boxes[[0, 1, 3, 4, 5]], atol=0.011)
@@ -59,13 +65,13 @@ def test_labels_follow_the_classes_of_the_config(tmp_path: Path, classes: tuple[
     split, _ = one_frame(tmp_path, ("Car", "Van", "Truck", "Pedestrian", "Person_sitting"))
     named = tuple(dataclasses.replace(SPEC.classes[0], name=name) for name in classes)
     config = dataclasses.replace(CONFIG, detector=DetectorSpec(grid=GRID, classes=named))
-    assert read_frame(split, "000000", config).labels.tolist() == expected
+    assert read(split, config).labels.tolist() == expected
 
 
 def test_objects_with_too_few_points_are_neither_right_nor_wrong(tmp_path: Path) -> None:
     split, boxes = one_frame(tmp_path, ("Car", "Cyclist", "Pedestrian"))
-    points = read_frame(split, "000000", CONFIG).points
-    inside = points_in_boxes(points, read_frame(split, "000000", CONFIG).boxes)
+    points = read(split, CONFIG).points
+    inside = points_in_boxes(points, read(split, CONFIG).boxes)
     cyclist = points[inside[:, 1]]
     assert len(cyclist) > 10
     outside = points[~inside.any(axis=1)]
@@ -76,7 +82,7 @@ def test_objects_with_too_few_points_are_neither_right_nor_wrong(tmp_path: Path)
         (7, [0, 2, IGNORED]),
         (8, [0, IGNORED, IGNORED]),
     ):
-        frame = read_frame(split, "000000", with_data(min_points=min_points))
+        frame = read(split, with_data(min_points=min_points))
         assert frame.labels.tolist() == expected, f"min_points {min_points}"
         assert len(frame.boxes) == len(boxes)
 
@@ -88,10 +94,10 @@ def test_points_that_the_camera_does_not_see_are_left_out(tmp_path: Path) -> Non
     unseen = [[-20.0, 0.0, -1.0, 0.5], [2.0, 15.0, -1.0, 0.5], [2.0, -15.0, -1.0, 0.5], [10.0, 0.0, 8.0, 0.5]]
     cloud = np.array([*seen, *unseen], np.float32)
     write_scan(split.scan_path("000000"), cloud)
-    cropped = read_frame(split, "000000", CONFIG).points
+    cropped = read(split, CONFIG).points
     assert np.array_equal(cropped, cloud[:3])
     assert np.array_equal(cropped, cloud[in_image(cloud, CALIBRATION)])
-    assert np.array_equal(read_frame(split, "000000", with_data(camera_view=False)).points, cloud)
+    assert np.array_equal(read(split, with_data(camera_view=False)).points, cloud)
 
 
 def test_points_are_counted_after_the_crop(tmp_path: Path) -> None:
@@ -101,19 +107,19 @@ def test_points_are_counted_after_the_crop(tmp_path: Path) -> None:
     behind[0] *= -1
     write_scan(split.scan_path("000000"), np.array([[*behind[:3], 0.5]], np.float32))
     write_labels(split.label_path("000000"), objects_from_boxes(behind[None], ("Car",), CALIBRATION))
-    assert read_frame(split, "000000", CONFIG).labels.tolist() == [IGNORED]
-    assert read_frame(split, "000000", with_data(camera_view=False)).labels.tolist() == [0]
+    assert read(split, CONFIG).labels.tolist() == [IGNORED]
+    assert read(split, with_data(camera_view=False)).labels.tolist() == [0]
 
 
 def test_a_frame_without_points_or_labels(tmp_path: Path) -> None:
     split, _ = one_frame(tmp_path, ())
-    frame = read_frame(split, "000000", CONFIG)
+    frame = read(split, CONFIG)
     assert frame.boxes.shape == (0, 7) and frame.labels.shape == (0,) and len(frame.points) > 0
     one_frame(tmp_path, ("Car", "Pedestrian"))
     write_scan(split.scan_path("000000"), np.array([[-9, 0, 0, 0.5]], np.float32))  # behind the camera
     sample = KittiTrainingSet(tmp_path, with_data(train_set="val"), training=True)[0, 0]
     assert len(sample.pillars.cells) == len(sample.targets.positives) == 0
-    frame = read_frame(split, "000000", CONFIG)
+    frame = read(split, CONFIG)
     assert frame.points.shape == (0, 4) and frame.labels.tolist() == [IGNORED, IGNORED]
 
 
@@ -128,7 +134,7 @@ def test_lists_and_modes(tmp_path: Path) -> None:
 
 def test_validation_samples_are_not_augmented(tmp_path: Path) -> None:
     frames = KittiTrainingSet(write_dataset(tmp_path, 3, val_frames=2), CONFIG, training=False)
-    plain = read_frame(frames.split, "000002", CONFIG)
+    plain = read(frames.split, CONFIG, "000002")
     for epoch in (0, 5):
         sample = frames[epoch, 1]
         assert np.array_equal(sample.frame.points, plain.points) and np.array_equal(sample.frame.boxes, plain.boxes)

@@ -146,3 +146,10 @@ def test_nothing_at_all() -> None:
     assert count([], []) == dict.fromkeys(NAMES, (0, 0, 0))
     assert count([(CAR, box(9, 1))], [])["Car"] == (0, 0, 1)
     assert count([], [(CAR, box(9, 1))])["Car"] == (1, 0, 0)
+
+
+def test_an_excused_detection_is_not_false_but_still_finds() -> None:
+    found = detections((CAR, box(10, 2)), (CAR, box(30, 2)), (CAR, box(50, 2)))
+    tally = RecallTally(NAMES)
+    tally.add(found, np.array([box(10, 2)], np.float32), np.array([CAR]), np.array([True, True, False]))
+    assert tally.rows()["Car"][:3] == (1, 1, 1)

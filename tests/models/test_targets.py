@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from asca_pillars.data.frames import IGNORED
 from asca_pillars.geometry.anchors import KITTI_CLASSES, decode_boxes, make_anchors
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.grid import PillarGrid
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.models.targets import IGNORED, Targets, assign_targets
+from asca_pillars.models.targets import Targets, assign_targets
 
 # Rectangular, asymmetric, both minima off zero. Head cells are 0.32 m along y and 0.64, 0.32, 0.16 m along x in
 # the zones that begin at 2.00, 4.56 and 7.12 m: 16 rows, 4 + 8 + 16 columns.

@@ -1,0 +1,78 @@
+"""Labelled frames: points with the boxes and classes that a detector is to find in them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image
+from asca_pillars.data.scans import read_scan
+from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.grid import PillarGrid
+
+IGNORED = -1  # label of a box that is neither to be found nor to be missed
+
+# What KITTI's protocol treats as neither right nor wrong for a class.
+NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
+
+
+@dataclass(frozen=True)
+class LabeledFrame:
+    """One frame with its labels.
+
+    Attributes:
+        frame_id: name of the frame in its dataset.
+        points: (N, 4) float32 x, y, z, reflectance.
+        boxes: (M, 7) float32.
+        labels: (M,) int64 class index, or IGNORED.
+    """
+
+    frame_id: str
+    points: NDArray[np.float32]
+    boxes: NDArray[np.float32]
+    labels: NDArray[np.int64]
+
+
+def read_frame(
+    split: KittiSplit, frame_id: str, class_names: Sequence[str], *, camera_view: bool = True, min_points: int = 1
+) -> LabeledFrame:
+    """Points and labelled boxes of one frame.
+
+    Objects of other types are left out; neighbours of a class (KITTI's Van for Car) and objects with too few points
+    become IGNORED.
+
+    Args:
+        split: the dataset.
+        frame_id: one of `split.frame_ids`.
+        class_names: types that become labels 0, 1, ...
+        camera_view: keep only the points that the camera sees; KITTI labels nothing else.
+        min_points: an object with fewer points inside its box is IGNORED.
+
+    Raises:
+        DatasetError: a missing or damaged file, or an object of a class without a 3D box.
+    """
+    calibration = split.calibration(frame_id)
+    points = read_scan(split.scan_path(frame_id)).points
+    if camera_view:
+        points = points[in_image(points, calibration, split.image_size_wh(frame_id))]
+    known = {NEIGHBOR_TYPES[name]: IGNORED for name in class_names if name in NEIGHBOR_TYPES}
+    known |= {name: index for index, name in enumerate(class_names)}
+    objects = [item for item in split.objects(frame_id) if item.type in known]
+    if flat := [item.type for item in objects if not item.has_box_3d]:
+        raise DatasetError(
+            f"{split.label_path(frame_id)}: a {flat[0]} has no 3D box, its sizes are not all positive; "
+            "complete the line, or make it DontCare"
+        )
+    boxes = boxes_from_objects(objects, calibration)
+    labels = np.array([known[item.type] for item in objects], dtype=np.int64)
+    labels[points_in_boxes(points, boxes).sum(axis=0) < min_points] = IGNORED
+    return LabeledFrame(frame_id, points, boxes, labels)
+
+
+def within_grid(frame: LabeledFrame, grid: PillarGrid) -> LabeledFrame:
+    """The frame without the boxes whose centre lies beside the grid: no anchor stands where they are."""
+    x, y = frame.boxes[:, 0], frame.boxes[:, 1]
+    inside = (x >= grid.x_range_m[0]) & (x < grid.x_range_m[1]) & (y >= grid.y_range_m[0]) & (y < grid.y_range_m[1])
+    return replace(frame, boxes=frame.boxes[inside], labels=frame.labels[inside])
