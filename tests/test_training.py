@@ -80,7 +80,7 @@ def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
 
 def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
     """Kill -9 in the middle of an epoch, start again: the weights are those of a run that was never killed."""
-    data = write_dataset(tmp_path / "data", 13)
+    data = write_dataset(tmp_path / "data", 33)
     config = dataclasses.replace(
         CONFIG, augment=AugmentConfig(), train=dataclasses.replace(CONFIG.train, epochs=3, schedule="one_cycle")
     )
@@ -92,15 +92,15 @@ def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
     process = subprocess.Popen([*command, "--out", str(broken)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     last = broken / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 120
-    while not (last.exists() and load_checkpoint(last).steps >= 8):  # of 18, six to an epoch
+    while not (last.exists() and load_checkpoint(last).steps >= 18):  # of 48, sixteen to an epoch
         assert process.poll() is None and time.monotonic() < deadline, "the run ended before it could be killed"
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    assert load_checkpoint(last).steps < 18, "killed too late to test anything"
+    assert load_checkpoint(last).steps < 48, "killed too late to test anything"
 
     resumed = load_checkpoint(train(config, data, broken))
-    assert resumed.steps == unbroken.steps == 18
+    assert resumed.steps == unbroken.steps == 48
     for (name, expected), found in zip(
         unbroken.detector.state_dict().items(), resumed.detector.state_dict().values(), strict=True
     ):
@@ -124,3 +124,15 @@ def test_samples_do_not_depend_on_what_was_drawn_before(tmp_path: Path) -> None:
     again = frames[3, 1]
     assert np.array_equal(first.pillars.features, again.pillars.features)
     assert not np.array_equal(frames[4, 1].frame.points[:50], first.frame.points[:50])
+
+
+def test_two_processes_train_together(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 9)
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
+    command = [sys.executable, "-m", "asca_pillars.cli", "train", str(tmp_path / "config.yaml"), "--data", str(data)]
+    run = subprocess.run(
+        [*command, "--out", str(tmp_path / "run"), "--devices", "2"], capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    # Eight training frames, two to a batch, two batches at a time, two epochs.
+    assert load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").steps == 4

@@ -1,6 +1,7 @@
 """`asca detect`: scans in, tables, pictures and KITTI text out."""
 
 import json
+import logging
 import statistics
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ def run(
 ) -> None:
     """See `asca detect --help`."""
     console = Console()
+    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     paths = find_scans(sample_scan_path() if scans is None else scans)
     detector = Detector(bundle, provider=provider, threads=threads, score_threshold=score)
     reports: list[FrameReport] = []

@@ -103,7 +103,7 @@ class Bundle(Strict):
 
 def default_bundle_path() -> Path:
     """Folder of the model that comes with the package."""
-    return Path(str(resources.files("asca_deploy") / "bundles" / "asca_pointpillars"))
+    return Path(str(resources.files("asca_deploy") / "bundles" / "asca_small_sim"))
 
 
 def sample_scan_path() -> Path:

@@ -77,7 +77,7 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
 def compare_boxes(expected: Maps, found: Maps, spec: DetectorSpec, scan: int = 0) -> BoxDifference:
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
-    Thresholds are lowered until the best COMPARED_ANCHORS of each class take part. Before suppression nothing but
+    Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before suppression nothing but
     the thresholds can excuse a difference; after it, which of two overlapping boxes of equal score survives can.
 
     Raises:
@@ -88,13 +88,15 @@ def compare_boxes(expected: Maps, found: Maps, spec: DetectorSpec, scan: int = 0
         replace(class_, score_threshold=min(class_.score_threshold, _score_of_rank(logits)))
         for class_, logits in zip(spec.classes, by_class, strict=True)
     )
-    everything = replace(spec.post, nms_iou=1.0, max_detections=spec.post.candidates * len(classes))
+    uncut = replace(spec.post, max_detections=spec.post.candidates * len(classes))
     worst = BoxDifference(0.0, 0.0)
-    for post in (everything, spec.post):
+    for post in (replace(uncut, nms_iou=1.0), uncut):
         lowered = replace(spec, classes=classes, post=post)
         ours, theirs = lowered.decode(expected), lowered.decode(found)
-        for difference in (_pair(ours, theirs, lowered, scan), _pair(theirs, ours, lowered, scan)):
-            worst = BoxDifference(*map(max, zip(worst, difference, strict=True)))
+        forward, our_lone = _pair(ours, theirs)
+        backward, their_lone = _pair(theirs, ours)
+        _require_ties(ours[our_lone], theirs[their_lone], ours, theirs, lowered, scan)
+        worst = BoxDifference(*map(max, zip(worst, forward, backward, strict=True)))
     return worst
 
 
@@ -104,34 +106,53 @@ def _score_of_rank(logits: NDArray[np.float32]) -> float:
     return float(1 / (1 + np.exp(-logit.astype(np.float64))))
 
 
-def _pair(boxes: Detections, partners: Detections, spec: DetectorSpec, scan: int) -> BoxDifference:
+def _pair(boxes: Detections, partners: Detections) -> tuple[BoxDifference, NDArray[np.int64]]:
+    """Largest difference between boxes and their nearest partners, and the boxes (n,) without one in tolerance."""
     worst_m = worst_rad = 0.0
-    for index in range(len(boxes)):
-        box, score = boxes.boxes[index], boxes.scores[index]
-        same = partners[partners.labels == boxes.labels[index]]
-        lengths = np.abs(same.boxes[:, :6] - box[:6]).max(axis=1, initial=0.0)
-        yaws = np.abs(wrap_angle(same.boxes[:, 6] - box[6]))
-        close = (lengths <= BOX_TOLERANCE_M) & (yaws <= YAW_TOLERANCE_RAD)
-        if close.any():
-            best = np.flatnonzero(close)[lengths[close].argmin()]
-            worst_m, worst_rad = max(worst_m, float(lengths[best])), max(worst_rad, float(yaws[best]))
-        elif not _is_tie(boxes, index, same, partners, spec):
-            raise ExportError(
-                f"scan {scan}: stage decode: the {boxes.names[index]} at x = {box[0]:.2f}, y = {box[1]:.2f} m with "
-                f"score {score:.3f} has no partner within {BOX_TOLERANCE_M} m "
-                f"and {np.rad2deg(YAW_TOLERANCE_RAD)} degrees"
-            )
-    return BoxDifference(worst_m, worst_rad)
+    lone = []
+    for index, (box, label) in enumerate(zip(boxes.boxes, boxes.labels, strict=True)):
+        same = partners.boxes[partners.labels == label]
+        lengths = np.abs(same[:, :6] - box[:6]).max(axis=1, initial=0.0)
+        yaws = np.abs(wrap_angle(same[:, 6] - box[6]))
+        close = np.flatnonzero((lengths <= BOX_TOLERANCE_M) & (yaws <= YAW_TOLERANCE_RAD))
+        if len(close) == 0:
+            lone.append(index)
+            continue
+        best = close[lengths[close].argmin()]
+        worst_m, worst_rad = max(worst_m, float(lengths[best])), max(worst_rad, float(yaws[best]))
+    return BoxDifference(worst_m, worst_rad), np.array(lone, dtype=np.int64)
 
 
-def _is_tie(boxes: Detections, index: int, same: Detections, partners: Detections, spec: DetectorSpec) -> bool:
-    """Whether the other detector may rightly lack box `index`: two scores that decide are equal within the tolerance.
+def _require_ties(
+    our_lone: Detections, their_lone: Detections, ours: Detections, theirs: Detections, spec: DetectorSpec, scan: int
+) -> None:
+    """Raise ExportError unless ties between scores explain every box that one side alone has.
 
-    Its own and the class's threshold, or that of the last box that was reported, or that of an overlapping box.
+    A box is explained if its score ties with the threshold or with a box of the other side that overlaps it; and if
+    it overlaps an explained box of the other side, which suppression then put in its place or took out of its way.
     """
-    score = boxes.scores[index]
-    rivals = same[bev_iou(boxes.boxes[index][None], same.boxes)[0] > spec.post.nms_iou]
-    deciding = [spec.classes[boxes.labels[index]].score_threshold, *rivals.scores]
-    if len(partners) == spec.post.max_detections:
-        deciding.append(partners.scores[-1])
-    return bool((np.abs(np.array(deciding) - score) <= MAP_TOLERANCE).any())
+    explained = [_ties(our_lone, theirs, spec), _ties(their_lone, ours, spec)]
+    clash = _clash(our_lone, their_lone, spec)
+    while True:
+        grown = [explained[0] | clash[:, explained[1]].any(axis=1), explained[1] | clash[explained[0]].any(axis=0)]
+        if all(np.array_equal(before, after) for before, after in zip(explained, grown, strict=True)):
+            break
+        explained = grown
+    for lone, known in zip((our_lone, their_lone), explained, strict=True):
+        for name, box, score in zip(lone[~known].names, lone[~known].boxes, lone[~known].scores, strict=True):
+            raise ExportError(
+                f"scan {scan}: stage decode: the {name} at x = {box[0]:.2f}, y = {box[1]:.2f} m with score {score:.3f} "
+                f"has no partner within {BOX_TOLERANCE_M} m and {np.rad2deg(YAW_TOLERANCE_RAD)} degrees"
+            )
+
+
+def _ties(lone: Detections, others: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
+    thresholds = np.array([class_.score_threshold for class_ in spec.classes])
+    tied = np.abs(thresholds[lone.labels] - lone.scores) <= MAP_TOLERANCE
+    equal = np.abs(lone.scores[:, None] - others.scores[None]) <= MAP_TOLERANCE
+    return tied | (_clash(lone, others, spec) & equal).any(axis=1)
+
+
+def _clash(a: Detections, b: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
+    """(N, M): pairs that suppression does not keep side by side."""
+    return (a.labels[:, None] == b.labels[None]) & (bev_iou(a.boxes, b.boxes) > spec.post.nms_iou)

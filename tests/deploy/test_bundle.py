@@ -175,5 +175,5 @@ def test_a_manifest_is_not_written_for_graphs_that_are_not_there(bundle_copy: Pa
 
 
 def test_shipped_files_lie_in_the_package() -> None:
-    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_pointpillars")
+    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_small_sim")
     assert sample_scan_path().parts[-3:] == ("asca_deploy", "samples", "street.bin")

@@ -14,7 +14,7 @@ import torch
 from asca_deploy import Detector, load_bundle
 from asca_export import graphs
 from asca_export.export import export_bundle
-from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes, prove_parity
+from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
 from asca_pillars.config import Config, NetworkConfig
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans import read_scan
@@ -148,9 +148,8 @@ def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: str) -> No
         pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")
     split = KittiSplit(root)
     scans = [read_scan(split.scan_path(frame_id)).points for frame_id in split.frame_ids]
-    checkpoint = _checkpoint(cpa, DetectorSpec())
-    export_bundle(checkpoint, tmp_path, scans)
-    parity = prove_parity(checkpoint.detector, Detector(tmp_path), scans)
+    parity = export_bundle(_checkpoint(cpa, DetectorSpec()), tmp_path, scans).parity
+    assert parity is not None and parity.scans == len(scans)
     assert parity.box_max_error_m <= 0.01 and parity.yaw_max_error_rad <= np.deg2rad(0.5)
 
 
