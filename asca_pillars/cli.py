@@ -117,11 +117,14 @@ def train(
     num_nodes: Annotated[
         int, typer.Option(min=1, help="Machines that train together (torchrun or SLURM starts each).")
     ] = 1,
+    init: Annotated[
+        Path | None, typer.Option(help="Checkpoint whose weights a new run starts from, to go on with other data.")
+    ] = None,
 ) -> None:
     """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder."""
     from asca_pillars.commands.train import run
 
-    run(config, data, out, override or [], devices, num_nodes)
+    run(config, data, out, override or [], devices, num_nodes, init)
 
 
 @app.command()

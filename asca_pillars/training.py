@@ -13,6 +13,7 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.fabric.utilities.warnings import PossibleUserWarning
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch.utils.data import DataLoader
 
 from asca_pillars.config import Config
@@ -23,6 +24,7 @@ from asca_pillars.errors import TrainingError
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.detector import build_detector
 from asca_pillars.models.loss import LossTerms, detection_loss
 from asca_pillars.schema import to_dict
@@ -37,6 +39,7 @@ def train(
     *,
     devices: str = "auto",
     num_nodes: int = 1,
+    init: str | Path | None = None,
 ) -> Path:
     """Train `config` on a KITTI-layout folder, or go on where an interrupted run in `out` stopped.
 
@@ -48,43 +51,27 @@ def train(
         out: folder of this run; one run with the same config in it is resumed exactly.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
+        init: checkpoint whose weights a new run starts from, instead of random ones.
 
     Returns:
         The last checkpoint.
 
     Raises:
-        TrainingError: `out` holds a run with another config, or a loss became infinite or NaN.
+        TrainingError: `out` holds a run with another config, `init` is another network, the devices are not there,
+            or a loss became infinite or NaN.
         DatasetError: the data cannot be read.
     """
     out = Path(out)
     checkpoints = out / "checkpoints"
     last = checkpoints / "last.ckpt"
+    data = DetectionData(config, data_root)
     _claim(out, config)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     L.seed_everything(config.train.seed, verbose=False)
     module = DetectionModule(config)
-    data = DetectionData(config, data_root)
-    trainer = L.Trainer(
-        default_root_dir=out,
-        max_epochs=config.train.epochs,
-        devices=int(devices) if devices.isdigit() else devices,
-        num_nodes=num_nodes,
-        precision="bf16-mixed" if config.train.precision == "bf16" else "32-true",
-        gradient_clip_val=config.train.gradient_clip or None,
-        num_sanity_val_steps=SANITY_STEPS,
-        sync_batchnorm=torch.cuda.is_available(),  # there is no such thing on a CPU
-        use_distributed_sampler=False,
-        enable_model_summary=False,
-        log_every_n_steps=10,
-        plugins=[AtomicCheckpointIO()],
-        logger=TensorBoardLogger(out, name="", version="tensorboard"),
-        callbacks=[
-            ProgressBar(),
-            LearningRateMonitor("step"),
-            _checkpoint(checkpoints, "last", every_n_train_steps=config.train.checkpoint_steps),
-            _checkpoint(checkpoints, "best", monitor="val/loss"),
-        ],
-    )
+    if init is not None and not last.exists():
+        _start_from(module, init)
+    trainer = _trainer(config, out, devices=int(devices) if devices.isdigit() else devices, num_nodes=num_nodes)
     with warnings.catch_warnings():
         # Of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")
@@ -229,6 +216,42 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
         with atomic_path(path) as temporary:
             torch.save(checkpoint, temporary)
+
+
+def _trainer(config: Config, out: Path, **devices: Any) -> L.Trainer:
+    checkpoints = out / "checkpoints"
+    try:
+        return L.Trainer(
+            default_root_dir=out,
+            max_epochs=config.train.epochs,
+            precision="bf16-mixed" if config.train.precision == "bf16" else "32-true",
+            gradient_clip_val=config.train.gradient_clip or None,
+            num_sanity_val_steps=SANITY_STEPS,
+            sync_batchnorm=torch.cuda.is_available(),  # there is no such thing on a CPU
+            use_distributed_sampler=False,
+            enable_model_summary=False,
+            log_every_n_steps=10,
+            plugins=[AtomicCheckpointIO()],
+            logger=TensorBoardLogger(out, name="", version="tensorboard"),
+            callbacks=[
+                ProgressBar(),
+                LearningRateMonitor("step"),
+                _checkpoint(checkpoints, "last", every_n_train_steps=config.train.checkpoint_steps),
+                _checkpoint(checkpoints, "best", monitor="val/loss"),
+            ],
+            **devices,
+        )
+    except (MisconfigurationException, TypeError, ValueError) as error:
+        raise TrainingError(
+            f"devices {devices['devices']} x {devices['num_nodes']} nodes: {' '.join(str(error).split())}"
+        ) from None
+
+
+def _start_from(module: "DetectionModule", path: str | Path) -> None:
+    try:
+        module.detector.load_state_dict(load_checkpoint(path).detector.state_dict())
+    except RuntimeError as error:
+        raise TrainingError(f"{path}: weights of another network ({str(error).splitlines()[1].strip()})") from None
 
 
 def _checkpoint(folder: Path, name: str, **when: Any) -> ModelCheckpoint:

@@ -21,17 +21,21 @@ from asca_pillars.schema import to_dict
 from tests.scenes import make_scene, write_dataset
 from tests.test_training import CONFIG
 
-WITHOUT_TORCH = (
-    "import sys\n"
-    "class Block:\n"
-    "    def find_spec(self, name, *_):\n"
-    "        if name.split('.')[0] in ('torch', 'lightning', 'onnx', 'numba'):\n"
-    "            raise ImportError(name)\n"
-    "sys.meta_path.insert(0, Block())\n"
-    "from asca_pillars.cli import main\n"
-    "sys.argv[0] = 'asca'\n"
-    "main()\n"
-)
+WITHOUT_TORCH = """
+import sys
+from importlib.machinery import PathFinder
+
+class BaseInstall(PathFinder):
+    @classmethod
+    def find_spec(cls, name, *rest):
+        if name.split(".")[0] in ("torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba"):
+            return None
+        return super().find_spec(name, *rest)
+
+sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
+from asca_pillars.cli import main
+main()
+"""
 
 
 def asca(*arguments: object, cwd: Path | None = None, code: str = WITHOUT_TORCH) -> subprocess.CompletedProcess:

@@ -78,6 +78,25 @@ def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
         train(CONFIG, data, tmp_path / "run")
 
 
+def test_a_run_can_start_from_other_weights(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    first = train(CONFIG, data, tmp_path / "first")
+    still = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1, learning_rate=1e-12))
+    second = load_checkpoint(train(still, data, tmp_path / "second", init=first))
+    for (name, expected), found in zip(
+        load_checkpoint(first).detector.named_parameters(), second.detector.parameters(), strict=True
+    ):
+        torch.testing.assert_close(found, expected, msg=name)
+    other = dataclasses.replace(CONFIG, network=dataclasses.replace(NETWORK, pillar_channels=8))
+    with pytest.raises(TrainingError, match="weights of another network"):
+        train(other, data, tmp_path / "third", init=first)
+
+
+def test_devices_that_do_not_exist_are_one_line(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="devices many x 1 nodes"):
+        train(CONFIG, write_dataset(tmp_path / "data", 3), tmp_path / "run", devices="many")
+
+
 def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
     """Kill -9 in the middle of an epoch, start again: the weights are those of a run that was never killed."""
     data = write_dataset(tmp_path / "data", 33)

@@ -7,7 +7,9 @@ from rich.console import Console
 from asca_pillars.commands.extras import require
 
 
-def run(config: Path, data: Path, out: Path, overrides: list[str], devices: str, num_nodes: int) -> None:
+def run(
+    config: Path, data: Path, out: Path, overrides: list[str], devices: str, num_nodes: int, init: Path | None
+) -> None:
     """See `asca train --help`."""
     from asca_pillars.config import load_config
 
@@ -15,5 +17,5 @@ def run(config: Path, data: Path, out: Path, overrides: list[str], devices: str,
     require("train")
     from asca_pillars.training import train
 
-    last = train(settings, data, out, devices=devices, num_nodes=num_nodes)
+    last = train(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)
     Console().print(f"Trained: {last}\nNext: asca export {last} -o {out / 'bundle'}")

@@ -1,5 +1,6 @@
 """Which frames form which batch: a function of the seed and of the optimizer's step, so that a run can be resumed."""
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -12,7 +13,8 @@ class EpochSampler(Sampler[list[tuple[int, int]]]):
     """Batches of (epoch, frame number), whose order depends on the seed and the optimizer's step alone.
 
     A resumed run starts at the batch after the last one that the checkpoint knew. Every rank gets the same number
-    of batches; frames that do not fill a batch on every rank wait for the next epoch's order.
+    of batches, or the ranks would wait for each other for ever: frames that do not fill a batch on every rank wait for
+    the next epoch's order, and in validation the first frames are seen again by the ranks that would have one less.
 
     Args:
         frames: number of frames.
@@ -41,7 +43,7 @@ class EpochSampler(Sampler[list[tuple[int, int]]]):
 
     def __len__(self) -> int:
         if self.step is None:
-            return -(-len(range(self.rank, self.frames, self.world_size)) // self.batch_size)
+            return math.ceil(math.ceil(self.frames / self.world_size) / self.batch_size)
         return self.frames // (self.batch_size * self.world_size)
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
@@ -50,6 +52,8 @@ class EpochSampler(Sampler[list[tuple[int, int]]]):
         order = np.arange(self.frames)
         if self.step is not None:
             order = np.random.default_rng((self.seed, epoch)).permutation(self.frames)
+        else:
+            order = np.resize(order, math.ceil(self.frames / self.world_size) * self.world_size)
         own = order[self.rank :: self.world_size].tolist()
         batches = [own[i * self.batch_size : (i + 1) * self.batch_size] for i in range(start, len(self))]
         return iter([[(epoch, number) for number in batch] for batch in batches])

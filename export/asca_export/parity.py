@@ -77,8 +77,9 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
 def compare_boxes(expected: Maps, found: Maps, spec: DetectorSpec, scan: int = 0) -> BoxDifference:
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
-    Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before suppression nothing but
-    the thresholds can excuse a difference; after it, which of two overlapping boxes of equal score survives can.
+    Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
+    suppression nothing but the thresholds can excuse a difference; after it, which of two overlapping boxes of equal
+    score survives can.
 
     Raises:
         ExportError: a box without a partner within the tolerances that no tie between scores explains.

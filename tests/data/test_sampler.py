@@ -30,6 +30,12 @@ def test_validation_sees_every_frame_once() -> None:
     assert [number for batch in EpochSampler(5, 2, 0, None) for _, number in batch] == [0, 1, 2, 3, 4]
 
 
+def test_validation_gives_every_rank_as_many_batches() -> None:
+    ranks = [EpochSampler(5, 2, 0, None, rank=rank, world_size=3) for rank in range(3)]
+    seen = [[number for batch in sampler for _, number in batch] for sampler in ranks]
+    assert seen == [[0, 3], [1, 4], [2, 0]] and [len(sampler) for sampler in ranks] == [1, 1, 1]
+
+
 def test_too_few_frames_for_a_batch() -> None:
     with pytest.raises(TrainingError, match="3 training frames do not fill one batch of 4"):
         EpochSampler(3, 4, 0, lambda: 0)
