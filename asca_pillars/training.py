@@ -17,7 +17,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch.utils.data import DataLoader
 
 from asca_pillars.config import Config
-from asca_pillars.data.dataset import Batch, KittiTrainingSet
+from asca_pillars.data.dataset import Batch, KittiDataset
 from asca_pillars.data.sampler import EpochSampler
 from asca_pillars.environment import describe_environment
 from asca_pillars.errors import TrainingError
@@ -173,8 +173,8 @@ class DetectionData(L.LightningDataModule):
     def __init__(self, config: Config, root: str | Path) -> None:
         super().__init__()
         self.config = config
-        self.training_set = KittiTrainingSet(root, config, training=True)
-        self.validation_set = KittiTrainingSet(root, config, training=False)
+        self.training_set = KittiDataset(root, config, training=True)
+        self.validation_set = KittiDataset(root, config, training=False)
 
     def train_dataloader(self) -> DataLoader[Any]:
         return self._loader(self.training_set, lambda: self.trainer.global_step if self.trainer else 0)
@@ -182,7 +182,7 @@ class DetectionData(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader[Any]:
         return self._loader(self.validation_set, None)
 
-    def _loader(self, frames: KittiTrainingSet, step: Callable[[], int] | None) -> DataLoader[Any]:
+    def _loader(self, frames: KittiDataset, step: Callable[[], int] | None) -> DataLoader[Any]:
         trainer = self.trainer
         sampler = EpochSampler(
             len(frames),

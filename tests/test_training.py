@@ -14,7 +14,7 @@ import torch
 import yaml
 
 from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, TrainConfig
-from asca_pillars.data.dataset import Batch, KittiTrainingSet
+from asca_pillars.data.dataset import Batch, KittiDataset
 from asca_pillars.errors import TrainingError
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.geometry.decode import HeadMaps
@@ -40,7 +40,7 @@ def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: str) -> None:
     torch.manual_seed(0)
     network = dataclasses.replace(NETWORK, cpa=cpa)
     config = dataclasses.replace(CONFIG, network=network, data=DataConfig(train_set="val", workers=0))
-    frames = KittiTrainingSet(write_dataset(tmp_path, 2, val_frames=2), config, training=False)
+    frames = KittiDataset(write_dataset(tmp_path, 2, val_frames=2), config, training=False)
     batch = Batch([frames[0, 0], frames[0, 1]])
     assert sum(len(boxes) for boxes in batch.boxes) == 8
     detector = build_detector(config)
@@ -128,7 +128,7 @@ def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
 
 
 def test_the_first_loss_that_is_not_finite_stops_and_names_term_and_frames(tmp_path: Path) -> None:
-    frames = KittiTrainingSet(write_dataset(tmp_path, 4), CONFIG, training=True)
+    frames = KittiDataset(write_dataset(tmp_path, 4), CONFIG, training=True)
     module = DetectionModule(CONFIG)
     with torch.no_grad():
         module.detector.head.boxes.bias.fill_(float("nan"))
@@ -137,7 +137,7 @@ def test_the_first_loss_that_is_not_finite_stops_and_names_term_and_frames(tmp_p
 
 
 def test_samples_do_not_depend_on_what_was_drawn_before(tmp_path: Path) -> None:
-    frames = KittiTrainingSet(write_dataset(tmp_path, 4), CONFIG, training=True)
+    frames = KittiDataset(write_dataset(tmp_path, 4), CONFIG, training=True)
     first = frames[3, 1]
     _ = frames[3, 2], frames[4, 1]
     again = frames[3, 1]

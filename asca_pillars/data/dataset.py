@@ -59,7 +59,7 @@ class Batch:
         return self
 
 
-class KittiTrainingSet(Dataset[Sample]):
+class KittiDataset(Dataset[Sample]):
     """Frames of one ImageSets list, augmented when `training`.
 
     What a sample holds depends on the seed, the epoch and the frame alone, not on the number of workers or on what

@@ -18,6 +18,8 @@ from asca_pillars.geometry.grid import PillarGrid
 
 ANCHOR_YAWS_RAD = (0.0, math.pi / 2)
 
+IGNORED = -1  # label of a box that is neither to be found nor to be missed; others are indices into the classes
+
 # Bin 0 holds the yaws in [pi/4, 5pi/4), bin 1 the others. Most boxes stand near an anchor's yaw, and near a
 # bin's border the bin is hard to tell: so no border lies on an anchor's yaw.
 _BIN_START_RAD = math.pi / 4

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from asca_pillars.config import AugmentConfig, Config, DataConfig
-from asca_pillars.data.dataset import Batch, KittiTrainingSet, Sample
-from asca_pillars.data.frames import IGNORED, LabeledFrame, read_frame
+from asca_pillars.data.dataset import Batch, KittiDataset, Sample
+from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.scans import write_scan
 from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.spec import DetectorSpec
 from asca_pillars.models.targets import assign_targets
@@ -117,7 +118,7 @@ def test_a_frame_without_points_or_labels(tmp_path: Path) -> None:
     assert frame.boxes.shape == (0, 7) and frame.labels.shape == (0,) and len(frame.points) > 0
     one_frame(tmp_path, ("Car", "Pedestrian"))
     write_scan(split.scan_path("000000"), np.array([[-9, 0, 0, 0.5]], np.float32))  # behind the camera
-    sample = KittiTrainingSet(tmp_path, with_data(train_set="val"), training=True)[0, 0]
+    sample = KittiDataset(tmp_path, with_data(train_set="val"), training=True)[0, 0]
     assert len(sample.pillars.cells) == len(sample.targets.positives) == 0
     frame = read(split, CONFIG)
     assert frame.points.shape == (0, 4) and frame.labels.tolist() == [IGNORED, IGNORED]
@@ -125,15 +126,15 @@ def test_a_frame_without_points_or_labels(tmp_path: Path) -> None:
 
 def test_lists_and_modes(tmp_path: Path) -> None:
     root = write_dataset(tmp_path, 5, val_frames=2)
-    training, validation = (KittiTrainingSet(root, CONFIG, training=training) for training in (True, False))
+    training, validation = (KittiDataset(root, CONFIG, training=training) for training in (True, False))
     assert training.frame_ids == ("000000", "000001", "000002") and len(training) == 3
     assert validation.frame_ids == ("000003", "000004") and len(validation) == 2
     write_image_set(root, "few", ["000001"])
-    assert KittiTrainingSet(root, with_data(train_set="few"), training=True).frame_ids == ("000001",)
+    assert KittiDataset(root, with_data(train_set="few"), training=True).frame_ids == ("000001",)
 
 
 def test_validation_samples_are_not_augmented(tmp_path: Path) -> None:
-    frames = KittiTrainingSet(write_dataset(tmp_path, 3, val_frames=2), CONFIG, training=False)
+    frames = KittiDataset(write_dataset(tmp_path, 3, val_frames=2), CONFIG, training=False)
     plain = read(frames.split, CONFIG, "000002")
     for epoch in (0, 5):
         sample = frames[epoch, 1]
@@ -143,9 +144,9 @@ def test_validation_samples_are_not_augmented(tmp_path: Path) -> None:
 
 def test_training_samples_change_with_seed_and_epoch_together_with_their_targets(tmp_path: Path) -> None:
     root = write_dataset(tmp_path, 3)
-    frames = KittiTrainingSet(root, CONFIG, training=True)
+    frames = KittiDataset(root, CONFIG, training=True)
     reseeded = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, seed=1))
-    other_seed = KittiTrainingSet(root, reseeded, training=True)
+    other_seed = KittiDataset(root, reseeded, training=True)
     samples = [frames[0, 0], frames[1, 0], other_seed[0, 0]]
     boxes = [sample.frame.boxes for sample in samples]
     assert not any(np.array_equal(boxes[i], boxes[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -163,7 +164,7 @@ def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
     tight = dataclasses.replace(SPEC, limits=dataclasses.replace(SPEC.limits, max_pillars=50))
     still = AugmentConfig(0.0, 0.0, (1.0, 1.0), 0.0, 0.0, 0.0, 0.0)
     config = dataclasses.replace(CONFIG, detector=tight, augment=still)
-    frames = KittiTrainingSet(write_dataset(tmp_path, 2), config, training=True)
+    frames = KittiDataset(write_dataset(tmp_path, 2), config, training=True)
     first, second = frames[0, 0], frames[1, 0]
     assert np.array_equal(first.frame.points, second.frame.points)
     assert len(first.pillars.cells) == 50 and not np.array_equal(first.pillars.cells, second.pillars.cells)
@@ -171,7 +172,7 @@ def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
 
 def samples(root: Path) -> list[Sample]:
     """Three frames of different size; the one in the middle has no points and nothing to find."""
-    frames = KittiTrainingSet(write_dataset(root, 3, val_frames=2), CONFIG, training=False)
+    frames = KittiDataset(write_dataset(root, 3, val_frames=2), CONFIG, training=False)
     no_points, no_boxes = np.empty((0, 4), np.float32), np.empty((0, 7), np.float32)
     empty = LabeledFrame("none", no_points, no_boxes, np.empty(0, np.int64))
     nothing = assign_targets(SPEC.anchors, SPEC.classes, empty.boxes, empty.labels)
@@ -243,5 +244,5 @@ def test_what_is_missing_or_damaged_is_named(
     root = write_dataset(tmp_path, 3)
     damage(KittiSplit(root))
     with pytest.raises(DatasetError, match=message) as caught:
-        _ = KittiTrainingSet(root, CONFIG, training=True)[0, 0]
+        _ = KittiDataset(root, CONFIG, training=True)[0, 0]
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)

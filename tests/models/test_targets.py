@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.data.frames import IGNORED
-from asca_pillars.geometry.anchors import KITTI_CLASSES, decode_boxes, make_anchors
+from asca_pillars.geometry.anchors import IGNORED, KITTI_CLASSES, decode_boxes, make_anchors
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.grid import PillarGrid
 from asca_pillars.geometry.overlap import aligned_bev_iou
