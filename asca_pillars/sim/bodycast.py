@@ -177,15 +177,15 @@ def cast_triangles(triangles, surface, owners, salts, sensor, buffers, key):  # 
 
 
 @numba.njit(cache=True)
-def cast_ellipsoids(centers, matrices, surface, owners, salts, sensor, buffers, key):  # type: ignore[no-untyped-def]
-    """The same for ellipsoids, solid ones and clouds."""
+def cast_ellipsoids(centers, matrices, inverses, surface, owners, salts, sensor, buffers, key):  # type: ignore[no-untyped-def]
+    """The same for ellipsoids, solid ones and clouds; `inverses` of `matrices`, for which numba would want SciPy."""
     slope, origin_z, phase, cos_az, sin_az, first_column, cast_columns, in_camera = sensor
     rho, cosine, reflectance, owner, stamp, alone = buffers
     columns = len(cos_az)
     for e in range(len(centers)):
         cx, cy, cz = centers[e]
         m = matrices[e]
-        inverse = np.linalg.inv(m)
+        inverse = inverses[e]
         half_x = np.sqrt(inverse[0, 0] ** 2 + inverse[0, 1] ** 2 + inverse[0, 2] ** 2)
         half_y = np.sqrt(inverse[1, 0] ** 2 + inverse[1, 1] ** 2 + inverse[1, 2] ** 2)
         half_z = np.sqrt(inverse[2, 0] ** 2 + inverse[2, 1] ** 2 + inverse[2, 2] ** 2)

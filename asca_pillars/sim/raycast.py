@@ -60,7 +60,8 @@ def cast(bodies: Bodies, objects: int, ground: Ground | None, firings: Firings, 
     key = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
     cast_triangles(primitives.triangles, primitives.triangle_surface, bodies.tri_owner, bodies.tri_salt,
                     sensor, buffers, key)  # fmt: skip
-    cast_ellipsoids(primitives.centers, primitives.unit_from_world, primitives.ellipsoid_surface,
+    matrices = primitives.unit_from_world
+    cast_ellipsoids(primitives.centers, matrices, np.linalg.inv(matrices), primitives.ellipsoid_surface,
                      bodies.ell_owner, bodies.ell_salt, sensor, buffers, key)  # fmt: skip
     if ground is not None:
         grass = np.random.default_rng(seed).random((rings, columns), np.float32)
