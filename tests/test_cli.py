@@ -113,6 +113,7 @@ def test_doctor_names_the_missing_extras() -> None:
     result = asca("doctor")
     assert result.returncode == 0, result.stderr
     assert "provider cpu: ok" in result.stdout
+    assert "pip install 'asca-pillars[train]'" in result.stdout and "pip install 'asca-pillars[sim]'" in result.stdout
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ def run(
     report_path: Path | None,
 ) -> None:
     """See `asca bench --help`."""
-    console = Console()
+    console = Console(markup=False)
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]
     detector = Detector(bundle, provider=provider, threads=threads)
     with console.status(f"{rounds} rounds over {len(points)} scan(s)"):

@@ -31,7 +31,7 @@ def run(
     threads: int | None,
 ) -> None:
     """See `asca detect --help`."""
-    console = Console()
+    console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     paths = find_scans(sample_scan_path() if scans is None else scans)
     detector = Detector(bundle, provider=provider, threads=threads, score_threshold=score)
@@ -46,7 +46,7 @@ def run(
     console.print(_table_of_boxes(*results[0]) if len(results) == 1 else _table_of_scans(results, reports))
     for path, report in zip(paths, reports, strict=True):
         for warning in report.warnings:
-            console.print(f"[yellow]{path.name}: {warning}")
+            console.print(f"{path.name}: {warning}", style="yellow")
     while len(reports) < TIMED_FRAMES:
         detector(scan.points)
         reports.append(_report(detector))

@@ -14,7 +14,7 @@ from asca_pillars.machine import cpu_model
 
 def run() -> None:
     """See `asca doctor --help`."""
-    console = Console()
+    console = Console(markup=False)
     console.print(f"Python {platform.python_version()}, {cpu_model()}")
     console.print(", ".join(f"{name} {version}" for name, version in package_versions().items()))
     for name in PROVIDERS:

@@ -21,7 +21,7 @@ def run(checkpoint: Path, out: Path, scans: Path | None, trained_on: str) -> Non
     from asca_export.export import export_bundle
     from asca_pillars.models.checkpoint import load_checkpoint
 
-    console = Console()
+    console = Console(markup=False)
     loaded = load_checkpoint(checkpoint)
     points = _simulated(console) if scans is None else [read_scan(path).points for path in find_scans(scans)]
     environment = _environment(checkpoint)

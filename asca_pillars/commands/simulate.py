@@ -15,4 +15,6 @@ def run(out: Path, frames: int, seed: int, workers: int, view: str, val_share: f
 
     config = parse(SimulationConfig, {"field_of_view": view}, "--view")
     simulate(out, frames, seed, workers, config, val_share)
-    Console().print(f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin")
+    Console(markup=False).print(
+        f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin"
+    )

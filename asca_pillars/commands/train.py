@@ -18,4 +18,4 @@ def run(
     from asca_pillars.training import train
 
     last = train(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)
-    Console().print(f"Trained: {last}\nNext: asca export {last} -o {out / 'bundle'}")
+    Console(markup=False).print(f"Trained: {last}\nNext: asca export {last} -o {out / 'bundle'}")
