@@ -74,6 +74,7 @@ def _export(module: nn.Module, example: Sequence[Tensor], path: Path, **names: A
         logger.setLevel(level)
     assert program is not None
     model = program.model_proto
+    _forget_origin(model.graph)
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path)
 
@@ -106,3 +107,9 @@ def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:
     shape = op.Concat(op.Shape(point_counts), op.Shape(features, start=1), axis=0)
     lowest = op.Expand(op.Constant(value_float=LOWEST), shape)
     return op.ScatterND(lowest, op.Unsqueeze(pillar_index, op.Constant(value_ints=[1])), features, reduction="max")
+
+
+def _forget_origin(graph: Any) -> None:
+    """Drop the stack traces that the exporter writes at every node: they name folders of the exporting machine."""
+    for part in (graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
+        del part.metadata_props[:]

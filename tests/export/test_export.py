@@ -65,6 +65,7 @@ def test_graphs_carry_the_contract(tmp_path: Path) -> None:
         properties = {item.key: json.loads(item.value) for item in model.metadata_props}
         assert properties["spec"]["grid"]["zones"] == SPEC.grid.zones
         assert [spec["name"] for spec in properties["spec"]["classes"]] == list(SPEC.class_names)
+        assert b"site-packages" not in (tmp_path / name).read_bytes()  # nor any other folder of this machine
     encoder = onnx.load(tmp_path / "encoder.onnx").graph
     assert [node.name for node in encoder.input] == ["features", "pillar_index", "point_counts"]
     assert encoder.input[0].type.tensor_type.shape.dim[0].dim_param  # the number of points is dynamic
