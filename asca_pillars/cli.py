@@ -54,7 +54,7 @@ def detect(
             help="A scan (.bin .npy .pcd .ply) or a folder of them. Default: the sample that comes with asca."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and KITTI text.")] = Path("detections"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.")] = Path("detections"),
     bundle: Bundle = None,
     score: Annotated[
         float | None,
@@ -63,7 +63,11 @@ def detect(
     provider: ProviderName = "cpu",
     threads: Threads = None,
 ) -> None:
-    """Find cars, pedestrians and cyclists; write a bird's-eye picture and a KITTI text file per scan."""
+    """Find cars, pedestrians and cyclists; write a bird's-eye picture and the boxes of each scan.
+
+    NAME.json holds the boxes in the LiDAR's frame. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn
+    on the camera image.
+    """
     from asca_pillars.commands.detect import run
 
     run(scans, out, bundle, score, provider, threads)
