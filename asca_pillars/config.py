@@ -13,6 +13,7 @@ from asca_pillars.geometry.spec import DetectorSpec
 from asca_pillars.schema import Strict, parse
 
 CpaReading = Literal["none", "paper", "channel", "point"]
+InsertMethod = Literal["none", "gt_aug", "rs_aug"]
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,37 @@ class LossConfig(Strict):
 
 
 @dataclass(frozen=True)
+class InsertConfig(Strict):
+    """Labelled objects of other frames, put into a training frame before anything else is changed (section 3.5).
+
+    Attributes:
+        method: `rs_aug` sets objects on free ground as the paper does; `gt_aug` leaves them where they stood in
+            their own frame, as SECOND does; `none`.
+        objects: how many are put into a frame where there is room for them.
+        proportions: how often each class is wanted in the augmented training set, by name, relative to each other;
+            empty: every class as often as any other.
+        min_points: objects with fewer points inside their box do not enter the database.
+    """
+
+    method: InsertMethod = "none"
+    objects: int = 6
+    proportions: dict[str, float] = field(default_factory=dict)
+    min_points: int = 5
+
+    def __post_init__(self) -> None:
+        _require("augment.insert", self, ("objects",), low=0)
+        _require("augment.insert", self, ("min_points",), low=1)
+        for name, share in self.proportions.items():
+            if not (math.isfinite(share) and share >= 0):
+                raise ConfigError(f"augment.insert.proportions.{name} = {share:g}: must be at least 0")
+
+
+@dataclass(frozen=True)
 class AugmentConfig(Strict):
     """Random changes of a training frame, each drawn anew for every sample and epoch.
 
     Attributes:
+        insert: objects of other frames that are put into this one.
         flip_probability: of a mirror image about the x axis.
         rotation_rad: the scene turns about z by up to this angle either way.
         scale: (smallest, largest) global scaling.
@@ -69,6 +97,7 @@ class AugmentConfig(Strict):
         point_dropout: largest share of a frame's points that is dropped at random.
     """
 
+    insert: InsertConfig = field(default_factory=InsertConfig)
     flip_probability: float = 0.5
     rotation_rad: float = 0.785398
     scale: tuple[float, float] = (0.95, 1.05)
