@@ -48,6 +48,21 @@ def read_scan(path: str | Path) -> Scan:
     return Scan(points[finite] if dropped else points, dropped)
 
 
+def stored_points(path: Path) -> NDArray[np.float32]:
+    """The numbers of a `.bin` scan as they are stored, (N, 4): of any reflectance scale, perhaps not finite.
+
+    Raises:
+        ScanError: they are no whole number of points.
+    """
+    data = path.read_bytes()
+    if len(data) % _POINT_BYTES:
+        raise ScanError(
+            f"{path}: {len(data)} bytes are no whole number of points of {_POINT_BYTES} "
+            f"(float32 x, y, z, reflectance); {AGAIN}"
+        )
+    return np.frombuffer(data, dtype="<f4").reshape(-1, 4).astype(np.float32)
+
+
 def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
     """Write points (N, 4), N > 0, as KITTI's `.bin`: little-endian float32 x, y, z, reflectance.
 
@@ -88,13 +103,7 @@ def _natural_order(path: Path) -> tuple[list[str | int], str]:
 
 
 def _read_bin(path: Path) -> NDArray[np.float32]:
-    data = path.read_bytes()
-    if len(data) % _POINT_BYTES:
-        raise ScanError(
-            f"{path}: {len(data)} bytes are no whole number of points of {_POINT_BYTES} "
-            f"(float32 x, y, z, reflectance); {AGAIN}"
-        )
-    points = np.frombuffer(data, dtype="<f4").reshape(-1, 4).astype(np.float32)
+    points = stored_points(path)
     points[:, 3] = unit_reflectance(points[:, 3])
     return points
 

@@ -22,12 +22,14 @@ class Targets:
         positives: (n,) flat indices into (H, W, A) of the positive anchors, ascending.
         residuals: (n, 7) float32 box residuals of the positive anchors.
         directions: (n,) int64 direction bin of the positive anchors.
+        matched: (n,) int64 the box, by its row, that each positive anchor is to find.
     """
 
     state: NDArray[np.int8]
     positives: NDArray[np.int64]
     residuals: NDArray[np.float32]
     directions: NDArray[np.int64]
+    matched: NDArray[np.int64]
 
 
 def assign_targets(
@@ -80,9 +82,9 @@ def assign_targets(
         state[tuple(places.T)] = 1
         best_box[tuple(places.T)] = box_index
     positives = np.flatnonzero(state == 1)
-    matched = boxes[best_box.reshape(-1)[positives]]
-    residuals, directions = encode_boxes(matched, anchors.reshape(-1, 7)[positives])
-    return Targets(state, positives, residuals, directions)
+    matched = best_box.reshape(-1)[positives]
+    residuals, directions = encode_boxes(boxes[matched], anchors.reshape(-1, 7)[positives])
+    return Targets(state, positives, residuals, directions, matched)
 
 
 def _anchors_of(class_index: int) -> slice:

@@ -11,12 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.pillarize import PillarCounts
+from asca_pillars.geometry.sensor_height import TOLERANCE_M, ground_z_m
 from asca_pillars.schema import Strict
 
-GROUND_RING_M = (4.0, 20.0)  # beyond the vehicle's own roof, before the beams become sparse
-GROUND_PERCENTILE = 10.0  # below it lie ditches and reflections
-GROUND_MIN_POINTS = 50
-SENSOR_HEIGHT_TOLERANCE_M = 0.5
 OUTSIDE_SHARE = 0.95
 SAMPLE_POINTS = 16_384  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
 
@@ -59,18 +56,6 @@ def expected_input(scans: Iterable[NDArray[np.float32]]) -> ExpectedInput:
     )
 
 
-def ground_z_m(points: NDArray[np.float32]) -> float | None:
-    """Height of the ground around the sensor, metres: a low percentile of z in a near ring of the points.
-
-    Takes (N, 4); None if the ring holds too few points to tell.
-    """
-    x, y = points[:, 0], points[:, 1]
-    squared_range = x * x + y * y
-    ring = (squared_range > GROUND_RING_M[0] ** 2) & (squared_range < GROUND_RING_M[1] ** 2)
-    near_z = points[ring, 2]
-    return float(np.percentile(near_z, GROUND_PERCENTILE)) if len(near_z) >= GROUND_MIN_POINTS else None
-
-
 def check_input(points: NDArray[np.float32], counts: PillarCounts, expected: ExpectedInput) -> list[InputWarning]:
     """Compare a scan (N, 4) of finite points, and what pillarize counted in it, with the training scans."""
     fewest, most = expected.points_per_scan
@@ -104,7 +89,7 @@ def _height_warning(points: NDArray[np.float32], expected: ExpectedInput) -> Inp
     if ground is None or expected.ground_z_m is None:
         return None
     low, high = expected.ground_z_m
-    if low - SENSOR_HEIGHT_TOLERANCE_M <= ground <= high + SENSOR_HEIGHT_TOLERANCE_M:
+    if low - TOLERANCE_M <= ground <= high + TOLERANCE_M:
         return None
     text = (
         f"the ground near the sensor lies at z = {ground:.2f} m, in training at {low:.2f} to {high:.2f} m: "

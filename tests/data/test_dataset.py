@@ -162,7 +162,9 @@ def test_training_samples_change_with_seed_and_epoch_together_with_their_targets
 def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
     """In training another subset each epoch, even of a frame that nothing else changes."""
     tight = dataclasses.replace(SPEC, limits=dataclasses.replace(SPEC.limits, max_pillars=50))
-    still = AugmentConfig(0.0, 0.0, (1.0, 1.0), 0.0, 0.0, 0.0, 0.0)
+    still = AugmentConfig(
+        flip_probability=0.0, rotation_rad=0.0, scale=(1.0, 1.0), object_rotation_rad=0.0, object_shift_m=0.0
+    )
     config = dataclasses.replace(CONFIG, detector=tight, augment=still)
     frames = KittiDataset(write_dataset(tmp_path, 2), config, training=True)
     first, second = frames[0, 0], frames[1, 0]

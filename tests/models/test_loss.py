@@ -22,6 +22,7 @@ NO_TARGETS = Targets(
     np.empty(0, np.int64),
     np.empty((0, 7), np.float32),
     np.empty(0, np.int64),
+    np.empty(0, np.int64),
 )
 
 

@@ -87,6 +87,7 @@ def test_equals_a_plain_loop_over_all_anchors(labelled: tuple[np.ndarray, np.nda
     states, matches = assign_twin(boxes, labels)
     assert targets.state.reshape(-1).tolist() == states
     assert targets.positives.tolist() == sorted(matches)
+    assert targets.matched.tolist() == [matches[index] for index in sorted(matches)]
     decoded = decode_boxes(targets.residuals, targets.directions, ANCHORS.reshape(-1, 7)[targets.positives])
     expected = boxes[[matches[index] for index in sorted(matches)]].reshape(-1, 7)
     np.testing.assert_allclose(decoded[:, :6], expected[:, :6], rtol=1e-5, atol=1e-5)
