@@ -109,6 +109,25 @@ def simulate(
 
 
 @app.command()
+def inspect(
+    data: Annotated[Path, typer.Argument(help="KITTI-layout folder with training/ and ImageSets/.")],
+    config: Annotated[Path, typer.Option("--config", "-c", help="YAML to train with, or the name of one that ships.")],
+    split: Annotated[
+        str | None, typer.Option(help="A list in ImageSets/, or training for every scan. Default: data.train_set.")
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", "-n", min=1, help="Look at so many frames, evenly spaced.")] = 500,
+    json: Annotated[Path | None, typer.Option("--json", help="Also write what was found to this file.")] = None,
+) -> None:
+    """Look at a dataset before training: objects, points, sizes and positives per class, ranges, scans.
+
+    Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 2.
+    """
+    from asca_pillars.commands.inspect import run
+
+    run(data, config, split, frames, json)
+
+
+@app.command()
 def train(
     config: Annotated[Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")],
     data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")],
@@ -131,6 +150,55 @@ def train(
     run(config, data, out, override or [], devices, num_nodes, init)
 
 
+@app.command("eval")
+def evaluate(
+    model: Annotated[
+        Path | None,
+        typer.Argument(help="Bundle (folder) or checkpoint (.ckpt). Default: the bundle that comes with asca."),
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option("--data", "-d", help="KITTI-layout folder whose labels count; a model is run on it.")
+    ] = None,
+    split: Annotated[str, typer.Option(help="A list of ImageSets/, or training for every frame; with --data.")] = "val",
+    predictions: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of KITTI text with scores, instead of a model; one file per frame, empty if nothing was found."
+        ),
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(help="Folder of KITTI labels for --predictions. Default: those of --data.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for report, curves, gallery and the model's predictions.")
+    ] = Path("evaluation"),
+    json: Annotated[Path | None, typer.Option("--json", help="Also write the report's JSON to this file.")] = None,
+    gallery: Annotated[
+        int | None, typer.Option(min=0, help="Worst frames to draw. Default: 8 if there are scans (--data).")
+    ] = None,
+    score: Annotated[
+        float | None,
+        typer.Option(
+            help="Score from which on detections count for recall, precision and gallery. "
+            "Default: the model's, per class; 0.3 for --predictions."
+        ),
+    ] = None,
+    min_score: Annotated[
+        float,
+        typer.Option(min=0, max=1, help="Lowest score that a model is run with: AP needs the weak detections too."),
+    ] = 0.05,
+    provider: ProviderName = "cpu",
+    threads: Threads = None,
+) -> None:
+    """Score a model, or finished predictions, by KITTI's protocol: AP and AOS, by distance, recall and precision.
+
+    Frames without a prediction file are left out, as by KITTI's own tool, and named in every form of the report.
+    """
+    from asca_pillars.commands.eval import run
+
+    run(model, data, split, predictions, labels, out, json, gallery, score, min_score, provider, threads)
+
+
 @app.command()
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="RUN/checkpoints/best.ckpt or last.ckpt.")],
@@ -145,6 +213,25 @@ def export(
     from asca_pillars.commands.export import run
 
     run(checkpoint, out, scans, trained_on)
+
+
+@app.command()
+def ablate(
+    config: Annotated[str, typer.Argument(help="Base: a YAML, or the name of one that ships, such as ablation_small.")],
+    data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with ImageSets/{train,val}.txt.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the runs; finished ones there are kept.")],
+    seeds: Annotated[str, typer.Option(help="Seeds of every variant, with commas between them.")] = "0,1",
+    variants: Annotated[str, typer.Option(help="Names with commas between them, or all.")] = "all",
+    jobs: Annotated[int, typer.Option(min=1, help="Trainings at a time; they share the CPU cores.")] = 1,
+) -> None:
+    """Train and compare: with and without ASP, CPA, GT-Aug and RS-Aug, other K, the readings of CPA; write one table.
+
+    Table 5 of the paper, on equal terms and with the spread over the seeds, on whatever data you have. Goes on where it
+    stopped when the same command is given again.
+    """
+    from asca_pillars.commands.ablate import run
+
+    run(config, data, out, seeds, variants, jobs)
 
 
 @app.command()

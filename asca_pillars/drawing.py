@@ -78,6 +78,8 @@ class Texts:
 
     def put(self, text: str, places: Sequence[tuple[float, float]], color: Color) -> None:
         """Write at the first of the places (left end of the base line) that is free; leave it out if none is."""
+        if not text:
+            return
         width, height = self.size(text)
         for x, y in places:
             x = min(max(x, 2.0), self.canvas.shape[1] - width - 2.0)

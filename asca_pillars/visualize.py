@@ -3,6 +3,7 @@
 import math
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,7 @@ _CLASS_COLORS: dict[str, Color] = {
 _OTHER_COLORS: tuple[Color, ...] = ((255, 200, 70), (255, 120, 200), (90, 230, 230), (200, 200, 200))
 _RING, _GRAY, _WHITE = (74, 62, 54), (190, 180, 172), (255, 255, 255)
 _POINT_PX = 3
+_LEGEND_PX, _LEGEND_ROW_PX = 200, 22  # width kept free for it, and height of a row
 _RING_TEXT_DEG = (-40, -30, 40, 30, 0, -135, 135, 180)
 
 
@@ -37,6 +39,20 @@ def write_png(path: str | Path, image: Image) -> None:
     encoded = cv2.imencode(".png", image)[1]
     with atomic_path(path) as temporary:
         temporary.write_bytes(encoded.tobytes())
+
+
+@dataclass(frozen=True, eq=False)
+class BoxLayer:
+    """Boxes that are drawn alike, and their line in the legend."""
+
+    name: str
+    boxes: NDArray[np.floating]
+    """(N, 7) LiDAR boxes."""
+    color: Color
+    texts: Sequence[str] = ()
+    """What stands beside each box; nothing if empty."""
+    thickness_px: int = 4
+    """Of the outline, before the picture is made half as large."""
 
 
 def draw_bev(
@@ -56,26 +72,36 @@ def draw_bev(
 
     The picture shows the part of the grid's range in which there is something.
     """
-    boxes = detections.boxes if detections is not None else np.zeros((0, 7), np.float32)
-    labels = labels if labels is not None else np.zeros((0, 7), np.float32)
+    layers = []
+    found = Detections.empty(()) if detections is None else detections
+    for label, name in enumerate(found.class_names):
+        own = found[found.labels == label]
+        layers.append(BoxLayer(name, own.boxes, class_color(name), [f"{score:.2f}" for score in own.scores]))
+    if labels is not None and len(labels):
+        layers.append(BoxLayer("ground truth", labels, _WHITE, thickness_px=2))
+    return draw_layers(points, layers, grid, width_px=width_px)
+
+
+def draw_layers(
+    points: NDArray[np.floating], layers: Sequence[BoxLayer], grid: PillarGrid, *, width_px: int = 1000
+) -> Image:
+    """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend."""
     points = points[_in_range(points, grid)]
-    outlines = [footprints(np.asarray(some, dtype=np.float64)) for some in (boxes, labels)]
+    outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
     view = View.around(np.concatenate([points[:, :2], *(o.reshape(-1, 2) for o in outlines)]), grid, width_px)
 
     canvas = np.full((view.height_px, view.width_px, 3), BACKGROUND, np.uint8)
     texts = Texts(canvas, 0.42 * OVERSAMPLING)
-    _draw_rings(texts, view)
+    _draw_rings(texts, view, legend_rows=len(layers))
     _draw_points(canvas, view, points)
-    names = detections.names if detections is not None else []
-    for outline in outlines[1]:
-        _draw_footprint(canvas, view.pixels(outline), _WHITE, 2)
-    for outline, name in zip(outlines[0], names, strict=True):
-        _draw_footprint(canvas, view.pixels(outline), class_color(name), 4)
-    _draw_legend(texts, view, detections, len(labels))
-    if detections is not None:
-        for outline, name, score in zip(outlines[0], names, detections.scores, strict=True):
+    for layer, layer_outlines in reversed(list(zip(layers, outlines, strict=True))):
+        for outline in layer_outlines:
+            _draw_footprint(canvas, view.pixels(outline), layer.color, layer.thickness_px)
+    _draw_legend(texts, view, layers)
+    for layer, layer_outlines in zip(layers, outlines, strict=True):
+        for outline, text in zip(layer_outlines, layer.texts, strict=bool(layer.texts)):
             if view.shows(view.pixels(outline.mean(axis=0))):
-                _put_beside(texts, view.pixels(outline), f"{score:.2f}", class_color(name))
+                _put_beside(texts, view.pixels(outline), text, layer.color)
     size = (view.width_px // OVERSAMPLING, view.height_px // OVERSAMPLING)
     return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
@@ -86,17 +112,20 @@ def draw_on_image(
     names: Sequence[str],
     scores: Sequence[float] | NDArray[np.floating] | None,
     calib: Calibration,
+    *,
+    colors: Sequence[Color] | None = None,
 ) -> Image:
     """A copy of a camera image (H, W, 3) with LiDAR boxes (N, 7) as wireframes, their front faces tinted.
 
-    `scores` is None for ground truth. What lies behind the camera is cut off.
+    `scores` is None for ground truth, `colors` for those of the classes. What lies behind the camera is cut off.
     """
+    colors = [class_color(name) for name in names] if colors is None else colors
     canvas = image.copy()
     edges = project_edges(boxes, calib)
     _, depths_m = calib.project(np.asarray(boxes)[:, :3])
     far_to_near = [int(i) for i in np.argsort(-depths_m, kind="stable") if np.isfinite(edges[i]).any()]
     for i in far_to_near:
-        color = class_color(names[i])
+        color = colors[i]
         front = edges[i, [3, 11, 7, 8]]
         if np.isfinite(front).all():
             # Corners 3, 0, 4, 7 go round the front. With an edge behind the camera there is nothing to fill.
@@ -114,7 +143,7 @@ def draw_on_image(
         low, high = visible.min(axis=0), visible.max(axis=0)
         if (high > 0).all() and (low < (canvas.shape[1], canvas.shape[0])).all():
             text = names[i] if scores is None else f"{names[i]} {scores[i]:.2f}"
-            texts.put(text, [(low[0], low[1] - 5), (low[0], high[1] + 14)], class_color(names[i]))
+            texts.put(text, [(low[0], low[1] - 5), (low[0], high[1] + 14)], colors[i])
     return np.asarray(canvas, dtype=np.uint8)
 
 
@@ -139,8 +168,9 @@ def _draw_points(canvas: Image, view: View, points: NDArray[np.floating]) -> Non
             canvas[row, np.minimum(columns + right, view.width_px - 1)] = colors
 
 
-def _draw_rings(texts: Texts, view: View) -> None:
-    """Circles of equal distance to the sensor, and the sensor as a small arrow."""
+def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
+    """Circles of equal distance to the sensor, with texts beside the legend's place, and the sensor as an arrow."""
+    legend = np.array([_LEGEND_PX, _LEGEND_ROW_PX * (legend_rows + 1)]) * OVERSAMPLING
     reach_m = math.hypot(view.x_max_m, max(abs(view.y_max_m), abs(view.y_max_m - view.width_px / view.px_per_m)))
     step_m = 10 if reach_m < 100 else 20
     around = np.radians(np.arange(360))
@@ -149,7 +179,8 @@ def _draw_rings(texts: Texts, view: View) -> None:
         ring = view.pixels(radius_m * circle)
         cv2.polylines(texts.canvas, [subpixels(ring)], True, _RING, 2, cv2.LINE_AA, SUBPIXEL_BITS)
         # Beside the way ahead, where there is the least to hide; elsewhere only if the picture does not show that.
-        visible = [pixel for angle_deg in _RING_TEXT_DEG if view.shows(pixel := ring[angle_deg], 60)]
+        places = [ring[angle_deg] for angle_deg in _RING_TEXT_DEG]
+        visible = [pixel for pixel in places if view.shows(pixel, 60) and (pixel > legend).any()]
         if visible:
             texts.put(f"{radius_m} m", [(visible[0][0] - 20, visible[0][1] + 8)], _GRAY)
     arrow = view.pixels(np.array([[1.3, 0], [-0.5, 0.8], [0, 0], [-0.5, -0.8]]))
@@ -171,13 +202,10 @@ def _put_beside(texts: Texts, outline: NDArray[np.float64], text: str, color: Co
     texts.put(text, [(right + 8, middle), (left - width - 8, middle), above, below], color)
 
 
-def _draw_legend(texts: Texts, view: View, detections: Detections | None, label_count: int) -> None:
-    """Legend with the number of boxes of each class, and the scale."""
-    names = detections.names if detections is not None else []
-    classes = detections.class_names if detections is not None else ()
-    rows = [(f"{name}  {names.count(name)}", class_color(name)) for name in classes]
-    rows += [(f"ground truth  {label_count}", _WHITE)] if label_count else []
-    line = 22 * OVERSAMPLING
+def _draw_legend(texts: Texts, view: View, layers: Sequence[BoxLayer]) -> None:
+    """Legend with the number of boxes of each layer, and the scale."""
+    rows = [(f"{layer.name}  {len(layer.boxes)}", layer.color) for layer in layers]
+    line = _LEGEND_ROW_PX * OVERSAMPLING
     for number, (text, color) in enumerate(rows):
         left, base = 16 * OVERSAMPLING, 12 * OVERSAMPLING + (number + 1) * line - line // 4
         cv2.rectangle(texts.canvas, (left, base - line // 2), (left + line // 2, base), color, -1)

@@ -68,7 +68,7 @@ def test_help_loads_nothing_heavy() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    for command in ("detect", "bench", "simulate", "train", "export", "doctor"):
+    for command in ("detect", "bench", "simulate", "inspect", "train", "eval", "export", "ablate", "doctor"):
         assert command in result.stdout
 
 

@@ -7,7 +7,7 @@ import pytest
 from asca_pillars.data.calibration import Calibration
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.visualize import class_color, draw_bev, draw_on_image, write_png
+from asca_pillars.visualize import BoxLayer, class_color, draw_bev, draw_layers, draw_on_image, write_png
 
 AHEAD = PillarGrid(x_range_m=(5.12, 25.6), y_range_m=(-10.24, 5.12), zones=1)
 AROUND = PillarGrid(x_range_m=(-10.24, 20.48), y_range_m=(-5.12, 10.24), zones=1)
@@ -167,3 +167,35 @@ def test_png_round_trip(tmp_path):
     write_png(tmp_path / "new" / "a.png", image)
     assert np.array_equal(cv2.imread(str(tmp_path / "new" / "a.png")), image)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.png"]
+
+
+def test_the_first_layer_is_on_top():
+    box = np.array([[15.0, -2, -1, 8, 3, 2, 0.3]])
+    red, blue = BoxLayer("a", box, (0, 0, 255)), BoxLayer("b", box, (255, 0, 0))
+    for layers in ([red, blue], [blue, red]):
+        image = draw_layers(NO_POINTS, layers, AHEAD, width_px=500)[110:]
+        top, hidden = (len(near(image, layer.color)[0]) for layer in layers)
+        assert top > 100 > 10 * hidden
+
+
+def test_every_layer_keeps_its_line_in_the_legend():
+    """The texts of the rings keep clear of it: in this view one would stand on the fourth and fifth line."""
+    layers = [BoxLayer(f"kind {number}", np.zeros((0, 7)), (10, 10, 10)) for number in range(8)]
+    grid = PillarGrid(x_range_m=(0, 69.12), y_range_m=(-39.68, 39.68), zones=1)
+    corners = np.array([[x, y, 0, 0] for x in (0.1, 45) for y in (-1, 10)], np.float32)
+    image = draw_layers(corners, layers, grid)
+    for number in range(len(layers)):
+        row = image[12 + 22 * number : 12 + 22 * (number + 1), 38:110]
+        assert (row > 200).all(axis=-1).sum() > 40, number
+
+
+def test_boxes_on_the_image_take_given_colors():
+    calib = Calibration(
+        p2=np.array([[700.0, 0, 250, 0], [0, 700, 150, 0], [0, 0, 1, 0]]),
+        r0_rect=np.eye(3),
+        camera_from_lidar=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]),
+    )
+    image, box = np.zeros((300, 500, 3), np.uint8), np.array([[12.0, 0, 0, 4, 2, 2, 0]])
+    drawn = draw_on_image(image, box, [""], None, calib, colors=[(255, 0, 255)])
+    assert len(near(drawn, (255, 0, 255))[0]) > 100
+    assert not drawn[..., 1].any()  # an empty text leaves no mark

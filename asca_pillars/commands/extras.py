@@ -4,7 +4,11 @@ import importlib.util
 
 from asca_pillars.errors import AscaError
 
-EXTRAS = {"train": ("torch", "lightning", "onnx", "onnxscript", "tensorboard"), "sim": ("numba",)}
+EXTRAS = {
+    "train": ("torch", "lightning", "onnx", "onnxscript", "tensorboard"),
+    "sim": ("numba",),
+    "eval": ("matplotlib",),
+}
 
 
 def missing_modules(extra: str) -> list[str]:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.evaluation.assignment import greedy_matches
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 
@@ -98,15 +99,12 @@ def _count(
 ) -> tuple[int, int, int]:
     """Objects, found and false detections of one class in one frame; detections by descending score."""
     iou = bev_iou(found_boxes, boxes)
+    rows, columns = np.nonzero(iou >= min_iou)
+    order = np.lexsort((-iou[rows, columns], rows))
+    rows, columns = rows[order], columns[order]
+    matched = greedy_matches(rows, columns)
     near = np.hypot(boxes[:, 0], boxes[:, 1]) <= max_distance_m
-    free = np.ones(len(boxes), dtype=bool)
-    found = false = 0
-    for box, excuse, row in zip(found_boxes, excused, iou, strict=True):
-        candidates = np.where(free, row, 0.0)
-        best = int(candidates.argmax()) if len(candidates) else -1
-        if best >= 0 and candidates[best] >= min_iou:
-            free[best] = False
-            found += bool(wanted[best] and near[best])
-        elif not excuse and np.hypot(box[0], box[1]) <= max_distance_m:
-            false += 1
-    return int((wanted & near).sum()), found, false
+    false = ~excused & (np.hypot(found_boxes[:, 0], found_boxes[:, 1]) <= max_distance_m)
+    false[rows[matched]] = False
+    counted = wanted & near
+    return int(counted.sum()), int(counted[columns[matched]].sum()), int(false.sum())

@@ -41,10 +41,12 @@ def wrap_angle(angle_rad: ArrayLike, period: float = 2 * math.pi) -> NDArray[Any
     wrapped = angle - period * np.floor((angle + half) / period)
     wrapped = np.where(wrapped >= half, -half, np.maximum(wrapped, -half)).astype(dtype)
     if dtype == np.float32:
-        limit = np.float32(half)
-        if float(limit) >= half:
-            limit = np.nextafter(limit, np.float32(0))
-        wrapped = np.clip(wrapped, -limit, limit)
+        low, high = np.float32(-half), np.float32(half)
+        if float(low) < -half:
+            low = np.nextafter(low, np.float32(0))
+        if float(high) >= half:
+            high = np.nextafter(high, np.float32(0))
+        wrapped = np.clip(wrapped, low, high)
     return wrapped
 
 

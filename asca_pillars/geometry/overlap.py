@@ -24,8 +24,38 @@ def bev_intersection(a: _Boxes, b: _Boxes) -> _Doubles:
     first, second = a.astype(np.float64), b.astype(np.float64)
     shared = np.zeros((len(a), len(b)))
     rows, columns = _near_pairs(first, second)
-    shared[rows, columns] = _paired_intersection(first[rows], second[columns])
+    shared[rows, columns] = paired_bev_intersection(first[rows], second[columns])
     return shared
+
+
+def paired_bev_intersection(a: _Doubles, b: _Doubles) -> _Doubles:
+    """Area shared by the footprints of a[k] and b[k], square metres: (K, 7), (K, 7) float64 -> (K,).
+
+    In b's own frame b is |x| <= bl, |y| <= bw. The area of a inside it is the line integral of -y dx around
+    a's border, counter-clockwise, with x held within bl and y within bw: what lies outside is pressed flat
+    onto b's border, where the ways there and back cancel. Every term is continuous in the corners, so boxes
+    that touch, coincide or nearly coincide need no special case, and there are no lists of vertices to keep.
+    """
+    cos, sin = np.cos(b[:, 6]), np.sin(b[:, 6])
+    dx, dy = a[:, 0] - b[:, 0], a[:, 1] - b[:, 1]
+    x, y = cos * dx + sin * dy, cos * dy - sin * dx
+    cos, sin = np.cos(a[:, 6] - b[:, 6]), np.sin(a[:, 6] - b[:, 6])
+    al, aw, bl, bw = a[:, 3] / 2, a[:, 4] / 2, b[:, 3] / 2, b[:, 4] / 2
+
+    area = np.zeros(len(a))
+    corners = [
+        (x + cos * along - sin * across, y + sin * along + cos * across)
+        for along, across in ((al, aw), (-al, aw), (-al, -aw), (al, -aw))
+    ]
+    for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
+        area -= _pressed_integral(start, end, bl, bw)
+
+    # Rounding leaves some 1e-16 where nothing is shared; the separating axes tell for certain.
+    cos_abs, sin_abs = np.abs(cos), np.abs(sin)
+    apart = (np.abs(x) >= bl + cos_abs * al + sin_abs * aw) | (np.abs(y) >= bw + sin_abs * al + cos_abs * aw)
+    apart |= np.abs(cos * x + sin * y) >= al + cos_abs * bl + sin_abs * bw
+    apart |= np.abs(cos * y - sin * x) >= aw + sin_abs * bl + cos_abs * bw
+    return np.where(apart, 0.0, np.clip(area, 0.0, 4 * np.minimum(al * aw, bl * bw)))
 
 
 def bev_iou(a: _Boxes, b: _Boxes) -> _Doubles:
@@ -83,36 +113,6 @@ def _near_pairs(a: _Doubles, b: _Doubles) -> tuple[NDArray[np.int64], NDArray[np
     reach = np.hypot(a[:, 3], a[:, 4])[:, None] + np.hypot(b[:, 3], b[:, 4])[None, :]
     rows, columns = np.nonzero(4 * squared < np.square(reach))
     return rows, columns
-
-
-def _paired_intersection(a: _Doubles, b: _Doubles) -> _Doubles:
-    """Area shared by a[k] and b[k]: (K, 7), (K, 7) -> (K,).
-
-    In b's own frame b is |x| <= bl, |y| <= bw. The area of a inside it is the line integral of -y dx around
-    a's border, counter-clockwise, with x held within bl and y within bw: what lies outside is pressed flat
-    onto b's border, where the ways there and back cancel. Every term is continuous in the corners, so boxes
-    that touch, coincide or nearly coincide need no special case, and there are no lists of vertices to keep.
-    """
-    cos, sin = np.cos(b[:, 6]), np.sin(b[:, 6])
-    dx, dy = a[:, 0] - b[:, 0], a[:, 1] - b[:, 1]
-    x, y = cos * dx + sin * dy, cos * dy - sin * dx
-    cos, sin = np.cos(a[:, 6] - b[:, 6]), np.sin(a[:, 6] - b[:, 6])
-    al, aw, bl, bw = a[:, 3] / 2, a[:, 4] / 2, b[:, 3] / 2, b[:, 4] / 2
-
-    area = np.zeros(len(a))
-    corners = [
-        (x + cos * along - sin * across, y + sin * along + cos * across)
-        for along, across in ((al, aw), (-al, aw), (-al, -aw), (al, -aw))
-    ]
-    for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
-        area -= _pressed_integral(start, end, bl, bw)
-
-    # Rounding leaves some 1e-16 where nothing is shared; the separating axes tell for certain.
-    cos_abs, sin_abs = np.abs(cos), np.abs(sin)
-    apart = (np.abs(x) >= bl + cos_abs * al + sin_abs * aw) | (np.abs(y) >= bw + sin_abs * al + cos_abs * aw)
-    apart |= np.abs(cos * x + sin * y) >= al + cos_abs * bl + sin_abs * bw
-    apart |= np.abs(cos * y - sin * x) >= aw + sin_abs * bl + cos_abs * bw
-    return np.where(apart, 0.0, np.clip(area, 0.0, 4 * np.minimum(al * aw, bl * bw)))
 
 
 def _pressed_integral(start: _Point, end: _Point, x_limit: _Doubles, y_limit: _Doubles) -> _Doubles:

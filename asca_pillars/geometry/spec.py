@@ -1,6 +1,6 @@
 """One detector's numbers, all that training and the vehicle must agree on. `bundle.json` carries it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -47,6 +47,10 @@ class DetectorSpec:
         anchors = make_anchors(self.grid, self.classes)
         anchors.flags.writeable = False
         return anchors
+
+    def with_score_threshold(self, score: float) -> "DetectorSpec":
+        """The same detector that reports detections of every class from `score` on."""
+        return replace(self, classes=tuple(replace(spec, score_threshold=score) for spec in self.classes))
 
     def pillarize(self, points: NDArray[np.float32], rng: np.random.Generator | None = None) -> Pillars:
         """Pillars of an (N, 4) scan on this detector's grid, see `pillarize`."""

@@ -2,7 +2,7 @@
 
 import hashlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -100,6 +100,28 @@ def benchmark(
         graphs_sha256={"encoder": graphs.encoder.sha256, "backbone": graphs.backbone.sha256},
         input_sha256=_sha256(scans),
     )
+
+
+def compare(
+    detectors: Mapping[str, Detector], scans: Sequence[NDArray[np.float32]], rounds: int = 10
+) -> dict[str, NDArray[np.float64]]:
+    """Time several detectors in alternation, so that whatever else the machine does meets all of them alike.
+
+    Args:
+        detectors: by name.
+        scans: (N, 4) each; every round passes all of them through every detector.
+
+    Returns:
+        By name (rounds,) the median time of one scan in each round, milliseconds; divide two of them element by element
+        for ratios that a busy machine does not spoil.
+    """
+    for detector in detectors.values():
+        detector(scans[0])
+    times = {name: np.empty(rounds) for name in detectors}
+    for number in range(rounds):
+        for name, detector in detectors.items():
+            times[name][number] = np.median([_frame(detector, scan).total_ms for scan in scans])
+    return times
 
 
 def _frame(detector: Detector, scan: NDArray[np.float32]) -> FrameReport:

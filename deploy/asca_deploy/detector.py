@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,7 +19,6 @@ from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.pillarize import FEATURES, PillarCounts, Pillars
-from asca_pillars.geometry.spec import DetectorSpec
 from asca_pillars.machine import default_threads
 
 STAGES = ("input", "pillarize", "encode", "scatter", "neck+head", "decode")
@@ -79,7 +78,8 @@ class Detector:
             raise ConfigError(f"threads {self.threads} must be at least 1")
         providers = select_providers(provider)
         self.bundle = load_bundle(self.folder)
-        self.spec = _with_threshold(self.bundle.spec, score_threshold)
+        spec = self.bundle.spec
+        self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
         self._backbone = _open_backbone(self.folder, self.bundle, providers, self.threads)
         # Both graphs on the same provider: in "auto" the first one found out which starts.
         self.provider = self._backbone.provider
@@ -188,12 +188,6 @@ def _finite_points(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:
         return scan, 0
     usable = finite.all(axis=1)
     return scan[usable], int(len(scan) - usable.sum())
-
-
-def _with_threshold(spec: DetectorSpec, score_threshold: float | None) -> DetectorSpec:
-    if score_threshold is None:
-        return spec
-    return replace(spec, classes=tuple(replace(c, score_threshold=score_threshold) for c in spec.classes))
 
 
 def _open_encoder(folder: Path, bundle: Bundle, providers: list[str]) -> Graph:

@@ -36,7 +36,7 @@ def count(
     return {name: row[:3] for name, row in tally.rows().items()}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(st.sampled_from([CAR, PEDESTRIAN, CYCLIST]), st.integers(0, 11), st.integers(-6, 6)),
@@ -77,8 +77,9 @@ def test_a_second_detection_of_an_object_is_false() -> None:
 def test_two_neighbors_share_two_detections() -> None:
     """The better detection takes the object it overlaps most and leaves the other one to the next."""
     wanted = [(PEDESTRIAN, box(10.0, 0, PEDESTRIAN)), (PEDESTRIAN, box(10.2, 0, PEDESTRIAN))]
-    found = [(PEDESTRIAN, box(10.2, 0, PEDESTRIAN)), (PEDESTRIAN, box(10.25, 0, PEDESTRIAN))]
-    assert count(found, wanted)["Pedestrian"] == (2, 2, 0)
+    for second_x in (10.25, 9.7):  # prefers the one that is taken; reaches only the other one
+        found = [(PEDESTRIAN, box(10.2, 0, PEDESTRIAN)), (PEDESTRIAN, box(second_x, 0, PEDESTRIAN))]
+        assert count(found, wanted)["Pedestrian"] == (2, 2, 0)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from asca_pillars.geometry.boxes import corners, footprints, points_in_boxes, wrap_angle
@@ -100,6 +100,7 @@ def test_no_boxes_and_no_points() -> None:
 
 
 @given(st.floats(-1e4, 1e4), st.sampled_from([2 * math.pi, math.pi, 1.0]), st.sampled_from([np.float32, float]))
+@example(-0.5, 1.0, np.float32)  # a lower end that float32 holds exactly
 def test_wrapped_angles_differ_by_whole_periods(angle: float, period: float, dtype: type) -> None:
     angle = dtype(angle)
     wrapped = wrap_angle(angle, period)

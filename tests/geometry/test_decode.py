@@ -71,7 +71,7 @@ def decode_twin(maps: HeadMaps, post: PostProcess) -> list[tuple[float, int, np.
     return sorted(reported, key=lambda item: -item[0])[: post.max_detections]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([-6.0, -4.0]),

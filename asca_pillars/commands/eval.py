@@ -1,0 +1,184 @@
+"""`asca eval`: a model or finished predictions against labels, as KITTI scores them."""
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from asca_pillars.commands.extras import missing_modules
+from asca_pillars.commands.models import Model, open_model
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.environment import describe_environment
+from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.evaluation import gallery
+from asca_pillars.evaluation.curves import write_curves
+from asca_pillars.evaluation.kitti import DIFFICULTIES, evaluate
+from asca_pillars.evaluation.operating_point import operating_points
+from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
+from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
+from asca_pillars.evaluation.verdicts import verdicts
+from asca_pillars.files import atomic_directory, atomic_path
+from asca_pillars.geometry.grid import PillarGrid
+
+CLASS_NAMES = ("Car", "Pedestrian", "Cyclist")
+TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
+GALLERY = 8
+MADE_BY = "made_by.json"  # marks a folder of predictions as ours to replace
+
+
+@dataclass(frozen=True)
+class Task:
+    """Predictions and labels to compare, from where they are, and where their scans are if anywhere."""
+
+    subject: str
+    predictions: Path
+    labels: Path
+    split: KittiSplit | None
+    grid: PillarGrid
+    scores: dict[str, float]
+    about: dict[str, Any]
+
+
+def run(
+    model: Path | None,
+    data: Path | None,
+    split_name: str,
+    predictions: Path | None,
+    labels: Path | None,
+    out: Path,
+    json_path: Path | None,
+    gallery_frames: int | None,
+    score: float | None,
+    min_score: float,
+    provider: str,
+    threads: int | None,
+) -> None:
+    """See `asca eval --help`."""
+    console = Console(markup=False)
+    _check_arguments(model, data, predictions, labels, gallery_frames, score)
+    split = None if data is None else KittiSplit(data, split_name)
+    if labels is None:
+        assert split is not None, "checked with the arguments"
+        labels = split.folder / "label_2"
+    truth = read_truth(labels, None if split is None else split.frame_ids)
+    if predictions is not None:
+        scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE if score is None else score)
+        about = {"predictions": str(predictions), "labels": str(labels)}
+        task = Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid(), scores, about)
+    else:
+        assert split is not None, "checked with the arguments"
+        opened = open_model(model, min_score, provider, threads)
+        scores = _fixed_scores(opened, score, min_score)
+        task = _run_model(opened, split, labels, scores, out, console)
+    frames = read_predictions(task.predictions, truth, labels, console=console)
+    _report(task, frames, out, json_path, console)
+    _draw_gallery(task, frames, out, gallery_frames, console)
+    console.print(f"Written to {out}/", highlight=False)
+
+
+def _check_arguments(
+    model: Path | None,
+    data: Path | None,
+    predictions: Path | None,
+    labels: Path | None,
+    gallery_frames: int | None,
+    score: float | None,
+) -> None:
+    if predictions is not None and model is not None:
+        raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
+    if predictions is None and labels is not None:
+        raise ConfigError(f"--labels {labels} goes with --predictions DIR; a model is run on --data ROOT")
+    if predictions is None and data is None:
+        raise ConfigError("nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR")
+    if predictions is not None and labels is None and data is None:
+        raise ConfigError(f"--predictions {predictions} needs --labels DIR, or --data ROOT that has the labels")
+    if gallery_frames and data is None:
+        raise ConfigError(f"--gallery {gallery_frames} draws scans: give --data ROOT that has them")
+    if score is not None and not math.isfinite(score):
+        raise ConfigError(f"--score {score} must be a number")
+
+
+def _fixed_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
+    """For each class the score from which on detections count for precision and recall."""
+    known = {name.lower(): name for name in CLASS_NAMES}
+    scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
+    for item in model.spec.classes:
+        if item.name.lower() not in known:
+            raise ConfigError(f"{model.name} detects {item.name}; KITTI's protocol knows {', '.join(CLASS_NAMES)}")
+        fixed = item.score_threshold if score is None else score
+        if fixed < min_score:
+            raise ConfigError(
+                f"score {fixed:g} of {item.name} is below --min-score {min_score:g}, the lowest that {model.name} is "
+                "run with; lower --min-score"
+            )
+        scores[known[item.name.lower()]] = fixed
+    return scores
+
+
+def _run_model(
+    model: Model, split: KittiSplit, labels: Path, scores: dict[str, float], out: Path, console: Console
+) -> Task:
+    """Write the model's predictions to `out`: what is scored is read from there, so that it can be scored again."""
+    about = {"model": model.about, "data": str(split.root), "split": split.name}
+    with _replacing(out / "predictions", MADE_BY) as folder:
+        write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
+        _write_json(folder / MADE_BY, about)
+    if model.unlike:
+        console.print(
+            f"{len(model.unlike)} of {len(split.frame_ids)} scans are unlike those that {model.name} was trained on; "
+            f"the first: {model.unlike[0]}",
+            style="yellow",
+            soft_wrap=True,
+        )
+    subject = f"{model.name} on {split.root}, {split.name}"
+    return Task(subject, out / "predictions", labels, split, model.spec.grid, scores, about)
+
+
+def _report(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
+    """Evaluate; print and write the tables, the JSON (to `json_path` too) and the curves."""
+    truth, found = frames.truth, frames.detections
+    ap = evaluate(truth, found, CLASS_NAMES, bands_m=tuple(BANDS_M), progress=True)
+    points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES)
+    about = task.about | {"environment": json.loads(describe_environment())}
+    report = EvalReport(task.subject, frames, ap, points, about)
+    print_report(report, console)
+    content = to_json(report)
+    for path in (json_path, out / "report.json"):
+        if path is not None:
+            _write_json(path, content)
+    with atomic_path(out / "report.md") as temporary:
+        temporary.write_text(to_markdown(report), encoding="utf-8")
+    if missing_modules("eval"):
+        console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
+    else:
+        write_curves(out / "curves.png", ap.overall, report.title)
+
+
+def _draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:
+    count = GALLERY if count is None else count
+    if task.split is None or count == 0:
+        return
+    judged = verdicts(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
+    worst = gallery.worst_frames(judged, count)
+    folders = task.split, task.labels, task.predictions
+    with _replacing(out / "gallery", gallery.INDEX) as folder:
+        gallery.write_gallery(folder, worst, *folders, task.grid, task.subject, console=console)
+
+
+@contextmanager
+def _replacing(folder: Path, marker: str) -> Iterator[Path]:
+    """A temporary folder that takes the place of `folder`, unless there is one that an evaluation did not write."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / marker).is_file():
+        raise DatasetError(f"{folder}: holds files that `asca eval` did not write; choose another --out, or move them")
+    with atomic_directory(folder) as temporary:
+        yield temporary
+
+
+def _write_json(path: Path, content: Any) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,0 +1,101 @@
+"""A model that is to be run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy import Detections, Detector
+from asca_pillars.commands.extras import require
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.spec import DetectorSpec
+
+
+@dataclass(frozen=True)
+class Model:
+    """A detector and what is to be known about it.
+
+    Attributes:
+        name: of the model.
+        detect: (N, 4) points -> detections, from `min_score` on.
+        spec: as the model was made, with its own thresholds.
+        camera_view: whether it expects only the points in the image.
+        about: where it comes from and where it runs, for the report.
+        unlike: for each scan that does not look like those of the training, the first reason.
+    """
+
+    name: str
+    detect: Callable[[NDArray[np.float32]], Detections]
+    spec: DetectorSpec
+    camera_view: bool
+    about: dict[str, Any]
+    unlike: list[str] = field(default_factory=list)
+
+
+def open_model(path: Path | None, min_score: float, provider: str, threads: int | None) -> Model:
+    """Open a bundle's folder or a checkpoint file; None for the bundle that ships.
+
+    Raises:
+        AscaError: missing, damaged, or not to be run as asked; one line.
+    """
+    if path is not None and (path.is_file() or path.suffix == ".ckpt"):
+        return _open_checkpoint(path, min_score, provider, threads)
+    return _open_bundle(path, min_score, provider, threads)
+
+
+def _open_bundle(path: Path | None, min_score: float, provider: str, threads: int | None) -> Model:
+    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are collected below
+    detector = Detector(path, provider=provider, threads=threads, score_threshold=min_score)
+    bundle = detector.bundle
+    unlike: list[str] = []
+
+    def detect(points: NDArray[np.float32]) -> Detections:
+        detections = detector(points)
+        assert detector.last_frame is not None, "the detector has run"
+        unlike.extend(detector.last_frame.warnings[:1])
+        return detections
+
+    about = {
+        "name": bundle.name,
+        "bundle": str(detector.folder),
+        "sha256": {"encoder": bundle.graphs.encoder.sha256, "backbone": bundle.graphs.backbone.sha256},
+        "trained_on": bundle.provenance.trained_on,
+        "provider": detector.provider,
+        "threads": detector.threads,
+        "min_score": min_score,
+    }
+    # Bundles do not say which view they were trained on; KITTI labels the camera's, and so is what is scored.
+    return Model(bundle.name, detect, bundle.spec, camera_view=True, about=about, unlike=unlike)
+
+
+def _open_checkpoint(path: Path, min_score: float, provider: str, threads: int | None) -> Model:
+    require("train")
+    import torch
+
+    from asca_pillars.models.checkpoint import load_checkpoint
+    from asca_pillars.models.inference import ScanDetector
+
+    if threads is not None and threads < 1:
+        raise ConfigError(f"threads {threads} must be at least 1")
+    if provider not in ("cpu", "cuda", "auto"):
+        raise ConfigError(f"provider {provider} does not run checkpoints: choose cpu, cuda or auto, or give a bundle")
+    if provider == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("provider cuda: PyTorch finds no CUDA device here; choose cpu")
+    device = "cpu" if provider == "cpu" or not torch.cuda.is_available() else "cuda"
+    if threads is not None:
+        torch.set_num_threads(threads)
+    config, network, steps = load_checkpoint(path)
+    about = {
+        "name": config.name,
+        "checkpoint": str(path),
+        "steps": steps,
+        "provider": f"torch {device}",
+        "threads": torch.get_num_threads(),
+        "min_score": min_score,
+    }
+    detect = ScanDetector(network.to(device), config.detector.with_score_threshold(min_score))
+    return Model(config.name, detect, config.detector, config.data.camera_view, about)

@@ -1,0 +1,169 @@
+"""Predictions to be scored: KITTI text that is read beside its labels, or written by a detector run over a split.
+
+The official tool evaluates the frames that have a detection file. So does this one, and says which frames that leaves
+out: a frame without detections needs an empty file.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from asca_pillars.data.kitti import KittiSplit, in_image, objects_from_boxes, read_labels, write_labels
+from asca_pillars.data.scans import read_scan
+from asca_pillars.errors import DatasetError
+from asca_pillars.evaluation.objects import FrameObjects, frame_objects
+from asca_pillars.geometry.detections import Detections
+
+KITTI_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
+_KNOWN = {name.lower() for name in KITTI_TYPES}
+
+
+@dataclass(frozen=True)
+class ScoredFrames:
+    """Labels and predictions of the same frames in the same order, and the frames that have no prediction file."""
+
+    truth: tuple[FrameObjects, ...]
+    detections: tuple[FrameObjects, ...]
+    without_predictions: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+    @property
+    def asked(self) -> int:
+        """Frames that were to be evaluated."""
+        return len(self.truth) + len(self.without_predictions)
+
+    @property
+    def shortage(self) -> str | None:
+        """One sentence that belongs beside every number if not all frames were evaluated; None if all were."""
+        if not self.without_predictions:
+            return None
+        first, *others = self.without_predictions
+        more = f" and {len(others)} {'other' if len(others) == 1 else 'others'}" if others else ""
+        return (
+            f"evaluated on {len(self)} of {self.asked} frames: no prediction file for {first}{more}; "
+            "a frame without detections needs an empty file"
+        )
+
+
+def read_truth(folder: str | Path, frame_ids: Sequence[str] | None = None) -> list[FrameObjects]:
+    """The labels of a folder, those of `frame_ids` or of every file in it, by frame id.
+
+    Raises:
+        DatasetError: a missing or empty folder, a missing or damaged file; names file, line, value and remedy.
+    """
+    chosen = _frame_ids(Path(folder), "labels") if frame_ids is None else sorted(frame_ids)
+    return [_read_frame(Path(folder), frame_id, scored=False) for frame_id in chosen]
+
+
+def read_predictions(
+    folder: str | Path, truth: Sequence[FrameObjects], labels: str | Path, *, console: Console | None = None
+) -> ScoredFrames:
+    """Pair the labels with the predictions of a folder of KITTI text, one file per frame.
+
+    Predictions of frames that have labels but are not among `truth` (another split) are left out.
+
+    Args:
+        folder: with NAME.txt of 16 fields per line.
+        truth: labels of the frames to be evaluated.
+        labels: the folder that they are from.
+        console: shows the progress.
+
+    Raises:
+        DatasetError: as `read_truth`; a line without a score; a prediction without labels.
+    """
+    folder, labels = Path(folder), Path(labels)
+    there = _frame_ids(folder, "predictions")
+    known = {frame.frame_id for frame in truth}
+    unlabeled = [name for name in there if name not in known and not (labels / f"{name}.txt").is_file()]
+    pairs = [frame for frame in truth if frame.frame_id in set(there)]
+    if not pairs:
+        raise DatasetError(
+            f"{folder}: none of its {len(there)} files is of a frame to be evaluated, as {truth[0].frame_id}.txt would "
+            f"be; give files the names of those in {labels}"
+        )
+    if unlabeled:
+        raise DatasetError(
+            f"{folder / unlabeled[0]}.txt: a prediction without labels, there is no {labels / unlabeled[0]}.txt "
+            f"({len(unlabeled)} such); remove it or add the labels"
+        )
+    detections = tuple(
+        _read_frame(folder, frame.frame_id, scored=True)
+        for frame in track(pairs, "Reading predictions", console=console, disable=console is None)
+    )
+    missing = tuple(frame.frame_id for frame in truth if frame.frame_id not in set(there))
+    return ScoredFrames(tuple(pairs), detections, missing)
+
+
+def write_predictions(
+    folder: str | Path,
+    split: KittiSplit,
+    detect: Callable[[NDArray[np.float32]], Detections],
+    *,
+    camera_view: bool = True,
+    console: Console | None = None,
+) -> None:
+    """Run a detector over a split and write what the camera sees as KITTI text, one file per frame.
+
+    KITTI labels nothing outside the image, so detections there cannot be judged and are left out.
+
+    Args:
+        folder: for NAME.txt of each frame, an empty file where nothing was found.
+        split: the frames; their scans and calibrations are read, their labels are not.
+        detect: (N, 4) points -> detections, for instance `asca_deploy.Detector` or `models.inference.ScanDetector`.
+        camera_view: give the detector only the points in the image, as it has seen in training.
+        console: shows the progress.
+
+    Raises:
+        DatasetError, ScanError: a frame cannot be read.
+    """
+    for frame_id in track(split.frame_ids, "Detecting", console=console, disable=console is None):
+        calibration, image_size_wh = split.calibration(frame_id), split.image_size_wh(frame_id)
+        points = read_scan(split.scan_path(frame_id)).points
+        if camera_view:
+            points = points[in_image(points, calibration, image_size_wh)]
+        found = detect(points)
+        objects = objects_from_boxes(found.boxes, found.names, calibration, image_size_wh, found.scores)
+        write_labels(Path(folder) / f"{frame_id}.txt", [item for item in objects if item.bbox[2] > item.bbox[0]])
+
+
+def _frame_ids(folder: Path, what: str) -> list[str]:
+    try:
+        names = sorted(path.stem for path in folder.iterdir() if path.suffix == ".txt")
+    except OSError as error:
+        raise DatasetError(
+            f"{folder}: cannot read this folder of {what} ({error.strerror}); correct the path"
+        ) from None
+    if not names:
+        inside = [path.parent.name for path in sorted(folder.glob("*/*.txt"))]
+        hint = f"; its folder {inside[0]}/ has some, give that" if inside else "; give the folder with <frame id>.txt"
+        raise DatasetError(f"{folder}: no *.txt {what} there{hint}")
+    return names
+
+
+def _read_frame(folder: Path, frame_id: str, *, scored: bool) -> FrameObjects:
+    path = folder / f"{frame_id}.txt"
+    objects = read_labels(path)
+    for index, item in enumerate(objects):
+        if item.type.lower() not in _KNOWN:
+            raise DatasetError(
+                f"{_place(path, index)}: unknown class '{item.type}'; KITTI has {', '.join(KITTI_TYPES)}; "
+                "rename it or remove the line"
+            )
+        if scored and item.score is None:
+            raise DatasetError(
+                f"{_place(path, index)}: 15 fields, but a prediction has 16; append the score at the end of the line"
+            )
+    return frame_objects(frame_id, objects)
+
+
+def _place(path: Path, index: int) -> str:
+    """FILE:LINE of an object: empty lines are not objects."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    return f"{path}:{[number for number, line in enumerate(lines, start=1) if line.strip()][index]}"

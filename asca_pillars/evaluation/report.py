@@ -1,0 +1,217 @@
+"""The report of an evaluation: the same tables on the console, as Markdown and as JSON."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from math import isnan
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from asca_pillars.evaluation.kitti import DIFFICULTIES, METRICS, Curve, KittiEvaluation, KittiResults
+from asca_pillars.evaluation.operating_point import OperatingPoint
+from asca_pillars.evaluation.predictions import ScoredFrames
+
+BANDS_M = {
+    (0.0, 40.0): "Table 4 of ASCA-PointPillars",
+    (40.0, 80.0): "Table 4 of ASCA-PointPillars",
+    (0.0, 30.0): "Table 3 of Deformable PV-RCNN",
+    (30.0, 50.0): "Table 3 of Deformable PV-RCNN",
+}
+"""Bands of the distance from the camera, and who reports them; the ASCA paper gives the mean and no difficulty."""
+METRIC_TITLES = {"bbox": "2D", "bev": "BEV", "3d": "3D", "aos": "AOS"}
+SMALL_SET = 40
+"""With so few counted objects the protocol itself keeps a perfect detector below 100."""
+_NONE = "-"
+
+
+@dataclass(frozen=True)
+class EvalReport:
+    """What was evaluated, and every number about it."""
+
+    subject: str
+    """The model or folder and the data, in words."""
+    frames: ScoredFrames
+    ap: KittiEvaluation
+    points: Sequence[OperatingPoint]
+    about: dict[str, Any]
+    """Model, command, machine and versions, for the JSON."""
+
+    @property
+    def title(self) -> str:
+        """The subject, and how many frames stand behind the numbers."""
+        return f"{self.subject}: {self.frames.shortage or f'{len(self.frames)} frames'}"
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of texts; the first `left` columns are names, the others numbers. Line breaks are for the console."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    left: int = 2
+
+
+def tables(report: EvalReport) -> list[TextTable]:
+    """AP, AP by distance, recall and precision at the fixed scores."""
+    recall = [(point, point.found, point.objects, point.recall, point.recall_interval) for point in report.points]
+    precision = [
+        (point, point.true, point.detections, point.precision, point.precision_interval) for point in report.points
+    ]
+    return [
+        _ap_table(report.ap.overall),
+        _band_table(report.ap),
+        _share_table("Recall", ("objects", "found"), recall),
+        _share_table("Precision", ("detections", "true"), precision),
+    ]
+
+
+def notes(report: EvalReport) -> list[str]:
+    """What one must know to read the tables: classes that were not evaluated, and sets too small for their AP."""
+    results = report.ap.overall
+    lines = []
+    for name in results.class_names:
+        if not any(results.curve(name, metric, DIFFICULTIES[0]) for metric in METRICS):
+            lines.append(f"{name}: not evaluated, because nothing was detected as one; the means leave the class out")
+        lines += [
+            _cap_note(curve) for curve in _counts_of(results, name) if curve is not None and curve.counted <= SMALL_SET
+        ]
+    return lines
+
+
+def print_report(report: EvalReport, console: Console) -> None:
+    """Tables and notes on the console."""
+    console.print(report.title, style="bold", highlight=False, soft_wrap=True)
+    for table in tables(report):
+        drawn = Table()
+        for index, column in enumerate(table.columns):
+            drawn.add_column(column, justify="left" if index < table.left else "right")
+        last = None
+        for name, *cells in table.rows:
+            if table.left > 1 and last not in (None, name):
+                drawn.add_section()
+            drawn.add_row("" if name == last else name, *cells)
+            last = name
+        console.print(f"\n{table.title}", highlight=False, soft_wrap=True)
+        console.print(drawn)
+    for line in notes(report):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def to_markdown(report: EvalReport) -> str:
+    """The tables and notes as Markdown."""
+    parts = [f"# {report.title}\n"]
+    for table in tables(report):
+        ruler = ["---" if index < table.left else "---:" for index in range(len(table.columns))]
+        columns = [column.replace("\n", " ") for column in table.columns]
+        lines = [f"| {' | '.join(cells)} |" for cells in (columns, ruler, *table.rows)]
+        parts.append("\n".join([f"## {table.title}\n", *lines, ""]))
+    if lines := notes(report):
+        parts.append("\n".join([*(f"- {line}" for line in lines), ""]))
+    return "\n".join(parts)
+
+
+def to_json(report: EvalReport) -> dict[str, Any]:
+    """Everything in the report; `results` has the shape of KITTI's: class, metric, R11 / R40 / precision."""
+    return {
+        "subject": report.subject,
+        "frames": len(report.frames),
+        "frames_asked": report.frames.asked,
+        "frames_without_predictions": list(report.frames.without_predictions),
+        "shortage": report.frames.shortage,
+        "results": report.ap.overall.to_json(),
+        "bands": [
+            {
+                "low_m": low,
+                "high_m": high,
+                "mean_3d_moderate_R40": band.mean_ap("3d", "moderate"),
+                "results": band.to_json(),
+            }
+            for (low, high), band in report.ap.bands.items()
+        ],
+        "operating_points": [_without_nan(asdict(point)) for point in report.points],
+        "notes": notes(report),
+        **report.about,
+    }
+
+
+def _ap_table(results: KittiResults) -> TextTable:
+    rows: list[tuple[str, ...]] = []
+    for name in results.class_names:
+        counted = [_NONE if curve is None else str(curve.counted) for curve in _counts_of(results, name)]
+        rows.append((name, "objects", *counted, *counted))
+        for metric, title in METRIC_TITLES.items():
+            curves = [results.curve(name, metric, difficulty) for difficulty in DIFFICULTIES]
+            r40 = [_percent(None if curve is None else curve.r40) for curve in curves]
+            r11 = [_percent(None if curve is None else curve.r11) for curve in curves]
+            rows.append((name, title, *r40, *r11))
+    for metric, title in METRIC_TITLES.items():
+        means = [_percent(results.mean_ap(metric, difficulty)) for difficulty in DIFFICULTIES]
+        rows.append(("mean", title, *means, *[""] * len(DIFFICULTIES)))
+    columns = [f"{average}\n{difficulty}" for average in ("R40", "R11") for difficulty in DIFFICULTIES]
+    title = "Average precision (%) of KITTI's protocol, over 40 and over 11 recall points, and the objects it counts"
+    return TextTable(title, ("class", "metric", *columns), tuple(rows))
+
+
+def _band_table(ap: KittiEvaluation) -> TextTable:
+    names = ap.overall.class_names
+    rows = tuple(
+        (f"{low:g}-{high:g} m", _percent(band.mean_ap("3d", "moderate")), *(_band_cell(band, name) for name in names))
+        for (low, high), band in ap.bands.items()
+    )
+    sources = "; ".join(dict.fromkeys(BANDS_M[band] for band in ap.bands if band in BANDS_M))
+    title = f"3D AP (%, R40, moderate) by distance, in brackets the counted objects (bands of {sources})"
+    return TextTable(title, ("distance", "mean", *names), rows, left=1)
+
+
+def _band_cell(band: KittiResults, name: str) -> str:
+    curve = band.curve(name, "3d", "moderate")
+    if curve is None:
+        return _NONE
+    return f"{_percent(curve.r40 if curve.counted else None)} ({curve.counted})"
+
+
+def _share_table(
+    what: str,
+    columns: tuple[str, str],
+    shares: Sequence[tuple[OperatingPoint, int, int, float, tuple[float, float]]],
+) -> TextTable:
+    """Rows of (operating point, part, whole, share, interval)."""
+    rows = tuple(
+        (point.class_name, point.difficulty, str(whole), str(part), *_percents(share, interval))
+        for point, part, whole, share, interval in shares
+    )
+    # A dictionary rather than a set keeps the order of the classes.
+    fixed = dict.fromkeys(f"{p.class_name} {p.score:g} (IoU {p.min_overlap:g})" for p, *_ in shares)
+    title = f"{what} (%) in 3D of what reaches the score: {', '.join(fixed)}"
+    return TextTable(title, ("class", "difficulty", *columns, what.lower(), "95 % interval"), rows)
+
+
+def _percents(share: float, interval: tuple[float, float]) -> tuple[str, str]:
+    if isnan(share):  # a share of nothing
+        return _NONE, _NONE
+    return _percent(100 * share), f"{100 * interval[0]:.2f} - {100 * interval[1]:.2f}"
+
+
+def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
+    """JSON knows no NaN: a share of nothing is null."""
+    return {key: None if isinstance(value, float) and isnan(value) else value for key, value in values.items()}
+
+
+def _counts_of(results: KittiResults, name: str) -> Iterator[Curve | None]:
+    """For each difficulty a curve of the class, which knows the counted objects: the same for every metric."""
+    for difficulty in DIFFICULTIES:
+        yield next((c for metric in METRICS if (c := results.curve(name, metric, difficulty))), None)
+
+
+def _cap_note(curve: Curve) -> str:
+    what = f"{curve.class_name} {curve.difficulty}"
+    if not curve.counted:
+        return f"{what}: no counted objects; its AP of 0 says nothing"
+    objects = f"only {curve.counted} counted object{'s' if curve.counted > 1 else ''}"
+    return f"{what}: {objects}; a perfect detector gets at most {curve.r40_cap:.1f} R40, {curve.r11_cap:.1f} R11"
+
+
+def _percent(value: float | None) -> str:
+    return _NONE if value is None else f"{value:.2f}"

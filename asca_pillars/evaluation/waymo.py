@@ -1,0 +1,246 @@
+"""Detection metrics of the Waymo Open Dataset: AP, and APH, in which a find of wrong heading weighs less.
+
+Definition: P. Sun et al., "Scalability in Perception for Autonomous Driving: Waymo Open Dataset", CVPR 2020
+(arXiv 1912.04838); where that is brief, the dataset's own evaluation tool decides:
+
+- Boxes match by a 3D IoU of at least 0.7 for vehicles and 0.5 for every other class, one to one within a frame and a
+  class, so that the sum of IoU is greatest. Scores take no part in it: for each cutoff 0, 0.01, ..., 1 the detections
+  that reach it are matched anew.
+- What holds no LiDAR point is no object. Up to 5 points, or the labelers' word, make an object LEVEL_2. At LEVEL_2
+  every object counts. At LEVEL_1 a LEVEL_2 object that nobody found is not missed, but one that was found is a find
+  like any other, in the precision and on both sides of the recall.
+- A find has the heading accuracy 1 - d / pi, d in [0, pi] being the difference of the headings. APH puts the sum of
+  these in place of the number of finds, in the precision but not in the recall.
+- Precision at a recall is the best at that recall or beyond. The area under it is that of trapezoids, but between
+  recalls more than 0.05 apart precision falls only in the last step, which is at most 0.05 wide.
+- A range keeps the objects *and* the detections whose own centers lie in it, by 3D distance from the origin; what
+  stands on two sides of a limit does not match.
+
+Table 7 of AFE-RCNN (2022) lists vehicles and cyclists, both levels, over all ranges; its text lets 5 points be LEVEL_1,
+which the tool does not.
+
+Departures: a level without objects has no AP (the tool says 0, or goes by the LEVEL_2 objects that were found); the
+tool rounds IoU to 1e-6 before matching; the leaderboard's no-label zones, which excuse detections, are not known here.
+Papers that let the tool choose 11 cutoffs by the distribution of the scores get somewhat different figures.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from asca_pillars.evaluation.assignment import NOBODY, best_assignments
+from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.overlap import iou_3d
+
+LEVELS = (1, 2)
+EVERYWHERE = (0.0, inf)
+RANGES_M = (EVERYWHERE, (0.0, 30.0), (30.0, 50.0), (50.0, inf))
+SCORE_CUTOFFS = (np.arange(101) * 0.01).astype(np.float32)
+VEHICLES = ("vehicle", "car")  # compared without case
+VEHICLE_MIN_IOU = 0.7
+SMALL_MIN_IOU = 0.5
+LEVEL_2_POINTS = 5
+MAX_RECALL_STEP = 0.05
+
+_Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class WaymoTruth:
+    """The N labelled objects of one frame.
+
+    Raises:
+        ValueError: if the arrays do not describe the same number of objects.
+    """
+
+    boxes: NDArray[np.floating]
+    """(N, 7) x, y, z, length, width, height, yaw; metres and radians, vehicle (or LiDAR) frame."""
+    labels: NDArray[np.int64]
+    """(N,) indices into the detections' `class_names`; negative for what is not evaluated."""
+    levels: NDArray[np.int64]
+    """(N,) 1 or 2, or 0 for an object without points: see `difficulty_levels`."""
+
+    def __post_init__(self) -> None:
+        shapes = self.boxes.shape, self.labels.shape, self.levels.shape
+        count = len(self.labels)
+        if shapes != ((count, 7), (count,), (count,)):
+            raise ValueError(f"boxes, labels and levels must have shapes (N, 7), (N,) and (N,), not {shapes}")
+
+
+@dataclass(frozen=True)
+class WaymoScore:
+    """AP and APH of one class at one level, in percent; None if there are no such objects."""
+
+    class_name: str
+    level: int
+    range_m: tuple[float, float]
+    objects: int
+    ap: float | None
+    aph: float | None
+
+
+def difficulty_levels(points: NDArray[np.integer], hard: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+    """Levels of objects from their number of LiDAR points: (N,) -> (N,) 0 without points, else 1 or 2.
+
+    Args:
+        hard: (N,) which ones the labelers called LEVEL_2, however many points they have.
+    """
+    level_2 = points <= LEVEL_2_POINTS
+    if hard is not None:
+        level_2 = level_2 | hard
+    return np.where(points > 0, np.where(level_2, 2, 1), 0)
+
+
+def waymo_detection(
+    truth: Sequence[WaymoTruth], detections: Sequence[Detections], *, progress: bool = False
+) -> list[WaymoScore]:
+    """AP and APH for every class of the detections, level and range, in that order.
+
+    Args:
+        truth: labels of each frame.
+        detections: of the same frames, in the same order and frame of reference, scores within [0, 1]. A frame in
+            which nothing was found has an empty one.
+        progress: draw a progress bar.
+
+    Raises:
+        ValueError: the sequences are empty or of different length, frames have different class names, or a score
+            lies outside [0, 1].
+    """
+    class_names = _checked_class_names(truth, detections)
+    tallies = {(index, span): _Tally() for index in range(len(class_names)) for span in RANGES_M}
+    pairs = list(zip(truth, detections, strict=True))
+    for labelled, found in track(pairs, "Evaluating", disable=not progress):
+        for index, name in enumerate(class_names):
+            own = (labelled.labels == index) & (labelled.levels > 0)
+            frame = _frame(labelled.boxes[own], labelled.levels[own], found[found.labels == index], name)
+            for span in RANGES_M:
+                tallies[index, span].add(frame.within(span))
+    return [
+        tallies[index, span].score(name, level, span)
+        for index, name in enumerate(class_names)
+        for level in LEVELS
+        for span in RANGES_M
+    ]
+
+
+def mean_over_classes(
+    scores: Sequence[WaymoScore], level: int, range_m: tuple[float, float] = EVERYWHERE
+) -> tuple[float, float]:
+    """mAP and mAPH in percent over the classes that have objects at that level and range; NaN if none has."""
+    rows = [(item.ap, item.aph) for item in scores if (item.level, item.range_m) == (level, range_m)]
+    known = np.array([row for row in rows if None not in row], dtype=np.float64).reshape(-1, 2)
+    ap, aph = known.mean(axis=0) if len(known) else (np.nan, np.nan)
+    return float(ap), float(aph)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """One class in one frame: N detections by descending score, M objects."""
+
+    scores: NDArray[np.float32]  # (N,)
+    distances_m: _Doubles  # (N,)
+    iou: _Doubles  # (N, M), 0 where it is too small to match
+    heading_accuracy: _Doubles  # (N, M)
+    object_distances_m: _Doubles  # (M,)
+    levels: NDArray[np.int64]  # (M,)
+
+    def within(self, range_m: tuple[float, float]) -> "_Frame":
+        if range_m == EVERYWHERE:
+            return self
+        rows = (self.distances_m >= range_m[0]) & (self.distances_m < range_m[1])
+        columns = (self.object_distances_m >= range_m[0]) & (self.object_distances_m < range_m[1])
+        both = np.ix_(rows, columns)
+        return _Frame(
+            self.scores[rows],
+            self.distances_m[rows],
+            self.iou[both],
+            self.heading_accuracy[both],
+            self.object_distances_m[columns],
+            self.levels[columns],
+        )
+
+
+def _frame(boxes: NDArray[np.floating], levels: NDArray[np.int64], found: Detections, class_name: str) -> _Frame:
+    found = found[np.argsort(-found.scores, kind="stable")]
+    iou = iou_3d(found.boxes, boxes)
+    iou[iou < (VEHICLE_MIN_IOU if class_name.casefold() in VEHICLES else SMALL_MIN_IOU)] = 0.0
+    turned = wrap_angle(found.boxes[:, None, 6].astype(np.float64) - boxes[None, :, 6])
+    return _Frame(
+        scores=found.scores,
+        distances_m=np.linalg.norm(found.boxes[:, :3].astype(np.float64), axis=1),
+        iou=iou,
+        heading_accuracy=1 - np.abs(turned) / np.pi,
+        object_distances_m=np.linalg.norm(boxes[:, :3].astype(np.float64), axis=1),
+        levels=levels,
+    )
+
+
+class _Tally:
+    """Counts of one class in one range at every cutoff, over the frames."""
+
+    def __init__(self) -> None:
+        self.objects = np.zeros(len(LEVELS), dtype=np.int64)  # up to each level
+        # At each cutoff: detections, finds, their heading accuracies, objects missed at each level.
+        self.detections = np.zeros(len(SCORE_CUTOFFS))
+        self.finds = np.zeros(len(SCORE_CUTOFFS))
+        self.heading_accuracy = np.zeros(len(SCORE_CUTOFFS))
+        self.missed = np.zeros((len(LEVELS), len(SCORE_CUTOFFS)))
+
+    def add(self, frame: _Frame) -> None:
+        reached = np.searchsorted(-frame.scores, -SCORE_CUTOFFS, side="right")  # how many have score >= cutoff
+        holders = best_assignments(frame.iou)
+        held = holders != NOBODY
+        accuracy = np.zeros(held.shape)
+        columns = np.nonzero(held)[1]
+        accuracy[held] = frame.heading_accuracy[holders[held], columns]
+        self.detections += reached
+        self.finds += held.sum(axis=1)[reached]
+        self.heading_accuracy += accuracy.sum(axis=1)[reached]
+        for row, level in enumerate(LEVELS):
+            counted = frame.levels <= level
+            self.objects[row] += counted.sum()
+            self.missed[row] += (~held[:, counted]).sum(axis=1)[reached]
+
+    def score(self, class_name: str, level: int, range_m: tuple[float, float]) -> WaymoScore:
+        row = LEVELS.index(level)
+        objects = int(self.objects[row])
+        if not objects:
+            return WaymoScore(class_name, level, range_m, 0, None, None)
+        recall = self.finds / (self.finds + self.missed[row])
+        detections = np.maximum(self.detections, 1)
+        ap = _average_precision(recall, self.finds / detections)
+        aph = _average_precision(recall, self.heading_accuracy / detections)
+        return WaymoScore(class_name, level, range_m, objects, 100 * ap, 100 * aph)
+
+
+def _average_precision(recall: _Doubles, precision: _Doubles) -> float:
+    """Area under precision over recall, fractions (K,), in any order."""
+    levels, group = np.unique(recall[recall > 0], return_inverse=True)
+    best = np.zeros(len(levels))
+    np.maximum.at(best, group, precision[recall > 0])
+    best = np.maximum.accumulate(best[::-1])[::-1]
+    area = lower = 0.0
+    # Down to recall 0, where precision is not known, the curve goes on level.
+    at_lower = best[0] if len(best) else 0.0
+    for upper, at_upper in zip(levels, best, strict=True):
+        gap = upper - lower
+        sloping = gap - MAX_RECALL_STEP * max(np.ceil((gap - 1e-6) / MAX_RECALL_STEP) - 1, 0)
+        area += (gap - sloping) * at_upper + sloping * (at_lower + at_upper) / 2
+        lower, at_lower = upper, at_upper
+    return float(area)
+
+
+def _checked_class_names(truth: Sequence[WaymoTruth], detections: Sequence[Detections]) -> tuple[str, ...]:
+    if len(truth) != len(detections) or not truth:
+        raise ValueError(f"{len(truth)} labelled frames and {len(detections)} with detections: need the same, not 0")
+    for index, found in enumerate(detections):
+        if found.class_names != detections[0].class_names:
+            raise ValueError(f"frame {index} has classes {found.class_names}, frame 0 {detections[0].class_names}")
+        if not ((found.scores >= 0) & (found.scores <= 1)).all():
+            raise ValueError(f"frame {index}: scores must lie within [0, 1]")
+    return detections[0].class_names

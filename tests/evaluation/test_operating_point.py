@@ -1,0 +1,308 @@
+"""Recall and precision at a fixed score: hand-made frames for every rule, a slow twin, and published intervals."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.data.labels import KittiObject
+from asca_pillars.evaluation.objects import FrameObjects, frame_objects
+from asca_pillars.evaluation.operating_point import OperatingPoint, operating_points, recall_table, wilson_interval
+from asca_pillars.evaluation.verdicts import verdicts
+from asca_pillars.geometry.overlap import bev_iou, iou_3d
+
+NAMES = ("Car", "Pedestrian", "Cyclist")
+SIZES_HWL = {"Pedestrian": (1.7, 0.6, 0.8), "Person_sitting": (1.3, 0.6, 0.8), "Cyclist": (1.7, 0.6, 1.8)}
+CAR_HWL = (1.5, 1.6, 4.0)
+IMAGE = (100.0, 100.0, 160.0, 150.0)
+ELSEWHERE = (400.0, 100.0, 460.0, 150.0)
+
+
+def item(kind: str, x: float, z: float, score: float | None = None, **changes: Any) -> KittiObject:
+    """An object that counts at every difficulty, heading to the right; its image box says nothing of its place."""
+    height, width, length = SIZES_HWL.get(kind, CAR_HWL)
+    made = KittiObject(kind, 0.0, 0, 0.0, IMAGE, height, width, length, x, 1.6, z, 0.0, score)
+    return replace(made, **changes)
+
+
+def frame(*objects: KittiObject, name: str = "0") -> FrameObjects:
+    return frame_objects(name, objects)
+
+
+def point(
+    truth: list[KittiObject], found: list[KittiObject], name: str = "Car", score: float = 0.5, **options: Any
+) -> OperatingPoint:
+    return operating_points([frame(*truth)], [frame(*found)], [name], scores=score, **options)[0]
+
+
+def counts(*given: Any, **options: Any) -> tuple[int, int, int, int, int]:
+    """found, objects; true, detections; excused."""
+    made = point(*given, **options)
+    return made.found, made.objects, made.true, made.detections, made.excused
+
+
+def test_found_missed_true_false() -> None:
+    truth = [item("Car", 0, 10), item("Car", 9, 10), item("Pedestrian", 3, 10)]
+    found = [item("Car", 0, 10, 0.9), item("Car", -9, 10, 0.5), item("Car", 9, 10, 0.49)]
+    result = point(truth, found)
+    assert (result.found, result.objects, result.recall) == (1, 2, 0.5)
+    assert (result.true, result.detections, result.precision, result.excused) == (1, 2, 0.5, 0)
+    assert result.recall_interval == wilson_interval(1, 2) == result.precision_interval
+    assert (result.class_name, result.score, result.metric, result.difficulty) == ("Car", 0.5, "3d", "moderate")
+    assert (result.min_overlap, result.band_m) == (0.7, None)
+    assert counts(truth, found, score=0.4) == (2, 2, 2, 3, 0)
+    assert counts(truth, found, "Pedestrian") == (0, 1, 0, 0, 0)
+
+
+def test_nothing_is_not_a_number() -> None:
+    result = point([], [])
+    assert math.isnan(result.recall) and math.isnan(result.precision)
+    assert result.recall_interval == result.precision_interval == (0, 1)
+    empty = operating_points([], [], NAMES, scores=0.5)
+    assert [(made.class_name, made.objects, made.detections) for made in empty] == [(name, 0, 0) for name in NAMES]
+
+
+def test_overlap_that_counts_as_found() -> None:
+    """d further along its length l a box overlaps itself by (l - d) / (l + d): 0.7 at 3 l / 17, 0.5 at l / 3."""
+    car, cyclist = item("Car", 0, 10), item("Cyclist", 0, 10)
+    for shift, hits in ((0.70, 1), (0.71, 0)):
+        assert point([car], [item("Car", shift, 10, 0.9)]).found == hits
+    for shift, hits in ((0.59, 1), (0.61, 0)):
+        assert point([cyclist], [item("Cyclist", shift, 10, 0.9)], "Cyclist").found == hits
+    low = {"Car": 0.25}  # at 0.6 l
+    assert point([car], [item("Car", 2.39, 10, 0.9)], min_overlap=low).found == 1
+    assert point([car], [item("Car", 2.41, 10, 0.9)], min_overlap=low).found == 0
+    # rotation_y turns from x towards -z: both views of the same box.
+    assert point([item("Car", 2, 10, rotation_y=0.7)], [item("Car", 2, 10, 0.9, rotation_y=0.7 - math.pi)]).found == 1
+    assert point([item("Car", 2, 10, rotation_y=0.7)], [item("Car", 2, 10, 0.9, rotation_y=-0.7)]).found == 0
+
+
+def test_height_matters_in_3d_only() -> None:
+    truth, raised = [item("Car", 0, 10)], [item("Car", 0, 10, 0.9, y_m=0.6)]
+    assert counts(truth, raised) == (0, 1, 0, 1, 0)
+    assert counts(truth, raised, metric="bev") == (1, 1, 1, 1, 0)
+
+
+def test_one_to_one_by_score_and_overlap() -> None:
+    truth = [item("Pedestrian", 0, 10), item("Pedestrian", 0.2, 10)]
+    best, other = item("Pedestrian", 0.2, 10, 0.9), item("Pedestrian", 0.21, 10, 0.8)
+    for found in ([best, other], [other, best]):
+        assert counts(truth, found, "Pedestrian") == (2, 2, 2, 2, 0)
+    assert counts(truth[:1], [best, other], "Pedestrian") == (1, 1, 1, 2, 0)
+    # The first takes the object it overlaps most, though only it could have had the other one.
+    far = item("Pedestrian", 0.45, 10, 0.8)
+    assert counts(truth, [item("Pedestrian", 0.15, 10, 0.9), far], "Pedestrian") == (1, 2, 1, 2, 0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"occluded": 2}, {"truncated": 0.31}, {"bbox": (0.0, 100.0, 50.0, 124.9)}, {"type": "Van"}],
+    ids=["hidden", "cut off", "low", "neighboring type"],
+)
+def test_ignored_objects_need_not_be_found_and_excuse(changes: dict[str, Any]) -> None:
+    ignored = replace(item("Car", 0, 10), **changes)
+    assert counts([ignored], []) == (0, 0, 0, 0, 0)
+    assert counts([ignored], [item("Car", 0, 10, 0.9)]) == (0, 0, 0, 0, 1)
+    assert counts([ignored], [item("Car", 0, 10, 0.9), item("Car", 0, 10, 0.8)]) == (0, 0, 0, 1, 1)
+
+
+def test_other_types_excuse_nothing() -> None:
+    for kind in ("Truck", "Pedestrian", "Misc", "Tram"):
+        other = item(kind, 0, 10, height_m=1.5, width_m=1.6, length_m=4.0)
+        assert counts([other], [item("Car", 0, 10, 0.9)]) == (0, 0, 0, 1, 0)
+    assert counts([item("car", 0, 10)], [item("CAR", 0, 10, 0.9)]) == (1, 1, 1, 1, 0)
+
+
+def test_low_detections_find_but_are_never_false() -> None:
+    for box in ((100.0, 100.0, 150.0, 124.9), (-1.0, -1.0, -1.0, -1.0)):
+        low = item("Car", 0, 10, 0.9, bbox=box)
+        assert counts([item("Car", 0, 10)], [low]) == (1, 1, 1, 1, 0)
+        assert counts([], [low]) == (0, 0, 0, 0, 1)
+
+
+def test_dont_care_areas_excuse() -> None:
+    def area(x2: float) -> KittiObject:
+        return KittiObject("DontCare", -1, -1, -10, (100.0, 90.0, x2, 160.0), -1, -1, -1, -1000, -1000, -1000, -10)
+
+    alone = [item("Car", 30, 10, 0.9)]  # its image box is 100..160
+    assert counts([area(131.0)], alone) == (0, 0, 0, 0, 1)
+    assert counts([area(129.0)], alone) == (0, 0, 0, 1, 0)
+    assert counts([area(129.0), area(128.0)], alone) == (0, 0, 0, 1, 0)
+    assert counts([area(160.0), item("Car", 30, 10)], alone) == (1, 1, 1, 1, 0)
+    assert counts([area(160.0)], [replace(alone[0], bbox=ELSEWHERE)]) == (0, 0, 0, 1, 0)
+    # In another frame there is no such area.
+    points = operating_points(
+        [frame(area(160.0)), frame(name="1")], [frame(), frame(*alone, name="1")], ["Car"], scores=0
+    )
+    assert (points[0].detections, points[0].excused) == (1, 0)
+
+
+def test_bands_judge_objects_and_detections_by_their_own_distance() -> None:
+    """13 m is (5, 12). A pair across the limit: found on its side, true on the other."""
+    truth, found = [item("Car", 5, 12.1), item("Car", 0, 30)], [item("Car", 5, 11.9, 0.9), item("Car", -9, 30, 0.9)]
+    points = operating_points(
+        [frame(*truth)], [frame(*found)], ["Car"], scores=0.5, min_overlap={"Car": 0.5}, bands_m=[(0, 13), (13, 99)]
+    )
+    assert [made.band_m for made in points] == [None, (0, 13), (13, 99)]
+    assert [(made.found, made.objects, made.true, made.detections) for made in points] == [
+        (1, 2, 1, 2),
+        (0, 0, 1, 1),
+        (1, 2, 0, 1),
+    ]
+    # A limit belongs to the band above it: (3, 4) is 5 m away.
+    halves = operating_points([frame(item("Car", 3, 4))], [frame()], ["Car"], scores=0, bands_m=[(0, 5), (5, 9)])
+    assert [made.objects for made in halves] == [1, 0, 1]
+
+
+def test_scores_and_overlaps_per_class() -> None:
+    truth = frame(*(item(kind, 5 * i, 10) for i, kind in enumerate(NAMES)))
+    found = frame(*(item(kind, 5 * i, 10, 0.4 + 0.1 * i) for i, kind in enumerate(NAMES)))
+    points = operating_points([truth], [found], NAMES, scores={"Car": 0.3, "Pedestrian": 0.6, "Cyclist": 0.6})
+    assert [(made.class_name, made.score, made.found, made.min_overlap) for made in points] == [
+        ("Car", 0.3, 1, 0.7),
+        ("Pedestrian", 0.6, 0, 0.5),
+        ("Cyclist", 0.6, 1, 0.5),
+    ]
+    with pytest.raises(ValueError, match="given for Cyclist"):
+        operating_points([truth], [found], NAMES, scores={"Car": 0.3, "Pedestrian": 0.6})
+    with pytest.raises(ValueError, match="given for Car, Cyclist"):
+        operating_points([truth], [found], NAMES, scores=0.3, min_overlap={"Pedestrian": 0.5})
+    with pytest.raises(ValueError, match="same frames"):
+        operating_points([truth], [frame(name="other")], NAMES, scores=0.3)
+
+
+def test_recall_table_has_the_three_difficulties() -> None:
+    """Easy asks for 40 px and nothing hidden, moderate allows one step of hiding, hard two."""
+    truth = [item("Car", 5 * level, 10, occluded=level) for level in range(4)]
+    found = [item("Car", 0, 10, 0.9), item("Car", 10, 10, 0.2)]
+    table = recall_table([frame(*truth)], [frame(*found)], ("Car", "Cyclist"), scores=-math.inf)
+    assert [(made.class_name, made.difficulty, made.found, made.objects) for made in table] == [
+        ("Car", "easy", 1, 1),
+        ("Car", "moderate", 1, 2),
+        ("Car", "hard", 2, 3),
+        *(("Cyclist", difficulty, 0, 0) for difficulty in ("easy", "moderate", "hard")),
+    ]
+    assert {(made.metric, made.min_overlap) for made in table} == {("3d", 0.7), ("3d", 0.5)}
+
+
+def test_verdicts_stand_behind_the_points() -> None:
+    hidden = item("Car", -9, 9, occluded=2)
+    truth = [frame(hidden, item("Car", 0, 10), item("Pedestrian", 5, 10)), frame(item("Truck", 0, 9), name="1")]
+    seen = [item("Pedestrian", 5, 10, 0.9), item("Car", 9, 30, 0.3), item("Car", 0, 10, 0.2)]
+    low = item("Cyclist", 3, 60, 0.9, bbox=(0.0, 0.0, 9.0, 9.0))
+    found = [frame(*seen), frame(low, item("Cyclist", 3, 60, 0.9), name="1")]
+    first, second = verdicts(truth, found, NAMES, scores={"Car": 0.25, "Pedestrian": 0.5, "Cyclist": 0.5})
+    assert (first.frame_id, second.frame_id) == ("0", "1")
+    assert first.missed.tolist() == [False, True, False] and first.found.tolist() == [False, False, True]
+    assert first.uncounted.tolist() == [True, False, False]
+    assert first.true.tolist() == [True, False, False] and first.false.tolist() == [False, True, False]
+    assert first.reported.tolist() == [True, True, False] and first.excused.tolist() == [False] * 3
+    assert second.uncounted.tolist() == [True]
+    assert second.excused.tolist() == [True, False] and second.false.tolist() == [False, True]
+    assert (first.errors, second.errors) == (2, 1)
+    assert verdicts([], [], NAMES, scores=0.5) == []
+
+
+def camera_boxes(objects: list[KittiObject]) -> np.ndarray:
+    """(N, 7) with z up: x right, y = z forward, z = -y; rotation_y about the downward axis is -yaw."""
+    rows = [(o.x_m, o.z_m, o.height_m / 2 - o.y_m, o.length_m, o.width_m, o.height_m, -o.rotation_y) for o in objects]
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)
+
+
+def naive(
+    frames: list[tuple[list[KittiObject], list[KittiObject]]],
+    name: str,
+    score: float,
+    metric: str,
+    band: tuple[float, float],
+) -> tuple[int, int, int, int, int]:
+    """found, objects; true, detections; excused: one object and one detection after the other."""
+    totals = np.zeros(5, dtype=int)
+    neighbor = {"Car": "Van", "Pedestrian": "Person_sitting"}.get(name)
+    for labels, seen in frames:
+        candidates = [o for o in labels if o.type in (name, neighbor)]
+        counted = [
+            o.type == name and o.bbox[3] - o.bbox[1] >= 25 and o.occluded <= 1 and o.truncated <= 0.3
+            for o in candidates
+        ]
+        taken: set[int] = set()
+        near = [band[0] <= math.hypot(o.x_m, o.z_m) < band[1] for o in candidates]
+        totals[1] += sum(c and n for c, n in zip(counted, near, strict=True))
+        reported = sorted((d for d in seen if d.type == name and d.score >= score), key=lambda d: -d.score)
+        for detection in reported:
+            inside = band[0] <= math.hypot(detection.x_m, detection.z_m) < band[1]
+            overlap = (iou_3d if metric == "3d" else bev_iou)(camera_boxes([detection]), camera_boxes(candidates))
+            best, most = -1, 0.7 if name == "Car" else 0.5
+            for index in range(len(candidates)):
+                if index not in taken and overlap[0, index] > most:
+                    best, most = index, overlap[0, index]
+            if best >= 0:
+                taken.add(best)
+                totals[0] += counted[best] and near[best]
+                totals[2:4] += counted[best] and inside
+                totals[4] += inside and not counted[best]
+            else:
+                low = detection.bbox[3] - detection.bbox[1] < 25
+                totals[4] += inside and low
+                totals[3] += inside and not low
+    return tuple(totals.tolist())
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["3d", "bev"]))
+def test_slow_twin(seed: int, metric: str) -> None:
+    rng = np.random.default_rng(seed)
+    frames = []
+    for _ in range(3):
+        labels = [
+            item(
+                str(rng.choice(["Car", "Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck"])),
+                *rng.uniform((-2, 8), (2, 12)),
+                occluded=int(rng.integers(0, 3)),
+                rotation_y=float(rng.uniform(-3, 3)),
+                bbox=(0.0, 0.0, 50.0, float(rng.uniform(15, 60))),
+            )
+            for _ in range(int(rng.integers(0, 8)))
+        ]
+        seen = [
+            replace(
+                o,
+                type={"Van": "Car", "Person_sitting": "Pedestrian"}.get(o.type, o.type),
+                x_m=o.x_m + float(rng.normal(0, 0.1)),
+                y_m=o.y_m + float(rng.normal(0, 0.1)),
+                bbox=(0.0, 0.0, 50.0, float(rng.uniform(15, 60))),
+                score=float(rng.random()),
+            )
+            for o in labels * 2
+        ]
+        frames.append((labels, seen))
+    truth = [frame(*labels, name=str(index)) for index, (labels, _) in enumerate(frames)]
+    found = [frame(*seen, name=str(index)) for index, (_, seen) in enumerate(frames)]
+    band = (0.0, 10.0)
+    for made in operating_points(truth, found, NAMES, scores=0.3, metric=metric, bands_m=[band]):  # type: ignore[arg-type]
+        expected = naive(frames, made.class_name, 0.3, metric, made.band_m or (0.0, math.inf))
+        assert (made.found, made.objects, made.true, made.detections, made.excused) == expected
+
+
+@pytest.mark.parametrize(
+    ("hits", "trials", "low", "high"),
+    # R. Newcombe, "Two-sided confidence intervals for the single proportion", Statistics in Medicine 1998, table I.
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_published_intervals(hits: int, trials: int, low: float, high: float) -> None:
+    assert wilson_interval(hits, trials) == pytest.approx((low, high), abs=5e-5)
+    assert wilson_interval(trials - hits, trials) == pytest.approx((1 - high, 1 - low), abs=5e-5)
+
+
+@given(st.integers(1, 5000), st.data())
+def test_interval_ends_where_the_share_is_two_deviations_away(trials: int, data: st.DataObject) -> None:
+    hits = data.draw(st.integers(0, trials))
+    low, high = wilson_interval(hits, trials)
+    assert 0 <= low <= hits / trials <= high <= 1
+    for end in (low, high):
+        deviation = math.sqrt(end * (1 - end) / trials)
+        assert abs(hits / trials - end) == pytest.approx(1.959964 * deviation, abs=1e-6)

@@ -1,0 +1,124 @@
+"""The tables, notes and JSON of a report, from a small set whose numbers are known."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from asca_pillars.data.kitti import KittiObject
+from asca_pillars.evaluation.kitti import DIFFICULTIES, METRICS, evaluate
+from asca_pillars.evaluation.objects import frame_objects
+from asca_pillars.evaluation.operating_point import operating_points
+from asca_pillars.evaluation.predictions import ScoredFrames
+from asca_pillars.evaluation.report import BANDS_M, EvalReport, notes, print_report, tables, to_json, to_markdown
+
+CLASSES = ("Car", "Pedestrian", "Cyclist")
+
+
+def car(x_m: float, z_m: float, score: float | None = None) -> KittiObject:
+    """A car that is high enough in the image for every difficulty, and alone where it is."""
+    left = 700 + 12 * x_m
+    return KittiObject("Car", 0, 0, 0.1, (left, 150, left + 8, 200), 1.5, 1.6, 3.9, x_m, 1.7, z_m, 0.1, score)
+
+
+def report(cars: int = 12, missing: tuple[str, ...] = ()) -> EvalReport:
+    """Frames of one car each, every second one 45 m away, all found."""
+    places = [(float(index), 45.0 if index % 2 else 20.0) for index in range(cars)]
+    truth = [frame_objects(f"{number:06d}", [car(*place)]) for number, place in enumerate(places)]
+    found = [frame_objects(f"{number:06d}", [car(*place, 1 - number / 100)]) for number, place in enumerate(places)]
+    return EvalReport(
+        subject="made up",
+        frames=ScoredFrames(tuple(truth), tuple(found), missing),
+        ap=evaluate(truth, found, CLASSES, bands_m=tuple(BANDS_M)),
+        points=operating_points(truth, found, CLASSES, scores=0.5, difficulties=DIFFICULTIES),
+        about={"model": {"name": "nobody"}},
+    )
+
+
+def cells(made: EvalReport, table: int) -> dict[tuple[str, str], tuple[str, ...]]:
+    return {(row[0], row[1]): row[2:] for row in tables(made)[table].rows}
+
+
+def test_average_precision_with_counts_and_dashes() -> None:
+    """12 of 12 found: KITTI's samples reach index 11 of 40, so R40 = 11/40 and R11 = 3/11 (indices 0, 4 and 8)."""
+    rows = cells(report(), 0)
+    assert rows["Car", "objects"] == ("12",) * 6
+    for metric in ("2D", "BEV", "3D", "AOS"):
+        assert rows["Car", metric] == ("27.50",) * 3 + ("27.27",) * 3
+        assert rows["Cyclist", metric] == ("-",) * 6
+        assert rows["mean", metric] == ("27.50",) * 3 + ("",) * 3
+    assert rows["Cyclist", "objects"] == ("-",) * 6
+
+
+def test_bands_give_the_mean_and_the_counted_objects() -> None:
+    table = tables(report())[1]
+    assert "R40, moderate" in table.title and "Table 4 of ASCA" in table.title and "Deformable PV-RCNN" in table.title
+    rows = {row[0]: row[1:] for row in table.rows}
+    # Six cars on either side of 40 m: 5/40. None between 30 and 40 m.
+    assert rows["0-40 m"] == ("12.50", "12.50 (6)", "-", "-")
+    assert rows["40-80 m"] == rows["30-50 m"] == rows["0-30 m"] == rows["0-40 m"]
+
+
+def test_recall_and_precision_have_intervals() -> None:
+    recall, precision = cells(report(), 2), cells(report(), 3)
+    # Wilson for 12 of 12: 1 / (1 + 1.96^2 / 12) = 0.7575 at the lower end.
+    assert recall["Car", "moderate"] == precision["Car", "moderate"] == ("12", "12", "100.00", "75.75 - 100.00")
+    assert recall["Cyclist", "hard"] == ("0", "0", "-", "-")
+    assert "Car 0.5 (IoU 0.7)" in tables(report())[2].title
+
+
+def test_small_sets_and_missing_classes_are_named() -> None:
+    lines = notes(report())
+    assert "Car moderate: only 12 counted objects; a perfect detector gets at most 27.5 R40, 27.3 R11" in lines
+    assert "Cyclist: not evaluated, because nothing was detected as one; the means leave the class out" in lines
+    assert not any(line.startswith("Car") for line in notes(report(cars=41)))
+    assert any(line.startswith("Car easy: only 40 ") for line in notes(report(cars=40)))
+
+
+def test_missing_frames_stand_in_every_form_of_the_report() -> None:
+    made = report(missing=("000012", "000013"))
+    sentence = (
+        "evaluated on 12 of 14 frames: no prediction file for 000012 and 1 other; "
+        "a frame without detections needs an empty file"
+    )
+    console = Console(record=True, width=80, markup=False, file=io.StringIO())
+    print_report(made, console)
+    assert f"made up: {sentence}" in console.export_text().splitlines()
+    assert to_markdown(made).splitlines()[0] == f"# made up: {sentence}"
+    content = to_json(made)
+    assert content["frames"] == 12 and content["frames_asked"] == 14 and content["shortage"] == sentence
+    assert content["frames_without_predictions"] == ["000012", "000013"]
+    assert to_json(report())["shortage"] is None and "12 frames" in to_markdown(report()).splitlines()[0]
+
+
+def test_the_json_has_kittis_shape_and_no_nan() -> None:
+    content = json.loads(json.dumps(to_json(report()), allow_nan=False))
+    assert content["model"] == {"name": "nobody"}
+    assert set(content["results"]) == set(CLASSES)
+    for name in CLASSES:
+        assert set(content["results"][name]) == set(METRICS)
+    assert content["results"]["Cyclist"]["3d"] is None
+    result = content["results"]["Car"]["3d"]
+    assert result["R40"] == pytest.approx([27.5] * 3) and result["R11"] == pytest.approx([300 / 11] * 3)
+    np.testing.assert_array_equal(result["precision"]["moderate"], [1.0] * 12 + [0.0] * 29)
+    assert [(band["low_m"], band["high_m"]) for band in content["bands"]] == list(BANDS_M)
+    assert content["bands"][0]["mean_3d_moderate_R40"] == pytest.approx(12.5)
+    assert content["bands"][0]["results"]["Car"]["bev"]["R40"] == pytest.approx([12.5] * 3)
+    by_class = {(point["class_name"], point["difficulty"]): point for point in content["operating_points"]}
+    assert len(by_class) == 9 and by_class["Car", "easy"]["found"] == 12
+    assert by_class["Cyclist", "easy"]["recall"] is None
+
+
+def test_the_markdown_tables_are_whole() -> None:
+    lines = to_markdown(report()).splitlines()
+    assert "| class | metric | R40 easy | R40 moderate | R40 hard | R11 easy | R11 moderate | R11 hard |" in lines
+    widths: list[int] = []
+    for line in lines:
+        if line.startswith("|"):
+            widths.append(line.count("|"))
+        elif widths:
+            assert len(set(widths)) == 1 and len(widths) > 3
+            widths = []
+    assert "- Car easy: only 12 counted objects; a perfect detector gets at most 27.5 R40, 27.3 R11" in lines

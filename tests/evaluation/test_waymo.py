@@ -1,0 +1,308 @@
+"""Waymo's metrics: against the dataset's own tool, against hand-derived figures, and against a slow twin."""
+
+from itertools import permutations, product
+from math import ceil, inf, pi
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from asca_pillars.evaluation.waymo import (
+    EVERYWHERE,
+    LEVELS,
+    RANGES_M,
+    WaymoScore,
+    WaymoTruth,
+    difficulty_levels,
+    mean_over_classes,
+    waymo_detection,
+)
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.overlap import iou_3d
+
+NAMES = ("Vehicle", "Pedestrian", "Cyclist")
+SIZES = np.array([[4.6, 1.9, 1.7], [0.9, 0.8, 1.75], [1.8, 0.8, 1.75]])
+VEHICLE, PEDESTRIAN, CYCLIST = 0, 1, 2
+
+
+def box(x: float, y: float, label: int = VEHICLE, yaw: float = 0.0) -> list[float]:
+    return [x, y, 0.0, *SIZES[label], yaw]
+
+
+def labelled(*boxes: list[float], label: int = VEHICLE, levels: list[int] | None = None) -> WaymoTruth:
+    count = len(boxes)
+    levels = [1] * count if levels is None else levels
+    return WaymoTruth(np.array(boxes, np.float32).reshape(-1, 7), np.full(count, label), np.array(levels, np.int64))
+
+
+def found(*scored: tuple[float, list[float]], label: int = VEHICLE) -> Detections:
+    boxes = np.array([item for _, item in scored], np.float32).reshape(-1, 7)
+    scores = np.array([score for score, _ in scored], np.float32)
+    return Detections(boxes, scores, np.full(len(scored), label), NAMES)
+
+
+def score_of(
+    truth: WaymoTruth | list[WaymoTruth],
+    detections: Detections | list[Detections],
+    level: int = 2,
+    range_m: tuple[float, float] = EVERYWHERE,
+    name: str = "Vehicle",
+) -> WaymoScore:
+    frames = truth if isinstance(truth, list) else [truth]
+    results = waymo_detection(frames, detections if isinstance(detections, list) else [detections])
+    return next(item for item in results if (item.class_name, item.level, item.range_m) == (name, level, range_m))
+
+
+def crowded_frames(seed: int, frames: int) -> tuple[list[WaymoTruth], list[Detections]]:
+    """Objects that overlap one another; detections off by little or much, doubled, turned around, or of nothing.
+
+    The numbers come from a bit generator, whose stream NumPy never changes: what the tool says of them is below.
+    """
+    bits = np.random.PCG64(seed)
+
+    def uniform(*shape: int) -> NDArray[np.float64]:
+        return (bits.random_raw(int(np.prod(shape))) / 2**64).reshape(shape)
+
+    truth, detections = [], []
+    for _ in range(frames):
+        count = 5 + int(35 * uniform(1)[0])
+        labels = (3 * uniform(count)).astype(np.int64)
+        sizes = SIZES[labels] * (0.8 + 0.4 * uniform(count, 3))
+        boxes = np.column_stack([120 * uniform(count, 2) - 60, 3 * uniform(count) - 1, sizes, 2 * pi * uniform(count)])
+        boxes[1:4] = boxes[0] + (0.4 * uniform(3, 7) - 0.2) * [1, 1, 1, 1, 1, 1, 0]
+        labels[1:4] = labels[0]
+        levels = 1 + (uniform(count) < 0.3)
+        copies = np.repeat(np.arange(count), (4 * uniform(count)).astype(np.int64))
+        noise = (uniform(len(copies), 7) + uniform(len(copies), 7) - 1) * [0.4, 0.4, 0.3, 0.3, 0.15, 0.15, 0.3]
+        boxes_found = boxes[copies] + noise * (0.3 + 2 * uniform(len(copies), 1))
+        boxes_found[:, 6] += np.where(uniform(len(copies)) < 0.15, pi, 0)
+        labels_found = np.where(uniform(len(copies)) < 0.05, CYCLIST, labels[copies])
+        scores = np.round(uniform(len(copies)), 3)
+        truth.append(WaymoTruth(boxes.astype(np.float32), labels, levels))
+        detections.append(Detections(boxes_found.astype(np.float32), scores.astype(np.float32), labels_found, NAMES))
+    return truth, detections
+
+
+# fmt: off
+# AP and APH of `crowded_frames(1, 12)` by waymo-open-dataset-tf 1.6.4 (Hungarian matching, cutoffs 0, 0.01, ..., 1):
+# for each class LEVEL_1 and LEVEL_2, for each level everywhere, 0-30 m, 30-50 m and beyond.
+OFFICIAL = (
+    (0.248096, 0.201543), (0.297577, 0.259530), (0.163807, 0.125817), (0.392227, 0.313781),
+    (0.227383, 0.184539), (0.270176, 0.233938), (0.158241, 0.121447), (0.335000, 0.268734),
+    (0.235514, 0.212685), (0.255208, 0.225833), (0.295775, 0.285285), (0.192381, 0.164585),
+    (0.204974, 0.184254), (0.240196, 0.212486), (0.251274, 0.241710), (0.165972, 0.141819),
+    (0.384127, 0.356140), (0.346128, 0.299660), (0.445279, 0.426672), (0.382064, 0.351478),
+    (0.323405, 0.297459), (0.318562, 0.272588), (0.364353, 0.347921), (0.326869, 0.297624),
+)
+# fmt: on
+
+
+def test_the_datasets_own_tool() -> None:
+    results = waymo_detection(*crowded_frames(1, 12))
+    figures = np.array([(item.ap, item.aph) for item in results], dtype=np.float64)
+    # The tool computes in float32.
+    np.testing.assert_allclose(figures, 100 * np.array(OFFICIAL).reshape(-1, 2), atol=1e-4, rtol=0)
+
+
+def naive(truth: list[WaymoTruth], detections: list[Detections], name: str, level: int) -> tuple[float, float] | None:
+    """AP and APH by doing for every cutoff and frame what the definition says, with every matching tried."""
+    if not any(((t.labels == NAMES.index(name)) & (t.levels > 0) & (t.levels <= level)).any() for t in truth):
+        return None
+    points = []
+    for cutoff in range(101):
+        finds = false = missed = 0
+        accuracy = 0.0
+        for frame, seen in zip(truth, detections, strict=True):
+            own = (frame.labels == NAMES.index(name)) & (frame.levels > 0)
+            seen = seen[(seen.labels == NAMES.index(name)) & (seen.scores >= np.float32(cutoff * 0.01))]
+            iou = iou_3d(seen.boxes, frame.boxes[own])
+            iou[iou < (0.7 if name == "Vehicle" else 0.5)] = 0
+            rows, columns = iou.shape
+            padded = np.vstack([iou, np.zeros((columns, columns))])
+            ways = permutations(range(rows + columns), columns)
+            way = max(ways, key=lambda way: sum(padded[row, column] for column, row in enumerate(way)))
+            pairs = [(row, column) for column, row in enumerate(way) if padded[row, column] > 0]
+            finds += len(pairs)
+            false += rows - len(pairs)
+            for column, item_level in enumerate(frame.levels[own]):
+                missed += item_level <= level and column not in [pair[1] for pair in pairs]
+            for row, column in pairs:
+                difference = abs(seen.boxes[row, 6] - frame.boxes[own][column, 6]) % (2 * pi)
+                accuracy += 1 - min(difference, 2 * pi - difference) / pi
+        if finds:
+            points.append((finds / (finds + missed), finds / (finds + false), accuracy / (finds + false)))
+    return area([point[:2] for point in points]), area([point[::2] for point in points])
+
+
+def area(points: list[tuple[float, float]]) -> float:
+    """Percent below the curve: precision on a fine staircase of recalls, each step judged at its middle."""
+    recalls = sorted({recall for recall, _ in points})
+    best = {recall: max(p for r, p in points if r >= recall) for recall in recalls}
+    total = 0.0
+    for lower, upper in zip([0.0, *recalls], recalls, strict=False):
+        at_lower, at_upper = best.get(lower, best[recalls[0]]), best[upper]
+        corner = upper - 0.05 * max(ceil((upper - lower - 1e-6) / 0.05) - 1, 0)
+        for step in (np.arange(2000) + 0.5) / 2000:
+            recall = lower + step * (upper - lower)
+            slope = at_lower + (at_upper - at_lower) * (recall - lower) / (corner - lower)
+            total += (upper - lower) / 2000 * (slope if recall < corner else at_upper)
+    return 100 * total
+
+
+def test_slow_twin() -> None:
+    rng = np.random.default_rng(5)
+    truth, detections = [], []
+    for levels in ([1, 2, 1, 0], [2, 1, 1, 2], [1, 1, 2, 1]):
+        labels = np.array([VEHICLE, VEHICLE, PEDESTRIAN, PEDESTRIAN])
+        boxes = np.array([box(9, 0), box(9.2, 0.3), box(5, 5, PEDESTRIAN), box(5.2, 5, PEDESTRIAN)])
+        boxes[:, 6] = rng.uniform(-pi, pi, 4)
+        boxes[1, 6] = boxes[0, 6]
+        truth.append(WaymoTruth(boxes.astype(np.float32), labels, np.array(levels)))
+        copies = rng.integers(0, 4, 5)
+        seen = boxes[copies] + rng.normal(0, 1, (5, 7)) * [0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.2]
+        detections.append(Detections(seen.astype(np.float32), rng.random(5).astype(np.float32), labels[copies], NAMES))
+    for name, level in product(NAMES[:2], LEVELS):
+        score = score_of(truth, detections, level, name=name)
+        expected = naive(truth, detections, name, level)
+        assert expected is not None and expected[0] > 5  # there is something to compare
+        assert (score.ap, score.aph) == pytest.approx(expected, abs=0.01)
+
+
+@settings(max_examples=20)
+@given(st.lists(st.tuples(st.sampled_from([0, 1, 2]), st.integers(-9, 9)), min_size=1, unique_by=lambda item: item[1]))
+def test_labels_score_100_against_themselves(places: list[tuple[int, int]]) -> None:
+    boxes = np.array([box(7 * place, 3 - place, label, 0.3 * place) for label, place in places], np.float32)
+    labels = np.array([label for label, _ in places])
+    truth = WaymoTruth(boxes, labels, np.arange(len(places)) % 2 + 1)
+    scores = np.linspace(0, 1, len(places), dtype=np.float32)
+    for item in waymo_detection([truth], [Detections(boxes, scores, labels, NAMES)]):
+        expected = (None, None) if item.objects == 0 else (pytest.approx(100), pytest.approx(100))
+        assert (item.ap, item.aph) == expected
+
+
+@pytest.mark.parametrize(("turn", "aph"), [(pi, 0.0), (pi / 2, 50.0), (-pi / 4, 75.0), (2 * pi, 100.0), (-3 * pi, 0.0)])
+def test_heading(turn: float, aph: float) -> None:
+    """A square box matches however it is turned by quarters; only the heading tells."""
+    square = [10.0, 2.0, 0.0, 2.0, 2.0, 1.5, 0.4]
+    score = score_of(
+        labelled(square, label=PEDESTRIAN), found((0.9, [*square[:6], 0.4 + turn]), label=PEDESTRIAN), name="Pedestrian"
+    )
+    assert (score.ap, score.aph) == (pytest.approx(100), pytest.approx(aph, abs=1e-3))
+
+
+def test_precision_that_falls() -> None:
+    """Two vehicles; a find at 0.9, a false one at 0.6, at 0.3 the other find, turned by 60 degrees (accuracy 2 / 3).
+
+    Recall 1/2 with precision 1 and recall 1 with precision 2/3 (APH: (1 + 2/3) / 3 = 5/9). From recall 0 to 1/2 the
+    curve is level, from 0.55 to 1 too, and falls between 0.5 and 0.55:
+    AP = 0.5 + 0.45 * 2/3 + 0.05 * (1 + 2/3) / 2 = 0.841667; APH = 0.5 + 0.45 * 5/9 + 0.05 * (1 + 5/9) / 2 = 0.788889.
+    """
+    near, far = [10.0, 0, 0, 2, 2, 2, 0], [20.0, 0, 0, 2, 2, 2, 0]
+    turned = [20.0, 0, 0, 2, 2, 2, pi / 3]
+    truth = labelled(near, far, label=CYCLIST)
+    detections = found((0.3, turned), (0.9, near), (0.6, box(40, 9)), label=CYCLIST)
+    score = score_of(truth, detections, name="Cyclist")
+    assert score.objects == 2
+    assert score.ap == pytest.approx(84.1667, abs=1e-4)
+    assert score.aph == pytest.approx(78.8889, abs=1e-4)
+
+
+def test_small_steps_of_recall_are_trapezoids() -> None:
+    """40 vehicles, 39 found at 0.9 without a false one; the last at 0.5 with 10 false ones: precision 40 / 50.
+
+    The step from recall 39/40 to 1 is narrower than 0.05: AP = 39/40 + 1/40 * (1 + 0.8) / 2 = 0.9975.
+    """
+    places = [box(7 * (i % 8), 7 * (i // 8)) for i in range(40)]
+    scored = [(0.9, item) for item in places[1:]] + [(0.5, places[0])] + [(0.5, box(-20, 7 * i)) for i in range(10)]
+    assert score_of(labelled(*places), found(*scored)).ap == pytest.approx(99.75)
+
+
+def test_a_level_2_object_need_not_be_found_at_level_1_but_may() -> None:
+    truth = labelled(box(10, 0), box(20, 0), levels=[1, 2])
+    missing = found((0.9, box(10, 0)))
+    assert score_of(truth, missing, 1).ap == pytest.approx(100)
+    assert score_of(truth, missing, 2).ap == pytest.approx(50)
+    assert (score_of(truth, missing, 1).objects, score_of(truth, missing, 2).objects) == (1, 2)
+    # Finding it is no mistake at LEVEL_1: precision stays 1 when it comes first.
+    both = found((0.9, box(20, 0)), (0.8, box(10, 0)))
+    assert score_of(truth, both, 1).ap == score_of(truth, both, 2).ap == pytest.approx(100)
+    # It counts as a find there: without the other one recall is 1 of 2.
+    assert score_of(truth, found((0.9, box(20, 0))), 1).ap == pytest.approx(50)
+
+
+def test_what_holds_no_point_is_no_object() -> None:
+    levels = difficulty_levels(np.array([0, 1, 5, 6, 100]))
+    assert levels.tolist() == [0, 2, 2, 1, 1]
+    assert difficulty_levels(np.array([0, 9, 9]), np.array([True, True, False])).tolist() == [0, 2, 1]
+    truth = labelled(box(10, 0), box(20, 0), levels=[1, 0])
+    assert score_of(truth, found((0.9, box(10, 0)))).ap == pytest.approx(100)
+    # A detection of it is false: precision 1/2 when it comes first.
+    assert score_of(truth, found((0.9, box(20, 0)), (0.8, box(10, 0)))).ap == pytest.approx(50)
+
+
+def test_classes_need_different_overlaps() -> None:
+    """d further along its length l a box overlaps itself by (l - d) / (l + d): 0.7 at 0.176 l, 0.5 at l / 3."""
+    for label, share, expected in ((0, 0.17, 100), (0, 0.18, 0), (2, 0.33, 100), (2, 0.34, 0), (1, 0.33, 100)):
+        moved = (0.9, box(10 + share * SIZES[label][0], 0, label))
+        score = score_of(labelled(box(10, 0, label), label=label), found(moved, label=label), name=NAMES[label])
+        assert score.ap == pytest.approx(expected)
+    assert score_of(labelled(box(10, 0, 1), label=1), found((0.9, box(10, 0, 1)), label=2), name="Pedestrian").ap == 0
+
+
+def test_matching_looks_at_the_sum_of_overlaps() -> None:
+    """The better detection overlaps both; it leaves the object that only the other one reaches."""
+    truth = labelled(box(10, 0), box(10.4, 0))
+    detections = found((0.9, box(10.15, 0)), (0.8, box(9.55, 0)))  # by score alone the first would take object 0
+    assert score_of(truth, detections).ap == pytest.approx(100)
+
+
+def test_ranges_judge_both_sides_by_their_own_centers() -> None:
+    truth, detections = labelled(box(29.9, 0)), found((0.9, box(30.1, 0)))
+    assert score_of(truth, detections).ap == pytest.approx(100)
+    near, middle, far = (score_of(truth, detections, range_m=span) for span in RANGES_M[1:])
+    assert (near.objects, near.ap, near.aph) == (1, 0, 0)
+    assert (middle.objects, middle.ap, middle.aph) == (0, None, None)
+    assert (far.objects, far.ap) == (0, None)
+    # Distance is 3D: 29 m ahead and 9 m up is beyond 30 m.
+    high = [29.0, 0, 9.0, 4, 2, 2, 0]
+    assert score_of(labelled(high), found((0.5, high)), range_m=(30.0, 50.0)).ap == pytest.approx(100)
+
+
+def test_frames_do_not_share_and_nothing_is_nothing() -> None:
+    here, elsewhere = labelled(box(10, 0)), labelled()
+    nothing = found()
+    assert score_of([here, elsewhere], [nothing, found((0.9, box(10, 0)))]).ap == 0
+    assert score_of([here, elsewhere], [found((0.9, box(10, 0))), nothing]).ap == pytest.approx(100)
+    assert score_of(elsewhere, nothing) == WaymoScore("Vehicle", 2, EVERYWHERE, 0, None, None)
+    assert score_of(here, nothing) == WaymoScore("Vehicle", 2, EVERYWHERE, 1, 0.0, 0.0)
+
+
+def test_mean_over_the_classes_that_have_objects() -> None:
+    scores = [
+        WaymoScore("Vehicle", 1, EVERYWHERE, 3, 60.0, 50.0),
+        WaymoScore("Vehicle", 2, EVERYWHERE, 4, 1.0, 2.0),
+        WaymoScore("Pedestrian", 1, EVERYWHERE, 5, 40.0, 20.0),
+        WaymoScore("Cyclist", 1, EVERYWHERE, 0, None, None),
+        WaymoScore("Vehicle", 1, (0.0, 30.0), 2, 3.0, 4.0),
+    ]
+    assert mean_over_classes(scores, 1) == (50.0, 35.0)
+    assert mean_over_classes(scores, 1, (0.0, 30.0)) == (3.0, 4.0)
+    assert np.isnan(mean_over_classes(scores, 2, (50.0, inf))).all()
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    truth, detections = labelled(box(1, 2)), found((0.5, box(1, 2)))
+    with pytest.raises(ValueError, match="2 labelled frames and 1"):
+        waymo_detection([truth, truth], [detections])
+    with pytest.raises(ValueError, match="0 labelled frames"):
+        waymo_detection([], [])
+    for wrong in (1.5, -0.1, float("nan")):
+        with pytest.raises(ValueError, match=r"frame 0: scores must lie within \[0, 1\]"):
+            waymo_detection([truth], [found((wrong, box(1, 2)))])
+    other = Detections.empty(("Car",))
+    with pytest.raises(ValueError, match="frame 1 has classes"):
+        waymo_detection([truth, truth], [detections, other])
+    with pytest.raises(ValueError, match="must have shapes"):
+        WaymoTruth(np.zeros((2, 7), np.float32), np.zeros(2, np.int64), np.zeros(3, np.int64))
