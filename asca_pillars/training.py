@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch.utils.data import DataLoader
 
-from asca_pillars.config import Config
+from asca_pillars.config import Config, load_config
 from asca_pillars.data.dataset import Batch, KittiDataset
 from asca_pillars.data.sampler import EpochSampler
 from asca_pillars.environment import describe_environment
@@ -263,7 +263,7 @@ def _claim(out: Path, config: Config) -> None:
     resolved = to_dict(config)
     path = out / "config.yaml"
     if path.exists():
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+        found = to_dict(load_config(path))  # a run of an older version lacks keys that are younger, not their values
         if difference := _first_difference(found, resolved):
             raise TrainingError(
                 f"{path}: the run there was started with {difference}; choose another --out, or delete it"

@@ -78,6 +78,18 @@ def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
         train(CONFIG, data, tmp_path / "run")
 
 
+def test_a_run_of_an_older_version_goes_on(tmp_path: Path) -> None:
+    """Its config.yaml lacks a setting that came later, not the setting's default."""
+    data = write_dataset(tmp_path / "data", 3)
+    first = train(CONFIG, data, tmp_path / "run")
+    path = tmp_path / "run" / "config.yaml"
+    older = yaml.safe_load(path.read_text())
+    del older["augment"]["insert"]
+    path.write_text(yaml.safe_dump(older))
+    steps = load_checkpoint(first).steps
+    assert load_checkpoint(train(CONFIG, data, tmp_path / "run")).steps == steps
+
+
 def test_a_run_can_start_from_other_weights(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 3)
     first = train(CONFIG, data, tmp_path / "first")
