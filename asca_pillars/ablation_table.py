@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from asca_pillars.ablation import VARIANTS, Run, Variant
+from asca_pillars.evaluation.kitti import DIFFICULTIES
+from asca_pillars.evaluation.report import markdown_table
 
 TABLES = {
     "Components (the rows of the paper's Table 5)": (
@@ -19,7 +21,6 @@ TABLES = {
     ),
 }
 CLASSES = ("Car", "Pedestrian", "Cyclist")
-DIFFICULTIES = ("easy", "moderate", "hard")
 BANDS_M = ((0.0, 40.0), (40.0, 80.0))
 
 
@@ -72,7 +73,7 @@ def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]
             low, high = speed.ratio_quartiles
             cells += [f"{speed.parameters:,}", f"{speed.fps:.1f}", f"{speed.ratio:.2f} ({low:.2f}-{high:.2f})"]
         rows.append([*_components(VARIANTS[name]), *cells])
-    return _markdown(header, rows)
+    return markdown_table(header, rows, left=3)
 
 
 def _by_difficulty(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
@@ -81,7 +82,7 @@ def _by_difficulty(names: Sequence[str], results: Mapping[str, Sequence[dict[str
     for name in names:
         cells = [_spread([_ap(run, c, d) for run in results[name]]) for c in CLASSES for d in DIFFICULTIES]
         rows.append([*_components(VARIANTS[name]), *cells])
-    return _markdown(header, rows)
+    return markdown_table(header, rows, left=3)
 
 
 def _components(variant: Variant) -> tuple[str, str, str]:
@@ -110,8 +111,3 @@ def _spread(values: Sequence[float]) -> str:
     """Mean over the seeds, and half the distance between the best and the worst."""
     mean = f"{statistics.fmean(values):.2f}"
     return mean if len(values) == 1 else f"{mean} ± {(max(values) - min(values)) / 2:.2f}"
-
-
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    ruler = ["---"] * 3 + ["---:"] * (len(header) - 3)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, ruler, *rows)) + "\n"

@@ -128,6 +128,26 @@ def inspect(
 
 
 @app.command()
+def prepare(
+    config: Annotated[Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")],
+    data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")],
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s data.prepared=DIR"),
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+) -> None:
+    """Compute once what GT-Aug and RS-Aug need of a dataset: the object database and the maps of free ground.
+
+    Training does the same on first use; what is there and unchanged is used again. Without an insertion method in
+    the config, what RS-Aug needs is prepared.
+    """
+    from asca_pillars.commands.prepare import run
+
+    run(config, data, override or [], workers)
+
+
+@app.command()
 def train(
     config: Annotated[Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")],
     data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")],

@@ -1,4 +1,7 @@
-"""The whole configuration as one typed tree. Its defaults are the paper's values (ASCA-PointPillars, section 4.1)."""
+"""The whole configuration as one typed tree. Its defaults are the paper's values (ASCA-PointPillars, section 4.1).
+
+One is not: inserting objects reads a prepared dataset, so it is off until a config asks for it, as the paper's does.
+"""
 
 import math
 from collections.abc import Sequence
@@ -122,6 +125,7 @@ class DataConfig(Strict):
         camera_view: keep only points that the camera sees; KITTI labels nothing else.
         min_points: an object with fewer points inside its box is neither a positive nor a negative.
         workers: processes that load and augment.
+        prepared: folder for what is computed once per dataset; if not given, prepared/ in the dataset's folder.
     """
 
     train_set: str = "train"
@@ -129,6 +133,7 @@ class DataConfig(Strict):
     camera_view: bool = True
     min_points: int = 1
     workers: int = 2
+    prepared: str | None = None
 
     def __post_init__(self) -> None:
         _require("data", self, ("min_points", "workers"), low=0)
@@ -174,6 +179,13 @@ class Config(Strict):
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     data: DataConfig = field(default_factory=DataConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+
+    def __post_init__(self) -> None:
+        wanted, names = self.augment.insert.proportions, self.detector.class_names
+        if unknown := [name for name in wanted if name not in names]:
+            raise ConfigError(f"augment.insert.proportions.{unknown[0]}: no such class; there are {', '.join(names)}")
+        if wanted and not any(wanted.values()):
+            raise ConfigError("augment.insert.proportions: all are 0; set augment.insert.method=none to insert nothing")
 
 
 def shipped_configs() -> dict[str, Path]:

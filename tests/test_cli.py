@@ -28,7 +28,7 @@ from importlib.machinery import PathFinder
 class BaseInstall(PathFinder):
     @classmethod
     def find_spec(cls, name, *rest):
-        if name.split(".")[0] in ("torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba"):
+        if name.split(".")[0] in ("torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy", "matplotlib"):
             return None
         return super().find_spec(name, *rest)
 
@@ -68,7 +68,7 @@ def test_help_loads_nothing_heavy() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    for command in ("detect", "bench", "simulate", "inspect", "train", "eval", "export", "ablate", "doctor"):
+    for command in ("detect", "bench", "simulate", "inspect", "prepare", "train", "eval", "export", "ablate", "doctor"):
         assert command in result.stdout
 
 

@@ -111,7 +111,8 @@ SECTIONS = dict(sections(Config()))
 def test_every_level_is_tested_below() -> None:
     names = {".".join(map(str, path)) for path in SECTIONS}
     assert names == {
-        *("", "detector", "detector.grid", "detector.limits", "detector.post", "network", "loss", "augment", "data"),
+        *("", "detector", "detector.grid", "detector.limits", "detector.post", "network", "loss", "augment"),
+        *("augment.insert", "data"),
         *("detector.classes.0", "detector.classes.1", "detector.classes.2", "train"),
     }
 
@@ -250,6 +251,9 @@ def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
         ("loss.smooth_l1_beta", "-0.1", "must be at least 0"),
         ("augment.flip_probability", "2", "must lie between 0 and 1"),
         ("augment.point_dropout", "-0.1", "must lie between 0 and 1"),
+        ("augment.insert.objects", "-1", "must be at least 0"),
+        ("augment.insert.min_points", "0", "must be at least 1"),
+        ("augment.insert.proportions.Car", "-1", "must be at least 0"),
         ("augment.object_shift_m", "-0.1", "must be at least 0"),
         ("augment.rotation_rad", ".inf", "must be at least 0"),
         ("augment.scale", "[1.05, 0.95]", "must be two positive numbers, the smaller first"),
@@ -268,14 +272,28 @@ def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
     ],
 )
 def test_impossible_numbers(tmp_path: Path, key: str, value: str, message: str) -> None:
-    section, name = key.split(".")
-    path = write(tmp_path, f"{section}:\n  {name}: {value}\n")
+    *parents, name = key.split(".")
+    path = write(tmp_path, "".join(f"{parent}: {{" for parent in parents) + f"{name}: {value}" + "}" * len(parents))
     assert re.fullmatch(rf"{re.escape(str(path))}: {re.escape(key)} = .+: {message}.*", refusal(path))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ("{Lorry: 1}", r"augment.insert.proportions.Lorry: no such class; there are Car, Pedestrian, Cyclist"),
+        ("{Car: 0}", r"augment.insert.proportions: all are 0; set augment.insert.method=none to insert nothing"),
+    ],
+)
+def test_proportions_that_cannot_be(tmp_path: Path, wanted: str, message: str) -> None:
+    path = write(tmp_path, f"augment: {{insert: {{proportions: {wanted}}}}}")
+    assert refusal(path) == f"{path}: {message}"
 
 
 def test_files_that_are_not_text(tmp_path: Path) -> None:
     path = tmp_path / "model.yaml"
     path.write_bytes(b"name: caf\xe9\n")
     assert refusal(path).startswith(f"{path}: not valid YAML: ")
-    assert "cannot be read (No such file or directory); these ship: asca_" in refusal(tmp_path / "missing.yaml")
+    assert "cannot be read (No such file or directory); these ship: ablation_small, asca_" in refusal(
+        tmp_path / "missing.yaml"
+    )
     assert "cannot be read (Is a directory)" in refusal(tmp_path)

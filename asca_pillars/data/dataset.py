@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 from asca_pillars.config import Config
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
+from asca_pillars.data.insertion import Inserter, insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.geometry.pillarize import Pillars
 from asca_pillars.models.detector import PillarBatch, batch_pillars
@@ -60,14 +61,14 @@ class Batch:
 
 
 class KittiDataset(Dataset[Sample]):
-    """Frames of one ImageSets list, augmented when `training`.
+    """Frames of one ImageSets list, augmented when `training`; the object database is built here if it is missing.
 
     What a sample holds depends on the seed, the epoch and the frame alone, not on the number of workers or on what
     was drawn before it: a resumed run sees what an unbroken one would have seen. An index is therefore a pair
     (epoch, frame number), see `EpochSampler`.
 
     Raises:
-        DatasetError: a missing list, scan, label or calibration file.
+        DatasetError: a missing list, scan, label or calibration file; a class to insert that no frame has.
     """
 
     def __init__(self, root: str | Path, config: Config, *, training: bool) -> None:
@@ -75,6 +76,9 @@ class KittiDataset(Dataset[Sample]):
         self.training = training
         self.split = KittiSplit(root, config.data.train_set if training else config.data.val_set)
         self.frame_ids = self.split.frame_ids
+        self.inserter: Inserter | None = None
+        if training and config.augment.insert.method != "none":
+            self.inserter = prepare_inserter(self.split, config)
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -90,6 +94,11 @@ class KittiDataset(Dataset[Sample]):
             camera_view=data.camera_view,
             min_points=data.min_points,
         )
+        if self.inserter is not None:
+            # A generator of its own: all other draws stay what they are without insertion.
+            frame = insert_objects(
+                frame, self.inserter, np.random.default_rng((self.config.train.seed, epoch, number, 1))
+            )
         if rng is not None:
             frame = augment(frame, self.config.augment, rng)
         frame = within_grid(frame, spec.grid)

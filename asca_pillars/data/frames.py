@@ -72,6 +72,12 @@ def read_frame(
 
 def within_grid(frame: LabeledFrame, grid: PillarGrid) -> LabeledFrame:
     """The frame without the boxes whose centre lies beside the grid: no anchor stands where they are."""
-    x, y = frame.boxes[:, 0], frame.boxes[:, 1]
-    inside = (x >= grid.x_range_m[0]) & (x < grid.x_range_m[1]) & (y >= grid.y_range_m[0]) & (y < grid.y_range_m[1])
+    inside = in_grid(frame.boxes, grid)
     return replace(frame, boxes=frame.boxes[inside], labels=frame.labels[inside])
+
+
+def in_grid(boxes: NDArray[np.floating], grid: PillarGrid) -> NDArray[np.bool_]:
+    """Which boxes (N, 7) have their centre over the grid: (N,)."""
+    x, y = boxes[:, 0], boxes[:, 1]
+    (x_min, x_max), (y_min, y_max) = grid.x_range_m, grid.y_range_m
+    return np.asarray((x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max))

@@ -79,10 +79,10 @@ def read_predictions(
         DatasetError: as `read_truth`; a line without a score; a prediction without labels.
     """
     folder, labels = Path(folder), Path(labels)
-    there = _frame_ids(folder, "predictions")
+    there = dict.fromkeys(_frame_ids(folder, "predictions"))
     known = {frame.frame_id for frame in truth}
     unlabeled = [name for name in there if name not in known and not (labels / f"{name}.txt").is_file()]
-    pairs = [frame for frame in truth if frame.frame_id in set(there)]
+    pairs = [frame for frame in truth if frame.frame_id in there]
     if not pairs:
         raise DatasetError(
             f"{folder}: none of its {len(there)} files is of a frame to be evaluated, as {truth[0].frame_id}.txt would "
@@ -97,7 +97,7 @@ def read_predictions(
         _read_frame(folder, frame.frame_id, scored=True)
         for frame in track(pairs, "Reading predictions", console=console, disable=console is None)
     )
-    missing = tuple(frame.frame_id for frame in truth if frame.frame_id not in set(there))
+    missing = tuple(frame.frame_id for frame in truth if frame.frame_id not in there)
     return ScoredFrames(tuple(pairs), detections, missing)
 
 

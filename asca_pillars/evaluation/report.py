@@ -103,13 +103,17 @@ def to_markdown(report: EvalReport) -> str:
     """The tables and notes as Markdown."""
     parts = [f"# {report.title}\n"]
     for table in tables(report):
-        ruler = ["---" if index < table.left else "---:" for index in range(len(table.columns))]
         columns = [column.replace("\n", " ") for column in table.columns]
-        lines = [f"| {' | '.join(cells)} |" for cells in (columns, ruler, *table.rows)]
-        parts.append("\n".join([f"## {table.title}\n", *lines, ""]))
+        parts.append(f"## {table.title}\n\n{markdown_table(columns, table.rows, table.left)}")
     if lines := notes(report):
         parts.append("\n".join([*(f"- {line}" for line in lines), ""]))
     return "\n".join(parts)
+
+
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
+    """A table as Markdown; the first `left` columns are names, the others numbers."""
+    ruler = ["---" if index < left else "---:" for index in range(len(columns))]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in (columns, ruler, *rows))
 
 
 def to_json(report: EvalReport) -> dict[str, Any]:

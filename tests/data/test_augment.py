@@ -85,7 +85,7 @@ def assert_objects_kept(before: LabeledFrame, after: LabeledFrame, mirrored: boo
         assert points_in_boxes(points_of(after, index), after.boxes)[:, index].all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(frames())
 def test_flip(frame: LabeledFrame) -> None:
     flipped = copy_of(frame)
@@ -96,7 +96,7 @@ def test_flip(frame: LabeledFrame) -> None:
     assert np.array_equal(flipped.boxes[:, :3], frame.boxes[:, :3] * mirror[:3])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(frames(), st.floats(-2 * math.pi, 2 * math.pi), st.booleans())
 def test_rotation(frame: LabeledFrame, angle_rad: float, numpy_scalar: bool) -> None:
     turned = copy_of(frame)
@@ -136,7 +136,7 @@ def test_directions_by_hand() -> None:
     np.testing.assert_allclose(scaled.points[0], [11, 7.7, -1.1, 0.5], rtol=1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(frames(), st.floats(0.5, 2.0))
 def test_scaling(frame: LabeledFrame, factor: float) -> None:
     scaled = copy_of(frame)
@@ -146,7 +146,7 @@ def test_scaling(frame: LabeledFrame, factor: float) -> None:
     assert np.array_equal(scaled.points[:, 3], frame.points[:, 3])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(frames(), st.integers(0, 2**32 - 1), st.floats(0, 1.5), st.floats(0, math.pi))
 def test_moved_objects(frame: LabeledFrame, seed: int, shift_m: float, turn_rad: float) -> None:
     moved = copy_of(frame)
@@ -212,7 +212,7 @@ def test_points_of_overlapping_boxes_are_not_torn_off() -> None:
     assert_objects_kept(LabeledFrame("0", points, boxes, np.zeros(2, np.int64)), frame)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(frames(), st.integers(0, 2**32 - 1))
 def test_augmented_objects_keep_their_points(frame: LabeledFrame, seed: int) -> None:
     points, boxes = frame.points.copy(), frame.boxes.copy()

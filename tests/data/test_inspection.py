@@ -131,7 +131,7 @@ def test_positives_are_those_of_the_training_loader(clean: Path) -> None:
     assert inspection.scans.points.largest == max(points)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2), st.floats(6.5, 23), st.floats(-4.5, 5.5), st.floats(0.5, 1.8), st.floats(-3.1, 3.1))
 def test_an_objects_fate_by_its_overlap_with_every_anchor(
     label: int, x: float, y: float, stretch: float, yaw: float

@@ -60,7 +60,7 @@ angles = st.floats(-3.0, 3.0)
 cents = st.integers
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     tilt=st.tuples(angles, angles, angles),
     offset=st.tuples(*[st.floats(-1.5, 1.5)] * 3),

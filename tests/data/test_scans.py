@@ -112,7 +112,7 @@ def test_a_file_cut_anywhere_is_a_scan_or_a_scan_error(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", FILES)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(changes=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=4))
 def test_a_file_with_wrong_bytes_is_a_scan_or_a_scan_error(tmp_path_factory, name, changes):
     content = bytearray(FILES[name])

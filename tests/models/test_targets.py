@@ -79,7 +79,7 @@ def labelled_boxes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
     return np.array(boxes, np.float32).reshape(-1, 7), np.array(labels, np.int64)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(labelled_boxes())
 def test_equals_a_plain_loop_over_all_anchors(labelled: tuple[np.ndarray, np.ndarray]) -> None:
     boxes, labels = labelled
