@@ -115,7 +115,7 @@ def evaluate_runs(todo: Sequence[Run], data: str | Path, jobs: int) -> None:
 
     def evaluate(run: Run) -> None:
         where = ("--data", str(data), "--split", "val", "--out", str(run.evaluated.parent))
-        _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0"), threads)
+        _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
 
     _at_once([run for run in todo if not run.evaluated.exists()], evaluate, jobs, "Evaluating")
 

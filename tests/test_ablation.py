@@ -45,6 +45,9 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.
     again = (out / "results.md").read_text()
     assert _accuracies(again) == _accuracies(text)
 
+    with pytest.raises(TrainingError, match="another base configuration or data"):
+        ablate.run("ablation_small", data, out, "0", "baseline", jobs=1)
+
 
 def test_a_failed_run_names_its_log(tmp_path: Path, config: str) -> None:
     todo = runs(tmp_path / "out", [0], [VARIANTS["baseline"]])

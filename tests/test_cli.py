@@ -28,7 +28,8 @@ from importlib.machinery import PathFinder
 class BaseInstall(PathFinder):
     @classmethod
     def find_spec(cls, name, *rest):
-        if name.split(".")[0] in ("torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy", "matplotlib"):
+        heavy = ("torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy", "matplotlib")
+        if name.split(".")[0] in heavy:
             return None
         return super().find_spec(name, *rest)
 

@@ -4,6 +4,7 @@ import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -12,12 +13,14 @@ from rich.progress import track
 
 from asca_pillars.ablation import VARIANTS, Run, Variant, evaluate_runs, runs, train_runs
 from asca_pillars.ablation_table import Speed, read_results, tables
+from asca_pillars.commands import prepare
 from asca_pillars.commands.extras import require
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.environment import command_line, package_versions
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path
-from asca_pillars.machine import cpu_model
+from asca_pillars.machine import cpu_model, default_threads
+from asca_pillars.schema import to_dict
 
 TIMED_ROUNDS = 10
 
@@ -27,8 +30,10 @@ def run(config: str, data: Path, out: Path, seeds: str, variants: str, jobs: int
     require("train")
     from asca_pillars.config import load_config
 
-    load_config(config)  # a typo is told now, not by the first training
+    _claim(out, {"config": to_dict(load_config(config)), "data": str(data)})
     todo = runs(out, _seeds(seeds), _variants(variants))
+    if any(one.variant.insert != "none" and not one.trained.exists() for one in todo):
+        prepare.run(Path(config), data, [], default_threads())  # once, not by every run that finds nothing there
     train_runs(todo, config, data, jobs)
     evaluate_runs(todo, data, jobs)
     console = Console(markup=False)
@@ -39,6 +44,16 @@ def run(config: str, data: Path, out: Path, seeds: str, variants: str, jobs: int
         temporary.write_text(text, encoding="utf-8")
     console.print(Markdown(text))
     console.print(f"Written: {path}")
+
+
+def _claim(out: Path, base: dict[str, Any]) -> None:
+    """Note what all runs in `out` have in common, or refuse to mix them with runs on another base."""
+    path = out / "ablation.json"
+    if not path.exists():
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(base, indent=1) + "\n", encoding="utf-8")
+    elif json.loads(path.read_text(encoding="utf-8")) != base:
+        raise TrainingError(f"{path}: the runs there have another base configuration or data; choose another --out")
 
 
 def _setup(todo: Sequence[Run], config: str, data: Path, jobs: int) -> str:
