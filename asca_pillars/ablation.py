@@ -87,8 +87,11 @@ def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Variant]) -> 
     return [Run(variant, seed, Path(out) / variant.name / f"seed{seed}") for seed in seeds for variant in variants]
 
 
-def train_runs(todo: Sequence[Run], config: str, data: str | Path, jobs: int) -> None:
+def train_runs(todo: Sequence[Run], config: str, data: str | Path, jobs: int, overrides: Sequence[str] = ()) -> None:
     """Train what is not trained yet, `jobs` processes at a time that share the cores.
+
+    Args:
+        overrides: of every run, in the form of `asca train -s`; those of the variant win over them.
 
     Raises:
         TrainingError: a training failed; the message names its log.
@@ -96,9 +99,9 @@ def train_runs(todo: Sequence[Run], config: str, data: str | Path, jobs: int) ->
     threads = max(1, default_threads() // jobs)
 
     def train(run: Run) -> None:
-        overrides = [part for text in (*run.variant.overrides, f"train.seed={run.seed}") for part in ("-s", text)]
+        settings = (*overrides, *run.variant.overrides, f"train.seed={run.seed}")
         where = ("--data", str(data), "--out", str(run.folder), "--devices", "1")
-        seconds = _asca(run, ("train", config, *where, *overrides), threads)
+        seconds = _asca(run, ("train", config, *where, *(part for text in settings for part in ("-s", text))), threads)
         with atomic_path(run.trained) as temporary:
             temporary.write_text(json.dumps({"seconds": round(seconds), "threads": threads}), encoding="utf-8")
 

@@ -240,6 +240,10 @@ def ablate(
     config: Annotated[str, typer.Argument(help="Base: a YAML, or the name of one that ships, such as ablation_small.")],
     data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with ImageSets/{train,val}.txt.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the runs; finished ones there are kept.")],
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", "-s", help="key.subkey=value for every run. Repeatable: -s train.epochs=3"),
+    ] = None,
     seeds: Annotated[str, typer.Option(help="Seeds of every variant, with commas between them.")] = "0,1",
     variants: Annotated[str, typer.Option(help="Names with commas between them, or all.")] = "all",
     jobs: Annotated[int, typer.Option(min=1, help="Trainings at a time; they share the CPU cores.")] = 1,
@@ -251,7 +255,7 @@ def ablate(
     """
     from asca_pillars.commands.ablate import run
 
-    run(config, data, out, seeds, variants, jobs)
+    run(config, data, out, override or [], seeds, variants, jobs)
 
 
 @app.command()

@@ -25,16 +25,16 @@ from asca_pillars.schema import to_dict
 TIMED_ROUNDS = 10
 
 
-def run(config: str, data: Path, out: Path, seeds: str, variants: str, jobs: int) -> None:
+def run(config: str, data: Path, out: Path, overrides: list[str], seeds: str, variants: str, jobs: int) -> None:
     """See `asca ablate --help`."""
     require("train")
     from asca_pillars.config import load_config
 
-    _claim(out, {"config": to_dict(load_config(config)), "data": str(data)})
+    _claim(out, {"config": to_dict(load_config(config, overrides)), "data": str(data)})
     todo = runs(out, _seeds(seeds), _variants(variants))
     if any(one.variant.insert != "none" and not one.trained.exists() for one in todo):
-        prepare.run(Path(config), data, [], default_threads())  # once, not by every run that finds nothing there
-    train_runs(todo, config, data, jobs)
+        prepare.run(Path(config), data, overrides, default_threads())  # once, not by every run that finds nothing there
+    train_runs(todo, config, data, jobs, overrides)
     evaluate_runs(todo, data, jobs)
     console = Console(markup=False)
     speeds = _speeds(todo, data, console)
