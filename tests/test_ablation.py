@@ -34,16 +34,16 @@ def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
 def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_dataset(tmp_path / "data", 14, val_frames=8)
     out = tmp_path / "out"
-    ablate.run(config, data, out, ["train.learning_rate=0.001"], "0", "baseline,asp_k2", jobs=2)
+    ablate.run(config, data, out, ["train.learning_rate=0.002"], "0", "baseline,asp_k2", jobs=2)
     text = (out / "results.md").read_text()
     assert "6 frames for training, 8 for validation" in text and "2 runs" in text
     assert sum(line.startswith("| K=2 | - | - |") for line in text.splitlines()) == 2
     trained = load_config(out / "baseline" / "seed0" / "config.yaml")
-    assert (trained.train.learning_rate, trained.detector.grid.zones) == (1e-3, 1)
+    assert (trained.train.learning_rate, trained.detector.grid.zones) == (2e-3, 1)
     weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
 
     ablate.run(
-        config, data, out, ["train.learning_rate=0.001"], "0", "baseline,asp_k2", jobs=1
+        config, data, out, ["train.learning_rate=0.002"], "0", "baseline,asp_k2", jobs=1
     )  # nothing is trained twice
     assert all(path.stat().st_mtime_ns == before for path, before in weights.items())
     again = (out / "results.md").read_text()
