@@ -14,7 +14,7 @@ from asca_pillars.data.gt_database import StoredObject
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.geometry.overlap import bev_intersection
+from asca_pillars.geometry.overlap import paired_bev_touch
 
 PLACE_TRIES = 32  # places that are tried for one object
 CHECKED_PLACES = 4  # of those on free ground, looked at closely
@@ -43,19 +43,19 @@ class Scene:
         self._owners = np.ascontiguousarray(inside[self._owned].T)
         self._wanted = self._owners[frame.labels >= 0]
         self._enough = MIN_SEEN_SHARE * np.count_nonzero(self._wanted, axis=1)
-        self._owned_points = frame.points[self._owned]
+        self._owned_rays = Rays(frame.points[self._owned])
         self._hidden = np.zeros(len(self._owned), bool)
 
     def add(self, item: StoredObject) -> None:
         """Put an object where it says."""
-        self._hidden |= rays_entering(self._owned_points, item.box[None])
+        self._hidden |= self._owned_rays.entering(item.box[None])
         self._seen_points = [*self._seen_with(item), self._seen_of(item)]
         self.inserted.append(item)
         self.obstacles = np.concatenate([self.obstacles, item.box[None]])
 
     def shows_all_with(self, item: StoredObject) -> bool:
         """Whether most of every object, `item` included, would be seen if `item` were added."""
-        seen = ~(self._hidden | rays_entering(self._owned_points, item.box[None]))
+        seen = ~(self._hidden | self._owned_rays.entering(item.box[None]))
         if (np.count_nonzero(self._wanted & seen, axis=1) < self._enough).any():
             return False
         if len(self._seen_of(item)) < MIN_SEEN_SHARE * len(item.points):
@@ -93,34 +93,47 @@ class Scene:
         ]
 
 
+class Rays:
+    """The straight ways from the sensor to points (N, >=3), looked at again and again while places are tried."""
+
+    def __init__(self, points: _Floats) -> None:
+        self._ends = np.ascontiguousarray(points[:, :3].T, dtype=np.float64)
+        self._reach = np.hypot(self._ends[0], self._ends[1]) * (1 + 1e-5) + 1e-3
+
+    def entering(self, boxes: _Floats) -> NDArray[np.bool_]:
+        """Which of them touch one of boxes (M, 7), their ends included: (N,)."""
+        px, py, _ = self._ends
+        hits = np.zeros(len(px), bool)
+        for x, y, z, length, width, height, yaw in boxes.tolist():
+            # Most ways pass the box's circumscribed circle by; both sides are scaled by the distance to the point.
+            near = (np.abs(px * y - py * x) <= math.hypot(length, width) / 2 * self._reach).nonzero()[0]
+            if not len(near):
+                continue
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            into_box = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+            ray = into_box @ self._ends[:, near]
+            center = (into_box @ (x, y, z))[:, None]
+            ray[np.abs(ray) < 1e-9] = 1e-9
+            half = np.array([[length], [width], [height]]) / 2
+            one, other = (center - half) / ray, (center + half) / ray
+            enters = np.minimum(one, other).max(axis=0)
+            leaves = np.maximum(one, other).min(axis=0)
+            hits[near] |= (enters <= leaves) & (leaves >= 0) & (enters <= 1)
+        return hits
+
+
 def rays_entering(points: _Floats, boxes: _Floats) -> NDArray[np.bool_]:
     """Which straight ways from the sensor to points (N, >=3) touch one of boxes (M, 7), their ends included: (N,)."""
-    hits = np.zeros(len(points), bool)
-    px, py = np.ascontiguousarray(points[:, :2].T)
-    reach = np.hypot(px, py) * np.float32(1 + 1e-5) + np.float32(1e-3)
-    for x, y, z, length, width, height, yaw in boxes.tolist():
-        # Most ways pass the box's circumscribed circle by; both sides are scaled by the distance to the point.
-        near = np.flatnonzero(np.abs(px * y - py * x) <= math.hypot(length, width) / 2 * reach)
-        if not len(near):
-            continue
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        into_box = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-        ray = into_box @ points[near, :3].astype(np.float64).T
-        center = (into_box @ (x, y, z))[:, None]
-        ray[np.abs(ray) < 1e-9] = 1e-9
-        half = np.array([[length], [width], [height]]) / 2
-        one, other = (center - half) / ray, (center + half) / ray
-        enters = np.minimum(one, other).max(axis=0)
-        leaves = np.maximum(one, other).min(axis=0)
-        hits[near] |= (enters <= leaves) & (leaves >= 0) & (enters <= 1)
-    return hits
+    return Rays(points).entering(boxes)
 
 
 def is_clear(box: _Floats, obstacles: _Floats, grid: PillarGrid) -> bool:
     """Whether a box (7,) stands over the grid and touches none of the others (K, 7)."""
     reach = (np.hypot(obstacles[:, 3], obstacles[:, 4]) + math.hypot(box[3], box[4])) / 2
     near = obstacles[np.hypot(obstacles[:, 0] - box[0], obstacles[:, 1] - box[1]) <= reach]
-    return bool(in_grid(box[None], grid)[0]) and not (len(near) and bev_intersection(box[None], near).any())
+    if not in_grid(box[None], grid)[0]:
+        return False
+    return not paired_bev_touch(np.broadcast_to(box, near.shape).astype(np.float64), near.astype(np.float64)).any()
 
 
 def to_free_place(

@@ -36,10 +36,7 @@ def paired_bev_intersection(a: _Doubles, b: _Doubles) -> _Doubles:
     onto b's border, where the ways there and back cancel. Every term is continuous in the corners, so boxes
     that touch, coincide or nearly coincide need no special case, and there are no lists of vertices to keep.
     """
-    cos, sin = np.cos(b[:, 6]), np.sin(b[:, 6])
-    dx, dy = a[:, 0] - b[:, 0], a[:, 1] - b[:, 1]
-    x, y = cos * dx + sin * dy, cos * dy - sin * dx
-    cos, sin = np.cos(a[:, 6] - b[:, 6]), np.sin(a[:, 6] - b[:, 6])
+    x, y, cos, sin = _relative(a, b)
     al, aw, bl, bw = a[:, 3] / 2, a[:, 4] / 2, b[:, 3] / 2, b[:, 4] / 2
 
     area = np.zeros(len(a))
@@ -51,11 +48,29 @@ def paired_bev_intersection(a: _Doubles, b: _Doubles) -> _Doubles:
         area -= _pressed_integral(start, end, bl, bw)
 
     # Rounding leaves some 1e-16 where nothing is shared; the separating axes tell for certain.
+    return np.where(paired_bev_touch(a, b), np.clip(area, 0.0, 4 * np.minimum(al * aw, bl * bw)), 0.0)
+
+
+def paired_bev_touch(a: _Doubles, b: _Doubles) -> NDArray[np.bool_]:
+    """Whether the footprints of a[k] and b[k] share any area: (K, 7), (K, 7) float64 -> (K,).
+
+    By the separating axes: several times as fast as the area.
+    """
+    x, y, cos, sin = _relative(a, b)
+    al, aw, bl, bw = a[:, 3] / 2, a[:, 4] / 2, b[:, 3] / 2, b[:, 4] / 2
     cos_abs, sin_abs = np.abs(cos), np.abs(sin)
     apart = (np.abs(x) >= bl + cos_abs * al + sin_abs * aw) | (np.abs(y) >= bw + sin_abs * al + cos_abs * aw)
     apart |= np.abs(cos * x + sin * y) >= al + cos_abs * bl + sin_abs * bw
     apart |= np.abs(cos * y - sin * x) >= aw + sin_abs * bl + cos_abs * bw
-    return np.where(apart, 0.0, np.clip(area, 0.0, 4 * np.minimum(al * aw, bl * bw)))
+    return ~apart
+
+
+def _relative(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles, _Doubles, _Doubles]:
+    """Center x, y of a[k] in the frame of b[k], and cosine and sine of its heading there: 4 x (K,)."""
+    cos, sin = np.cos(b[:, 6]), np.sin(b[:, 6])
+    dx, dy = a[:, 0] - b[:, 0], a[:, 1] - b[:, 1]
+    turn = a[:, 6] - b[:, 6]
+    return cos * dx + sin * dy, cos * dy - sin * dx, np.cos(turn), np.sin(turn)
 
 
 def bev_iou(a: _Boxes, b: _Boxes) -> _Doubles:

@@ -15,6 +15,7 @@ from asca_pillars.geometry.overlap import (
     bev_iou,
     iou_3d,
     paired_bev_intersection,
+    paired_bev_touch,
     rotated_nms,
 )
 
@@ -153,6 +154,23 @@ def test_rows_are_a_and_columns_are_b() -> None:
 def test_pairs_are_the_diagonal() -> None:
     a, b = random_boxes(0, 40, 3.0).astype(np.float64), random_boxes(1, 40, 3.0).astype(np.float64)
     np.testing.assert_array_equal(paired_bev_intersection(a, b), np.diag(bev_intersection(a, b)))
+
+
+def test_footprints_apart_do_not_touch() -> None:
+    box = np.array([10.0, 2.0, 0, 4.0, 2.0, 1.5, 0.3])
+    # Turned by 0.3, 2.2 to the side is 2.10 across its width of 2, and 2.0 is 1.91.
+    for dx, dy, touch in ((5.0, 0.0, False), (0.0, 2.2, False), (0.0, 2.0, True)):
+        assert paired_bev_touch(box[None], moved(box, dx, dy)[None])[0] == touch
+
+
+@given(BOXES, BOXES)
+def test_footprints_touch_where_they_share_area(a: np.ndarray, b: np.ndarray) -> None:
+    for first, second in ((a, b), (a, moved(a, dx=a[3] * 0.9))):
+        shared = intersection_twin(first, second)
+        touch = bool(paired_bev_touch(first[None], second[None])[0])
+        assert touch == bool(paired_bev_touch(second[None], first[None])[0])
+        assert touch or shared < 1e-6  # less than that is rounding, in shapely as well as here
+        assert touch or not paired_bev_intersection(first[None], second[None])[0]
 
 
 def test_inputs_are_not_changed() -> None:
