@@ -225,6 +225,7 @@ def _placement_table(tallies: dict[str, Tally], milliseconds: dict[str, list[flo
             table.add_row(f"  fails by {name}", *(str(getattr(tally, name)) for tally in both))
     for name in ("boxes", "clusters", "inserts", "obstacle_points"):
         table.add_row(f"meets {name}", *(str(getattr(tally, name)) for tally in both))
+    table.add_row("ms per frame, mean", *(f"{np.mean(ms):.1f}" for ms in milliseconds.values()))
     for share in (50, 95):
         table.add_row(f"ms per frame, p{share}", *(f"{np.percentile(ms, share):.1f}" for ms in milliseconds.values()))
     return table
