@@ -68,7 +68,7 @@ def tables(report: EvalReport) -> list[TextTable]:
 
 
 def notes(report: EvalReport) -> list[str]:
-    """What one must know to read the tables: classes that were not evaluated, and sets too small for their AP."""
+    """What one must know to read the tables: classes not evaluated, sets too small for their AP, detections excused."""
     results = report.ap.overall
     lines = []
     for name in results.class_names:
@@ -77,7 +77,7 @@ def notes(report: EvalReport) -> list[str]:
         lines += [
             _cap_note(curve) for curve in _counts_of(results, name) if curve is not None and curve.counted <= SMALL_SET
         ]
-    return lines
+    return lines + [_excuse_note(p) for p in report.points if p.difficulty == "hard" and p.excused > p.detections]
 
 
 def print_report(report: EvalReport, console: Console) -> None:
@@ -215,6 +215,14 @@ def _cap_note(curve: Curve) -> str:
         return f"{what}: no counted objects; its AP of 0 says nothing"
     objects = f"only {curve.counted} counted object{'s' if curve.counted > 1 else ''}"
     return f"{what}: {objects}; a perfect detector gets at most {curve.r40_cap:.1f} R40, {curve.r11_cap:.1f} R11"
+
+
+def _excuse_note(point: OperatingPoint) -> str:
+    of_all = f"{point.excused} of {point.excused + point.detections} detections"
+    return (
+        f"{point.class_name}: {of_all} are excused even at hard (low in the image, without 2D box, on ignored objects "
+        "or DontCare areas); the precision does not count them"
+    )
 
 
 def _percent(value: float | None) -> str:
