@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from asca_pillars.ablation import VARIANTS, Run, Variant
-from asca_pillars.evaluation.kitti import DIFFICULTIES
+from asca_pillars.evaluation.kitti import CLASS_NAMES, DIFFICULTIES
 from asca_pillars.evaluation.report import markdown_table
 
 TABLES = {
@@ -20,7 +20,6 @@ TABLES = {
         *("asp_k3", "asp_k3_cpa_paper", "asp_k3_cpa_channel", "asp_k3_cpa_point"),
     ),
 }
-CLASSES = ("Car", "Pedestrian", "Cyclist")
 BANDS_M = ((0.0, 40.0), (40.0, 80.0))
 
 
@@ -60,11 +59,11 @@ def read_results(runs: Iterable[Run]) -> dict[str, list[dict[str, Any]]]:
 
 def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
     bands = [f"{low:g}-{high:g} m" for low, high in BANDS_M]
-    header = ["ASP", "CPA", "Aug", *CLASSES, "mean", *bands, "parameters", "FPS", "time / baseline"]
+    header = ["ASP", "CPA", "Aug", *CLASS_NAMES, "mean", *bands, "parameters", "FPS", "time / baseline"]
     rows = []
     for name in names:
         runs, speed = results[name], speeds.get(name)
-        cells = [_spread([_ap(run, c, "moderate") for run in runs]) for c in CLASSES]
+        cells = [_spread([_ap(run, c, "moderate") for run in runs]) for c in CLASS_NAMES]
         cells.append(_spread([_mean_ap(run) for run in runs]))
         cells += [_spread([_band(run, *band) for run in runs]) for band in BANDS_M]
         if speed is None:
@@ -77,10 +76,10 @@ def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]
 
 
 def _by_difficulty(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
-    header = ["ASP", "CPA", "Aug", *(f"{c} {d}" for c in CLASSES for d in DIFFICULTIES)]
+    header = ["ASP", "CPA", "Aug", *(f"{c} {d}" for c in CLASS_NAMES for d in DIFFICULTIES)]
     rows = []
     for name in names:
-        cells = [_spread([_ap(run, c, d) for run in results[name]]) for c in CLASSES for d in DIFFICULTIES]
+        cells = [_spread([_ap(run, c, d) for run in results[name]]) for c in CLASS_NAMES for d in DIFFICULTIES]
         rows.append([*_components(VARIANTS[name]), *cells])
     return markdown_table(header, rows, left=3)
 
@@ -104,7 +103,7 @@ def _band(result: dict[str, Any], low_m: float, high_m: float) -> float:
 
 
 def _mean_ap(result: dict[str, Any]) -> float:
-    return statistics.fmean(_ap(result, class_name, "moderate") for class_name in CLASSES)
+    return statistics.fmean(_ap(result, class_name, "moderate") for class_name in CLASS_NAMES)
 
 
 def _spread(values: Sequence[float]) -> str:

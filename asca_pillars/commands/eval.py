@@ -17,7 +17,7 @@ from asca_pillars.environment import describe_environment
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.kitti import DIFFICULTIES, evaluate
+from asca_pillars.evaluation.kitti import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.operating_point import operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
@@ -25,7 +25,6 @@ from asca_pillars.evaluation.verdicts import verdicts
 from asca_pillars.files import atomic_directory, atomic_path
 from asca_pillars.geometry.grid import PillarGrid
 
-CLASS_NAMES = ("Car", "Pedestrian", "Cyclist")
 TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
 GALLERY = 8
 MADE_BY = "made_by.json"  # marks a folder of predictions as ours to replace

@@ -31,6 +31,7 @@ from asca_pillars.evaluation.objects import FrameObjects
 from asca_pillars.evaluation.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
 from asca_pillars.evaluation.states import detection_states, is_neighbor, is_type, truth_states
 
+CLASS_NAMES = ("Car", "Pedestrian", "Cyclist")
 DIFFICULTIES = ("easy", "moderate", "hard")
 METRICS = ("bbox", "bev", "3d", "aos")
 MIN_OVERLAP: Mapping[str, float] = {"car": 0.7}
@@ -156,7 +157,7 @@ def min_overlap(class_name: str) -> float:
 def evaluate(
     truth: Sequence[FrameObjects],
     detections: Sequence[FrameObjects],
-    class_names: Sequence[str] = ("Car", "Pedestrian", "Cyclist"),
+    class_names: Sequence[str] = CLASS_NAMES,
     *,
     bands_m: Sequence[_Band] = (),
     progress: bool = False,

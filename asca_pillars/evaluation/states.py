@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.data.frames import NEIGHBOR_TYPES
 from asca_pillars.evaluation.objects import FrameObjects
 
 COUNTED, IGNORED, ABSENT = 0, 1, -1
 
 # Types so like a class that finding one is no mistake, and missing one neither.
-NEIGHBORS: Mapping[str, str] = {"car": "van", "pedestrian": "person_sitting"}
+NEIGHBORS: Mapping[str, str] = {name.casefold(): other.casefold() for name, other in NEIGHBOR_TYPES.items()}
 
 _Band = tuple[float, float]
 
