@@ -228,11 +228,15 @@ def export(
         typer.Option(help="Scans like those trained on, to prove parity on. Default: 8 simulated ones."),
     ] = None,
     trained_on: Annotated[str, typer.Option(help="What the weights have seen, for the manifest.")] = "not stated",
+    score: Annotated[
+        list[str] | None,
+        typer.Option(help="CLASS=VALUE: report this class from this score on. Repeatable. Default: the config's."),
+    ] = None,
 ) -> None:
     """Export to ONNX and prove on scans that the bundle is the same detector; fails if it is not."""
     from asca_pillars.commands.export import run
 
-    run(checkpoint, out, scans, trained_on)
+    run(checkpoint, out, scans, trained_on, score or [])
 
 
 @app.command()

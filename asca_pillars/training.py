@@ -77,6 +77,8 @@ def train(
         warnings.filterwarnings("ignore", message=".*LeafSpec")
         # EpochSampler starts at the step where the checkpoint stopped, which Lightning cannot know.
         warnings.filterwarnings("ignore", message="You're resuming from a checkpoint that ended before the epoch")
+        # Of a gradient of 1x1 convolutions, whose two layouts in memory are the same.
+        warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         # Advice on workers and logging that does not fit two cores and small data.
         warnings.filterwarnings("ignore", category=PossibleUserWarning)

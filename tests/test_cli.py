@@ -192,10 +192,16 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     process.wait()
     assert not bundle.exists()
 
-    exported = full(*export)
+    assert "Pedestrain: no such class; there are" in refusal(full(*export, "--score", "Pedestrain=0.2"))
+    assert "such as Car=0.35" in refusal(full(*export, "--score", "0.2"))
+    exported = full(*export, "--score", "Pedestrian=0.21")
     assert exported.returncode == 0, exported.stderr
     assert "parity on 8 scans" in exported.stdout
-    assert json.loads((bundle / "bundle.json").read_text())["provenance"]["command"].startswith("-c train")
+    manifest = json.loads((bundle / "bundle.json").read_text())
+    assert manifest["provenance"]["command"].startswith("-c train")
+    before = {spec.name: spec.score_threshold for spec in CONFIG.detector.classes}
+    after = {spec["name"]: spec["score_threshold"] for spec in manifest["spec"]["classes"]}
+    assert after == before | {"Pedestrian": 0.21}
     detected = asca("detect", scans, "--bundle", bundle, "--out", tmp_path / "out")
     assert detected.returncode == 0, detected.stderr
     assert len(list((tmp_path / "out").glob("*.json"))) == 8

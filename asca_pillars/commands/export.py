@@ -1,6 +1,7 @@
 """`asca export`: a checkpoint in, a proven bundle out."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,13 @@ from rich.console import Console
 
 from asca_pillars.commands.extras import require
 from asca_pillars.data.scans import find_scans, read_scan
+from asca_pillars.errors import ConfigError
 
 SIMULATED_SCANS = 8
 SIMULATED_SEED = 2**31  # far from the seeds that people train with
 
 
-def run(checkpoint: Path, out: Path, scans: Path | None, trained_on: str) -> None:
+def run(checkpoint: Path, out: Path, scans: Path | None, trained_on: str, scores: list[str]) -> None:
     """See `asca export --help`."""
     require("train")
     from asca_export.export import export_bundle
@@ -23,6 +25,8 @@ def run(checkpoint: Path, out: Path, scans: Path | None, trained_on: str) -> Non
 
     console = Console(markup=False)
     loaded = load_checkpoint(checkpoint)
+    spec = loaded.config.detector.with_score_threshold(dict(_score(text) for text in scores))
+    loaded = loaded._replace(config=replace(loaded.config, detector=spec))
     points = _simulated(console) if scans is None else [read_scan(path).points for path in find_scans(scans)]
     environment = _environment(checkpoint)
     with console.status("Exporting and proving parity"):
@@ -35,6 +39,14 @@ def run(checkpoint: Path, out: Path, scans: Path | None, trained_on: str) -> Non
         f"{out}: parity on {parity.scans} scans: head maps within {parity.head_maps_max_abs_error:.2g}, "
         f"boxes within {parity.box_max_error_m:.2g} m and {np.rad2deg(parity.yaw_max_error_rad):.2g} degrees"
     )
+
+
+def _score(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise ConfigError(f"--score {text}: write a class and its score, such as Car=0.35") from None
 
 
 def _simulated(console: Console) -> list[NDArray[np.float32]]:

@@ -1,5 +1,6 @@
 """One detector's numbers, all that training and the vehicle must agree on. `bundle.json` carries it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -48,9 +49,21 @@ class DetectorSpec:
         anchors.flags.writeable = False
         return anchors
 
-    def with_score_threshold(self, score: float) -> "DetectorSpec":
-        """The same detector that reports detections of every class from `score` on."""
-        return replace(self, classes=tuple(replace(spec, score_threshold=score) for spec in self.classes))
+    def with_score_threshold(self, score: float | Mapping[str, float]) -> "DetectorSpec":
+        """The same detector that reports detections from `score` on: of every class, or of those named, by name.
+
+        Raises:
+            ConfigError: no such class, or no score between 0 and 1.
+        """
+        scores = score if isinstance(score, Mapping) else dict.fromkeys(self.class_names, score)
+        if unknown := [name for name in scores if name not in self.class_names]:
+            raise ConfigError(f"{unknown[0]}: no such class; there are {', '.join(self.class_names)}")
+        return replace(
+            self,
+            classes=tuple(
+                replace(spec, score_threshold=scores.get(spec.name, spec.score_threshold)) for spec in self.classes
+            ),
+        )
 
     def pillarize(self, points: NDArray[np.float32], rng: np.random.Generator | None = None) -> Pillars:
         """Pillars of an (N, 4) scan on this detector's grid, see `pillarize`."""

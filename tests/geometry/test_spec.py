@@ -82,3 +82,14 @@ def test_geometry_needs_numpy_alone() -> None:
     code = f"import sys, asca_pillars.geometry.spec; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_score_thresholds_are_set_for_all_or_by_name() -> None:
+    both = SPEC.with_score_threshold(0.11)
+    assert [spec.score_threshold for spec in both.classes] == [0.11, 0.11]
+    one = both.with_score_threshold({"Pedestrian": 0.5})
+    assert [spec.score_threshold for spec in one.classes] == [0.11, 0.5]
+    with pytest.raises(ConfigError, match="Tram: no such class; there are Car, Pedestrian"):
+        SPEC.with_score_threshold({"Tram": 0.5})
+    with pytest.raises(ConfigError, match="score_threshold 2 of class Car"):
+        SPEC.with_score_threshold({"Car": 2.0})
