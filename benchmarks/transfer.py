@@ -15,12 +15,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from asca_pillars.evaluation.kitti import CLASS_NAMES
 from asca_pillars.evaluation.operating_point import wilson_interval
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth
+from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.evaluation.verdicts import Scene, judge
 
 OVERLAPS = (("Car", 0.5), ("Car", 0.7), ("Pedestrian", 0.25), ("Cyclist", 0.25))  # the first of a class chooses
@@ -49,7 +48,7 @@ class Outcome:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """For the table: found of objects, recall with its 95 % interval, false per frame."""
+        """For a table: found of objects, recall with its 95 % interval, false per frame."""
         low, high = wilson_interval(self.found, self.objects)
         per_frame = self.false / self.frames
         return f"{self.found}/{self.objects}", f"{self.recall:.2f} ({low:.2f}-{high:.2f})", f"{per_frame:.2f}"
@@ -63,20 +62,16 @@ def main(
 ) -> None:
     """Choose a score per class on simulated frames, and print what it gives there and on real frames."""
     sets = [_read(simulated, simulated_out), _read(real, real_out)]
-    table = Table()
-    for column in ("class", "score", "BEV IoU", "frames", "found", "recall", "false per frame"):
-        table.add_column(column, justify="left" if column in ("class", "frames") else "right", no_wrap=True)
+    rows = []
     chosen: dict[str, float] = {}
     for name, overlap in OVERLAPS:
         if name not in chosen:
             chosen[name] = max(SCORES, key=lambda score: count(sets[0], name, overlap, score).f1)
         for title, frames in zip(("simulated", "real"), sets, strict=True):
-            table.add_row(
-                name, f"{chosen[name]:.2f}", f"{overlap}", title, *count(frames, name, overlap, chosen[name]).row
-            )
-    console = Console()
-    console.print(f"{len(sets[0])} simulated and {len(sets[1])} real frames")
-    console.print(table)
+            outcome = count(frames, name, overlap, chosen[name])
+            rows.append((name, title, f"{chosen[name]:.2f}", f"{overlap}", *outcome.row))
+    columns = ("class", "frames", "score", "BEV IoU", "found", "recall", "false per frame")
+    print(f"{len(sets[0])} simulated and {len(sets[1])} real frames\n\n{markdown_table(columns, rows, left=2)}")
 
 
 def count(frames: ScoredFrames, class_name: str, overlap: float, score: float) -> Outcome:
