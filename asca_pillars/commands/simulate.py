@@ -40,10 +40,14 @@ def _report(out: Path, console: Console) -> None:
     """Compare the frames below `out` with KITTI; print the tables and write them, and the plots, to out/report/."""
     from asca_pillars.sim.report.comparison import compare
     from asca_pillars.sim.report.measuring import measure
+    from asca_pillars.sim.report.plots import write_plots
     from asca_pillars.sim.report.statistics import kitti_reference
     from asca_pillars.sim.report.tables import print_comparison, write_report
 
-    comparison = compare(measure(out), kitti_reference().statistics)
+    reference = kitti_reference()
+    measured = measure(out)
+    comparison = compare(measured, reference.statistics)
     print_comparison(comparison, console)
-    write_report(out / "report", comparison)
-    console.print(f"All rows, plots and statistics: {out / 'report'}/report.md, report.json", highlight=False)
+    folder = out / "report"
+    write_report(folder, comparison, write_plots(folder, comparison, measured, reference.sensor))
+    console.print(f"All rows and plots: {folder}/report.md; all numbers: {folder}/report.json", soft_wrap=True)

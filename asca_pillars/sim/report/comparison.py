@@ -9,7 +9,7 @@ import numpy as np
 from .distance import coarse, jensen_shannon, noise_of_points, noise_of_units
 from .measuring import Measured
 from .scans import MATERIALS, OBJECTS, unit_histograms
-from .statistics import BAND_M, REFLECTANCES, Band, ScanStatistics, Statistics
+from .statistics import BAND_M, PERCENTILES, REFLECTANCES, Band, ScanStatistics, Statistics
 
 RATIO_BAR = 0.15
 DISTANCE_BAR = 0.15
@@ -22,7 +22,12 @@ _MEANS = {
     "ground share": "ground_share",
     "ground share in view": "camera_ground_share",
 }
-_SHARES = {"drives as we do": "yaw_same", "comes towards us": "yaw_oncoming", "stands across": "yaw_across"}
+_PLACES = {
+    "points per ring": "points_per_ring",
+    "azimuths, bins of 5 degrees": "sector_points",
+    "ranges, bins of 1 m": "range_points",
+}
+_SHARES = {"heads as we do": "yaw_same", "comes towards us": "yaw_oncoming", "heads across": "yaw_across"}
 _HISTOGRAMS = {
     "number per frame": "per_frame",
     "distances, bins of 5 m": "range_counts",
@@ -43,8 +48,9 @@ class Row:
         real, simulated: the two values; of histograms their means, where these say something.
         measure: what `value` is: simulated / real, simulated - real, or the Jensen-Shannon distance.
         bar: how far a ratio may be from 1, or how large a distance; None where the row is for information.
-        noise: for reflectances, the distances that chance alone would give as many points, and as many objects
-            (or scans) as the real histogram holds.
+        noise: what chance alone would do, where it is known: the standard error of a ratio; the distance to expect
+            of as few objects (or scans) as the real reflectances come from, or of as few labels as the simulated.
+        noise_of_points: the distance to expect of as many independent points as the real reflectances are.
     """
 
     group: str
@@ -100,7 +106,7 @@ def _scan_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
         if first is not None and second is not None:
             error = np.hypot(first.std / np.sqrt(real.scans), second.std / np.sqrt(ours.scans)) / first.mean
             yield _ratio("scans", name, first.mean, second.mean, RATIO_BAR, float(error))
-    for name, field in (("points per ring", "points_per_ring"), ("ranges, bins of 1 m", "range_points")):
+    for name, field in _PLACES.items():
         first, second = getattr(real, field), getattr(ours, field)
         if first is not None and second is not None and len(first) == len(second):
             yield Row("scans", name, None, None, "distance", float(jensen_shannon(first, second)))
@@ -131,7 +137,7 @@ def _reflectance_rows(real: ScanStatistics, measured: Measured) -> Iterator[Row]
         )
         means = float(levels @ p / p.sum()), float(levels @ q / q.sum())
         distance = float(jensen_shannon(coarse(p), coarse(q)))
-        yield Row("reflectance", f"reflectance, {name}", *means, "distance", distance, DISTANCE_BAR, *noise)
+        yield Row("reflectance", f"reflectance: {name}", *means, "distance", distance, DISTANCE_BAR, *noise)
         yield Row("reflectance", f"{name}, bins of 0.01", None, None, "distance", float(jensen_shannon(p, q)))
         yield _ratio("reflectance", f"{name}, share of 0", float(p[0] / p.sum()), float(q[0] / q.sum()))
 
@@ -159,10 +165,12 @@ def _label_rows(name: str, real: Statistics, ours: Statistics) -> Iterator[Row]:
         p, q = np.array(getattr(first, counts)), np.array(getattr(second, counts))
         yield _ratio(name, f"{title}: share of none", p[0] / p.sum(), q[0] / q.sum())
     for title, field in _HISTOGRAMS.items():
-        yield Row(
-            name, title, None, None, "distance", float(jensen_shannon(getattr(first, field), getattr(second, field)))
-        )
-    yield _difference(name, "lateral position, deviation (m)", first.left_m.std, second.left_m.std)
+        p, q = getattr(first, field), getattr(second, field)
+        noise = noise_of_points(p, sum(q))
+        yield Row(name, title, None, None, "distance", float(jensen_shannon(p, q)), None, noise)
+    for index in (0, 2, 4):
+        place = first.left_m.percentiles[index], second.left_m.percentiles[index]
+        yield _difference(name, f"to the left (m), {PERCENTILES[index]} %", *place)
     yield from _by_range(name, "bottom (m)", first.bottom_z_m, second.bottom_z_m)
 
 

@@ -18,6 +18,7 @@ from .statistics import (
     CAR_FIT_RANGE_M,
     RANGE_BINS,
     REFLECTANCES,
+    SECTORS,
     Band,
     CarFit,
     Reflectance,
@@ -42,6 +43,7 @@ class ScanRecord:
     Attributes:
         points, in_camera, ground, ground_in_camera: returns.
         rings: (rings,) returns of each, from the top.
+        sectors: (SECTORS,) returns of each, counter-clockwise from straight ahead.
         ranges: (RANGE_BINS,) returns per metre.
         ground_sums: (3, 2, BANDS) number, sum and sum of squares of z and of reflectance of ground returns.
         reflectance: by material, (units, REFLECTANCES) counts of the scan or of each object in it.
@@ -53,6 +55,7 @@ class ScanRecord:
     ground: int
     ground_in_camera: int
     rings: _Counts
+    sectors: _Counts
     ranges: _Counts
     ground_sums: NDArray[np.float64]
     reflectance: dict[str, _Counts]
@@ -86,6 +89,7 @@ def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor, *, labelled: 
         int(ground.sum()),
         int((ground & camera).sum()),
         ring_counts(points, sensor),
+        np.bincount((_azimuth(points) * (SECTORS / (2 * np.pi))).astype(np.int64), minlength=SECTORS)[:SECTORS],
         np.bincount(np.minimum(slant, RANGE_BINS).astype(np.int64), minlength=RANGE_BINS)[:RANGE_BINS],
         np.array(sums),
         reflectance,
@@ -117,6 +121,7 @@ def scan_statistics(records: Sequence[ScanRecord]) -> ScanStatistics:
         points=_band([record.points for record in records]) if whole else None,
         ground_share=_band([r.ground / max(r.points, 1) for r in records]) if whole else None,
         points_per_ring=_mean([record.rings for record in records]) if whole and agree else None,
+        sector_points=_mean([record.sectors for record in records]) if whole else None,
         range_points=_mean([record.ranges for record in records]) if whole else None,
         ground_z_m=z if whole else None,
         ground_reflectance=reflectance if whole else None,
@@ -150,8 +155,7 @@ def ring_counts(points: NDArray[np.floating[Any]], sensor: Sensor) -> _Counts:
     KITTI's files hold ring after ring, each from azimuth 0 on, counter-clockwise: where the azimuth falls back, the
     next ring begins. In files of another order a return belongs to the ring of `sensor` whose beam passes nearest.
     """
-    azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
-    starts = np.flatnonzero(np.diff(azimuth) < -np.pi) + 1
+    starts = np.flatnonzero(np.diff(_azimuth(points)) < -np.pi) + 1
     if len(starts) + 1 in _LAYERS:
         return np.diff(np.concatenate([[0], starts, [len(points)]]))
     rho = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-3)
@@ -180,6 +184,10 @@ def _objects(
     plain = np.array([o.type == "Car" and o.occluded == 0 and o.truncated == 0 for o in objects], bool)
     cars = np.stack([np.hypot(boxes[:, 0], boxes[:, 1]), inside.sum(axis=0)], axis=1)[plain]
     return {name: rows[types == name] for name in OBJECTS}, cars
+
+
+def _azimuth(points: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    return np.asarray(np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi), np.float64)
 
 
 def _histogram(value: _Counts) -> _Counts:

@@ -14,6 +14,7 @@ from asca_pillars.schema import Strict, parse
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 BAND_M = 10.0  # of what is told by range, from 0 to 80 m
 BANDS = 8
+SECTORS = 72  # of 5 degrees of azimuth, counter-clockwise from straight ahead
 RANGE_BINS = 80  # of 1 m, of slant range
 LABEL_RANGE_BINS = 20  # of 5 m, of horizontal distance
 YAW_BINS = 24  # of 15 degrees from -pi
@@ -86,6 +87,7 @@ class ScanStatistics(Strict):
         points, camera_points: returns of a scan, and those in the image.
         ground_share, camera_ground_share: of these returns.
         points_per_ring: (rings,) from the top, None also where scans disagree about their number.
+        sector_points: (SECTORS,) points per 5 degrees of azimuth.
         range_points: (RANGE_BINS,) points per metre of slant range.
         ground_z_m, ground_reflectance: (BANDS,) of slant range, of all ground returns together.
         reflectance: by "overall", "ground", "non_ground" and the classes of objects in small letters. An object's
@@ -100,6 +102,7 @@ class ScanStatistics(Strict):
     points: Band | None = None
     ground_share: Band | None = None
     points_per_ring: tuple[float, ...] | None = None
+    sector_points: tuple[float, ...] | None = None
     range_points: tuple[float, ...] | None = None
     ground_z_m: tuple[Band | None, ...] | None = None
     ground_reflectance: tuple[Band | None, ...] | None = None
@@ -112,7 +115,8 @@ class LabelStatistics(Strict):
     Attributes:
         count: labelled objects.
         per_frame: (MAX_PER_FRAME + 1,) frames with 0, 1, 2 ... objects; the last holds those with more, too.
-        height_m, width_m, length_m, left_m: sizes, and the lateral position.
+        height_m, width_m, length_m: sizes.
+        left_m: the center's lateral position.
         range_counts: (LABEL_RANGE_BINS,) of horizontal distance.
         bottom_z_m: (BANDS,) of horizontal distance.
         yaw_counts: (YAW_BINS,); 0 is our direction.

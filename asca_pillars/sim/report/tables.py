@@ -1,7 +1,7 @@
 """The comparison as text: on the console, as Markdown and as JSON."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
@@ -52,27 +52,28 @@ def title(comparison: Comparison) -> str:
 def notes(comparison: Comparison) -> list[str]:
     """How many bars are kept, what was left out, and how to read the distances."""
     barred = [row for row in comparison.rows if row.within is not None]
-    missed = ", ".join(row.name for row in comparison.missed)
+    missed = "; ".join(row.name for row in comparison.missed)
     return [
         f"{len(barred) - len(comparison.missed)} of {len(barred)} bars kept"
         + (f"; missed: {missed}" if missed else ""),
         *(f"Left out: {line}" for line in comparison.skipped),
         "JS: Jensen-Shannon distance (base 2: 0 alike, 1 disjoint); of reflectances over 21 bins, exactly 0 and 20 of "
-        "0.05, beside the means. By chance: the standard error of a ratio; the JS distance to expect of a sample as "
-        "small as the real one, which has " + _sizes(comparison) + ".",
+        "0.05, beside their means.",
+        "By chance: the standard error of a ratio; the JS distance to expect of a sample as small as the real "
+        f"reflectances ({_sizes(comparison)}), or of labels as few as the simulated ones.",
         f"Real: {comparison.real.source}.",
     ]
 
 
-def write_report(folder: Path, comparison: Comparison) -> None:
-    """Write report.md and report.json to `folder`."""
+def write_report(folder: Path, comparison: Comparison, plots: Sequence[str]) -> None:
+    """Write report.md, which shows the named `plots` in the same folder, and report.json."""
     with atomic_path(folder / "report.md") as temporary:
-        temporary.write_text(to_markdown(comparison), encoding="utf-8")
+        temporary.write_text(to_markdown(comparison, plots), encoding="utf-8")
     with atomic_path(folder / "report.json") as temporary:
         temporary.write_text(json.dumps(to_json(comparison), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def to_markdown(comparison: Comparison, plots: Iterator[str] | tuple[str, ...] = ()) -> str:
+def to_markdown(comparison: Comparison, plots: Sequence[str]) -> str:
     """All rows as Markdown, a table for each group, and the named pictures."""
     parts = [f"# {title(comparison)}\n", "\n".join([*(f"- {line}" for line in notes(comparison)), ""])]
     columns = [column.replace("\n", " ") for column in _COLUMNS]
@@ -95,9 +96,8 @@ def to_json(comparison: Comparison) -> dict[str, Any]:
 
 def _sizes(comparison: Comparison) -> str:
     real = comparison.real.scan
-    cars = "" if real.car_fit is None else f", {real.car_fit.cars} unhidden cars"
     objects = [f"{real.reflectance[name].units} {name}s" for name in OBJECTS if name in real.reflectance]
-    return f"{real.scans} scans{cars} and points of {', '.join(objects)}"
+    return f"{real.scans} scans, {', '.join(objects)}"
 
 
 def _plain(row: Row) -> dict[str, Any]:
