@@ -109,7 +109,7 @@ def _cells(row: Row) -> tuple[str, ...]:
     bar = "" if row.bar is None else f"< {row.bar:g}" if row.measure == "distance" else f"1+-{row.bar:g}"
     within = {None: "", True: "yes", False: "NO"}[row.within]
     noise = "" if row.noise is None else f"{row.noise:.3f}" if row.measure == "distance" else f"+-{row.noise:.2f}"
-    value = _MEASURES[row.measure].format(row.value)
+    value = _MEASURES[row.measure].format(row.value) if isfinite(row.value) else ""  # of nothing there is no ratio
     return row.name, _number(row.real), _number(row.simulated), value, bar, within, noise
 
 
