@@ -49,7 +49,7 @@ class Row:
         measure: what `value` is: simulated / real, simulated - real, or the Jensen-Shannon distance.
         bar: how far a ratio may be from 1, or how large a distance; None where the row is for information.
         noise: what chance alone would do, where it is known: the standard error of a ratio; the distance to expect
-            of as few objects (or scans) as the real reflectances come from, or of as few labels as the simulated.
+            of as few objects (or scans) as the real reflectances come from, or of as few labels as this set has.
         noise_of_points: the distance to expect of as many independent points as the real reflectances are.
     """
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_REAL: dict[str, Any] = {"color": "#0072B2", "label": "real"}
-_OURS: dict[str, Any] = {"color": "#D55E00", "label": "simulated"}
+_REAL: dict[str, Any] = {"color": "#0072B2", "label": "KITTI"}
+_OURS: dict[str, Any] = {"color": "#D55E00", "label": "this set"}
 _COARSE_EDGES = np.concatenate([[-0.05], np.arange(21) * 0.05])
 
 
@@ -77,7 +77,7 @@ def _cars(comparison: Comparison, measured: Measured) -> "Figure":
     """Points of unoccluded cars over distance, the fits, and the bars about KITTI's."""
     figure, (plot,) = _figure(1, 1, 7.0, 5.0)
     cars = np.concatenate([record.cars for record in measured.records])
-    plot.plot(cars[:, 0], cars[:, 1], ".", color=_OURS["color"], alpha=0.4, label="a simulated car")
+    plot.plot(cars[:, 0], cars[:, 1], ".", color=_OURS["color"], alpha=0.4, label="a car of this set")
     ranges_m = np.geomspace(8.0, CAR_FIT_RANGE_M[1], 60)
     for side, style in ((comparison.real, _REAL), (comparison.simulated, _OURS)):
         if (fit := side.scan.car_fit) is not None:

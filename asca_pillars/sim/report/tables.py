@@ -18,7 +18,7 @@ from asca_pillars.schema import to_dict
 from .comparison import Comparison, Row
 from .scans import OBJECTS
 
-_COLUMNS = ("", "real", "simulated", "ratio\nor JS", "bar", "kept", "by\nchance")
+_COLUMNS = ("", "KITTI", "this set", "ratio\nor JS", "bar", "kept", "by\nchance")
 _LEFT = 1
 _MEASURES = {"ratio": "x {:.2f}", "difference": "{:+.2f}", "distance": "JS {:.3f}"}
 
@@ -60,7 +60,7 @@ def notes(comparison: Comparison) -> list[str]:
         "JS: Jensen-Shannon distance (base 2: 0 alike, 1 disjoint); of reflectances over 21 bins, exactly 0 and 20 of "
         "0.05, beside their means.",
         "By chance: the standard error of a ratio; the JS distance to expect of a sample as small as the real "
-        f"reflectances ({_sizes(comparison)}), or of labels as few as the simulated ones.",
+        f"reflectances ({_sizes(comparison)}), or of labels as few as those of this set.",
         f"Real: {comparison.real.source}.",
     ]
 
