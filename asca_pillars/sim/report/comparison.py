@@ -113,14 +113,15 @@ def _scan_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
 
 
 def _car_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
-    first, second = real.car_fit, ours.car_fit
-    if first is None or second is None:
-        return
-    for range_m in CAR_RANGES_M:
-        bar = RATIO_BAR if range_m in BARRED_RANGES_M else None
-        points = first.points_at(range_m), second.points_at(range_m)
-        error = points[1] / points[0] * np.hypot(first.error_at(range_m), second.error_at(range_m))
-        yield _ratio("points per car", f"points of a car at {range_m} m", *points, bar, float(error))
+    for name, field in (("points of a car", "car_fit"), ("of near cars alone", "near_car_fit")):
+        first, second = getattr(real, field), getattr(ours, field)
+        if first is None or second is None:
+            continue
+        for range_m in CAR_RANGES_M:
+            bar = RATIO_BAR if range_m in BARRED_RANGES_M else None
+            points = first.points_at(range_m), second.points_at(range_m)
+            error = points[1] / points[0] * np.hypot(first.error_at(range_m), second.error_at(range_m))
+            yield _ratio("points per car", f"{name} at {range_m} m", *points, bar, float(error))
 
 
 def _reflectance_rows(real: ScanStatistics, measured: Measured) -> Iterator[Row]:

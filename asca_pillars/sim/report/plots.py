@@ -13,7 +13,7 @@ from .comparison import BARRED_RANGES_M, RATIO_BAR, Comparison
 from .distance import coarse
 from .measuring import Measured
 from .scans import MATERIALS
-from .statistics import BAND_M, BANDS, CAR_FIT_RANGE_M, CLASSES, SECTORS, Band, Sensor
+from .statistics import BAND_M, BANDS, CAR_FIT_RANGE_M, CLASSES, NEAR_CARS_M, SECTORS, Band, Sensor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,18 +78,21 @@ def _cars(comparison: Comparison, measured: Measured) -> "Figure":
     figure, (plot,) = _figure(1, 1, 7.0, 5.0)
     cars = np.concatenate([record.cars for record in measured.records])
     plot.plot(cars[:, 0], cars[:, 1], ".", color=_OURS["color"], alpha=0.4, label="a car of this set")
-    ranges_m = np.geomspace(8.0, CAR_FIT_RANGE_M[1], 60)
-    for side, style in ((comparison.real, _REAL), (comparison.simulated, _OURS)):
-        if (fit := side.scan.car_fit) is not None:
+    for side, style in ((comparison.real.scan, _REAL), (comparison.simulated.scan, _OURS)):
+        for fit, end_m, line in ((side.car_fit, CAR_FIT_RANGE_M[1], ":"), (side.near_car_fit, NEAR_CARS_M[1], "-")):
+            if fit is None:
+                continue
+            ranges_m = np.geomspace(8.0, end_m, 60)
             points = np.array([fit.points_at(range_m) for range_m in ranges_m])
-            error = np.array([fit.error_at(range_m) for range_m in ranges_m])
-            plot.plot(ranges_m, points, color=style["color"], label=f"{style['label']}, fitted to {fit.cars} cars")
-            plot.fill_between(
-                ranges_m, points * np.exp(-error), points * np.exp(error), color=style["color"], alpha=0.2
-            )
-    if (fit := comparison.real.scan.car_fit) is not None:
-        at = np.array([fit.points_at(range_m) for range_m in BARRED_RANGES_M])
-        plot.errorbar(BARRED_RANGES_M, at, RATIO_BAR * at, fmt="none", color="black", capsize=4, label="bars")
+            factor = np.exp([fit.error_at(range_m) for range_m in ranges_m])
+            label = f"{style['label']}, fitted to {fit.cars} cars up to {end_m:.0f} m"
+            plot.plot(ranges_m, points, line, color=style["color"], label=label)
+            plot.fill_between(ranges_m, points / factor, points * factor, color=style["color"], alpha=0.12)
+    if (near := comparison.real.scan.near_car_fit) is not None:
+        at = np.array([near.points_at(range_m) for range_m in BARRED_RANGES_M])
+        plot.errorbar(
+            BARRED_RANGES_M, at, RATIO_BAR * at, fmt="none", color="black", capsize=4, label="bars, near cars"
+        )
     plot.set(xscale="log", yscale="log", xlabel="horizontal distance (m)", ylim=(0.8, None))
     plot.set_xticks((10, 20, 30, 40, 50, 60, 70), labels=("10", "20", "30", "40", "50", "60", "70"))
     plot.set_xticks((), minor=True)

@@ -16,6 +16,7 @@ from .statistics import (
     BAND_M,
     BANDS,
     CAR_FIT_RANGE_M,
+    NEAR_CARS_M,
     RANGE_BINS,
     REFLECTANCES,
     SECTORS,
@@ -109,6 +110,7 @@ def scan_statistics(records: Sequence[ScanRecord]) -> ScanStatistics:
     stacks = {name: stack for name in materials if len(stack := unit_histograms(records, name))}
     sums = np.sum([record.ground_sums for record in records], axis=0)
     z, reflectance = (_bands(sums[:, index]) for index in range(2))
+    cars = np.concatenate([record.cars for record in records])
     agree = len({len(record.rings) for record in records}) == 1
     return ScanStatistics(
         scans=len(records),
@@ -117,7 +119,8 @@ def scan_statistics(records: Sequence[ScanRecord]) -> ScanStatistics:
         reflectance={
             name: Reflectance(tuple(stack.sum(axis=0).tolist()), len(stack)) for name, stack in stacks.items()
         },
-        car_fit=fit_cars(np.concatenate([record.cars for record in records])),
+        car_fit=fit_cars(cars, CAR_FIT_RANGE_M),
+        near_car_fit=fit_cars(cars, NEAR_CARS_M),
         points=_band([record.points for record in records]) if whole else None,
         ground_share=_band([r.ground / max(r.points, 1) for r in records]) if whole else None,
         points_per_ring=_mean([record.rings for record in records]) if whole and agree else None,
@@ -135,12 +138,12 @@ def unit_histograms(records: Sequence[ScanRecord], material: str) -> _Counts:
     return stack[stack.sum(axis=1) > 0]
 
 
-def fit_cars(cars: NDArray[np.float64]) -> CarFit | None:
-    """The power law through ranges and points (C, 2) of cars, or None where it would be arbitrary.
+def fit_cars(cars: NDArray[np.float64], span_m: tuple[float, float]) -> CarFit | None:
+    """The power law through ranges and points (C, 2) of cars within a span, or None where it would be arbitrary.
 
     As in the reference, a car without any point, of which there is no logarithm, is left out.
     """
-    low_m, high_m = CAR_FIT_RANGE_M
+    low_m, high_m = span_m
     cars = np.log(cars[(cars[:, 1] > 0) & (cars[:, 0] >= low_m) & (cars[:, 0] <= high_m)])
     if len(cars) < _MIN_CARS or np.ptp(cars[:, 0]) < np.log(2):
         return None

@@ -23,6 +23,8 @@ MAX_PER_FRAME = 20
 PERCENTILES = (5, 25, 50, 75, 95)
 CAR_FIT_RANGE_M = (12.0, 70.0)
 """Where KITTI's cars of the fit stand. A power law holds piecewise only: fits are alike over the same span alone."""
+NEAR_CARS_M = (12.0, 50.0)
+"""Beyond, cars have so few returns that one more or less turns the whole line, and many have no label."""
 TRUNCATION_EDGES = (0.0, 0.15, 0.30, 0.50)  # shares above the last are the fifth group
 
 
@@ -92,6 +94,7 @@ class ScanStatistics(Strict):
         ground_z_m, ground_reflectance: (BANDS,) of slant range, of all ground returns together.
         reflectance: by "overall", "ground", "non_ground" and the classes of objects in small letters. An object's
             points are those in its box more than 0.1 m above its bottom.
+        car_fit, near_car_fit: over CAR_FIT_RANGE_M and NEAR_CARS_M; None where there are too few cars.
     """
 
     scans: int
@@ -99,6 +102,7 @@ class ScanStatistics(Strict):
     camera_ground_share: Band
     reflectance: dict[str, Reflectance]
     car_fit: CarFit | None
+    near_car_fit: CarFit | None
     points: Band | None = None
     ground_share: Band | None = None
     points_per_ring: tuple[float, ...] | None = None

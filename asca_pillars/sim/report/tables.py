@@ -17,6 +17,7 @@ from asca_pillars.schema import to_dict
 
 from .comparison import Comparison, Row
 from .scans import OBJECTS
+from .statistics import CAR_FIT_RANGE_M, NEAR_CARS_M
 
 _COLUMNS = ("", "KITTI", "this set", "ratio\nor JS", "bar", "kept", "by\nchance")
 _LEFT = 1
@@ -59,6 +60,8 @@ def notes(comparison: Comparison) -> list[str]:
         *(f"Left out: {line}" for line in comparison.skipped),
         "JS: Jensen-Shannon distance (base 2: 0 alike, 1 disjoint); of reflectances over 21 bins, exactly 0 and 20 of "
         "0.05, beside their means.",
+        "Points of a car: a power law through the unoccluded, untruncated ones from {:.0f} to {:.0f} m; near ones up "
+        "to {:.0f} m, because single returns far away turn the line.".format(*CAR_FIT_RANGE_M, NEAR_CARS_M[1]),
         "By chance: the standard error of a ratio; the JS distance to expect of a sample as small as the real "
         f"reflectances ({_sizes(comparison)}), or of labels as few as those of this set.",
         f"Real: {comparison.real.source}.",

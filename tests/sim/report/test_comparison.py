@@ -34,7 +34,7 @@ def test_a_set_is_like_itself(measured: Measured) -> None:
         # The share of a heading that nobody has is 0 on both sides, and their ratio is not a number.
         nothing = item.measure == "ratio" and item.real == item.simulated == 0
         assert nothing or item.value == pytest.approx(1 if item.measure == "ratio" else 0, abs=1e-6), item
-    assert sum(item.within is True for item in comparison.rows) == 4 + 4 + 5 and not comparison.missed
+    assert sum(item.within is True for item in comparison.rows) == 4 + 4 + 4 + 5 and not comparison.missed
 
 
 def test_a_shifted_histogram_is_caught(measured: Measured, tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_what_cannot_be_compared_is_said(measured: Measured, tmp_path: Path) -> 
     assert not names & {"points per scan", "ground share", "points per ring", "reflectance: overall"}
     told = " ".join(comparison.skipped)
     assert "--view full" in told and "no Cyclist is labelled" in told and "no returns of a van" in told
-    other = replace(view.statistics, scan=replace(view.statistics.scan, car_fit=None))
+    other = replace(view.statistics, scan=replace(view.statistics.scan, car_fit=None, near_car_fit=None))
     assert any("no points per car" in line for line in compare(replace(view, statistics=other), other).skipped)
 
 
@@ -75,6 +75,8 @@ def test_the_reference_is_kitti_s() -> None:
     assert real.scan.points is not None and real.scan.points.mean == pytest.approx(118787, abs=1)
     assert real.scan.car_fit is not None
     assert [round(real.scan.car_fit.points_at(range_m)) for range_m in (20, 30, 40, 50)] == [288, 81, 33, 17]
+    near = real.scan.near_car_fit
+    assert near is not None and (near.cars, round(near.points_at(20))) == (16, 281)
     assert real.labels["Car"].count == 28742 == sum(real.labels["Car"].range_counts)
     assert all(sum(labels.per_frame) == real.frames == 7481 for labels in real.labels.values())
     assert all(len(item.counts) == 100 for item in real.scan.reflectance.values())
@@ -103,6 +105,6 @@ def test_the_console_names_what_misses_its_bar(measured: Measured) -> None:
     print_comparison(comparison, console)
     shown = console.export_text()
     table = [line for line in shown.splitlines() if "1+-0.15" in line or "< 0.15" in line]
-    assert len(table) == 13 and max(len(line.rstrip()) for line in table) <= 80
+    assert len(table) == 17 and max(len(line.rstrip()) for line in table) <= 80
     assert "points per scan" in shown and f"missed: {comparison.missed[0].name}" in shown
     assert "| points per scan |" in to_markdown(comparison, ())

@@ -46,6 +46,8 @@ def test_reflectance_of_ground_and_objects(measured: Measured) -> None:
 def test_points_per_car_are_those_of_the_law(measured: Measured) -> None:
     fit = measured.statistics.scan.car_fit
     assert fit is not None and fit.cars == 6
+    near = measured.statistics.scan.near_car_fit
+    assert near is not None and near.b == pytest.approx(fit.b, abs=0.02)
     for range_m in (10, 20, 30, 40):
         assert fit.points_at(range_m) == pytest.approx(np.exp(CAR_LAW[0]) * range_m ** CAR_LAW[1], rel=0.02)
     assert fit.error_at(20) < fit.error_at(10) < 0.02
@@ -82,13 +84,12 @@ def test_rings_are_found_in_files_of_any_order() -> None:
 
 def test_a_fit_needs_cars_that_stand_apart() -> None:
     apart = np.array([[15, 500], [20, 300], [30, 80], [40, 30], [50, 20.0]])
-    assert fit_cars(apart) is not None
-    assert fit_cars(apart[:4]) is None
-    assert fit_cars(np.column_stack([np.full(9, 20.0), np.full(9, 300.0)])) is None
-    near_and_empty = np.array([[5, 9999], [25, 0], [79, 1.0]])
-    assert fit_cars(np.concatenate([apart, near_and_empty])) == fit_cars(apart), (
-        "out of the reference's range, or empty"
-    )
+    span_m = (12.0, 60.0)
+    assert fit_cars(apart, span_m) is not None
+    assert fit_cars(apart[:4], span_m) is None
+    assert fit_cars(np.column_stack([np.full(9, 20.0), np.full(9, 300.0)]), span_m) is None
+    others = np.array([[5, 9999], [25, 0], [79, 1.0]])
+    assert fit_cars(np.concatenate([apart, others]), span_m) == fit_cars(apart, span_m), "out of the span, or empty"
 
 
 def test_only_so_many_scans_are_read(tmp_path: Path) -> None:
