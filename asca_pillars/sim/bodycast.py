@@ -8,8 +8,6 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from .sensor import COUNT_DEG, COUNTS
-
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
@@ -52,15 +50,16 @@ def ring_window(
 @numba.njit(cache=True, inline="always")
 def column_window(low: float, width: float, phase: float, first_column: Ints, columns: int) -> tuple[int, int]:
     """Columns [first, last) whose azimuth lies in [low, low + width]; `last` may exceed the number of columns."""
-    unit = np.pi / 180.0 * COUNT_DEG
+    counts = len(first_column) - 1
+    unit = 2.0 * np.pi / counts
     start = (low - phase) / unit
-    start -= COUNTS * np.floor(start / COUNTS)
+    start -= counts * np.floor(start / counts)
     stop = start + width / unit
-    first = first_column[min(int(np.ceil(start)), COUNTS)]
+    first = first_column[min(int(np.ceil(start)), counts)]
     end = int(np.floor(stop)) + 1
-    if end <= COUNTS:
+    if end <= counts:
         return first, first_column[end]
-    return first, first_column[min(end - COUNTS, COUNTS)] + columns
+    return first, first_column[min(end - counts, counts)] + columns
 
 
 @numba.njit(cache=True)
