@@ -42,16 +42,16 @@ class SceneConfig:
     median_share: float = 0.4  # of the wide streets
     turning_share: float = 0.12  # the car stands at up to half a radian to the street
 
-    sensor_height_m: tuple[float, float] = (1.66, 1.80)
+    sensor_height_m: tuple[float, float] = (1.69, 1.82)
     heading_error_sigma_rad: float = 0.035  # of the car in its lane
     bend_sigma_per_m: float = 0.0022  # curvature of the road
     # Mean and standard deviation of the slopes under the car, as KITTI's scans have them.
     slope_x: tuple[float, float] = (0.0105, 0.0035)
     slope_y: tuple[float, float] = (-0.009, 0.016)
-    relief_m: tuple[float, float] = (0.0, 3.0)
+    relief_m: tuple[float, float] = (0.1, 2.6)
     bump_m: tuple[float, float] = (0.0, 0.15)  # standard deviation of bumps beyond the pavement
-    bank_slope_sigma: float = 0.02  # of the ground beyond the pavement
-    embankment_slope: tuple[float, float] = (-0.08, 0.6)
+    bank_slope_sigma: float = 0.03  # of the ground beyond the pavement
+    embankment_slope: tuple[float, float] = (-0.2, 0.45)
     ditch_m: tuple[float, float] = (0.1, 0.6)
     grass_m: tuple[float, float] = (0.02, 0.16)
 
@@ -74,5 +74,6 @@ class SceneConfig:
                     raise ConfigError(f"{item.name} is {value}: the lower bound comes first")
             elif value < 0:
                 raise ConfigError(f"{item.name} is {value}: it must not be negative")
-        if self.residential + self.urban + self.rural + self.campus + self.road + self.alley <= 0 or self.dispersion <= 0:
+        kinds = self.residential + self.urban + self.rural + self.campus + self.road + self.alley
+        if kinds <= 0 or self.dispersion <= 0:
             raise ConfigError("the shares of the kinds of streets must not all be 0, nor the dispersion")

@@ -72,7 +72,9 @@ def garages(builder: Builder, stretch: Stretch) -> None:
         if not builder.claim(along, side * (away + depth / 2), 2.9, depth, cross):
             continue
         recess = float(rng.uniform(0.1, 0.5)) if rng.random() < 0.85 else depth - 0.4
-        builder.box(along, side * (away + recess + (depth - recess) / 2), -0.5, (3.0, depth - recess, height), gate, cross)
+        builder.box(
+            along, side * (away + recess + (depth - recess) / 2), -0.5, (3.0, depth - recess, height), gate, cross
+        )
         builder.box(along, side * (away + depth / 2), height - 0.35, (3.0, depth, 0.35), stone, cross)
         for edge in (-1.4, 1.4):
             builder.box(along + edge, side * (away + depth / 2), -0.5, (0.3, depth, height + 0.4), stone, cross)

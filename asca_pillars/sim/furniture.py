@@ -181,7 +181,14 @@ def low_stones(builder: Builder, along: float, across: float) -> None:
     stone = (float(rng.uniform(0.15, 0.5)), 0.3, 0.0)
     for i in range(int(rng.integers(1, 6))):
         if builder.claim(along + i * step, across, length, length if yaw > 0.8 else 0.3):
-            builder.box(along + i * step, across, -0.1, (length, float(0.15 + rng.uniform(0, 0.2)), height + 0.1), stone, yaw=yaw)
+            builder.box(
+                along + i * step,
+                across,
+                -0.1,
+                (length, float(0.15 + rng.uniform(0, 0.2)), height + 0.1),
+                stone,
+                yaw=yaw,
+            )
 
 
 def island(builder: Builder, along: float, across: float) -> None:

@@ -14,6 +14,7 @@ from . import groundcast
 from .groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M
 
 Floats = npt.NDArray[np.float64]
+LEVEL_WITHIN_M = 28.0
 
 
 @dataclass(frozen=True)
@@ -126,11 +127,13 @@ def draw_relief(
     axis = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
     x, y = np.meshgrid(axis, axis, indexing="ij")
     height: Any = slope[0] * x + slope[1] * y
-    for wavelength in (160.0, 90.0, 45.0, 22.0):
+    # Roads are laid out level where one drives: hills begin some way off, with their crests or troughs at the car.
+    begun = 1.0 - np.exp(-(x**2 + y**2) / LEVEL_WITHIN_M**2)
+    for wavelength in (160.0, 90.0, 45.0):
         angle = rng.uniform(0, 2 * np.pi)
         size = amplitude_m * wavelength / 120.0 * rng.normal(0.0, 0.6)
-        # Roads are laid out level: the crest or the trough of every wave lies where one drives.
-        height = height + size * (np.cos((x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / wavelength) - 1.0)
+        along = (x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / wavelength
+        height = height + size * begun * (np.cos(along) - 1.0)
     if shape is not None:
         outside = groundcast.outside_roads(np.stack([x.ravel(), y.ravel()], axis=-1), shape).reshape(x.shape)
         # A lattice point shapes the cells around it: none of these may reach a carriageway.

@@ -7,7 +7,7 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 
 GROUND = -2  # owner of what the ground returns
-BANK_RUN_M = 8.0  # a bank rises over this way and is level beyond
+BANK_RUN_M = 6.0  # a bank rises over this way and is level beyond
 DITCH_HALF_M = 1.0
 TRACK_SPACING_HALF_M, GAUGE_HALF_M, RAIL_HALF_M = 1.7, 0.75, 0.06
 RELIEF_STEP_M = 4.0

@@ -34,7 +34,9 @@ def column(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     size = (float(rng.uniform(0.2, 0.7)), float(rng.uniform(0.15, 0.7)), float(rng.uniform(1.0, 2.4)))
     if builder.claim(along, across, 0.8, 0.8):
-        builder.box(along, across, -0.2, (size[0], size[1], size[2] + 0.2), material(builder), yaw=float(rng.uniform(0, 3.1)))
+        builder.box(
+            along, across, -0.2, (size[0], size[1], size[2] + 0.2), material(builder), yaw=float(rng.uniform(0, 3.1))
+        )
 
 
 def container(builder: Builder, along: float, across: float) -> None:
@@ -79,7 +81,9 @@ def stack(builder: Builder, along: float, across: float) -> None:
         for j in range(top):
             at = along + (i + 0.5) * length / columns - length / 2 + float(rng.normal(0, 0.03))
             size = (0.93 * length / columns, width * float(rng.uniform(0.75, 1.0)), 0.36)
-            builder.box(at, across + float(rng.normal(0, 0.03)), 0.4 * j - 0.02, size, paint, yaw=float(rng.normal(0, 0.03)))
+            builder.box(
+                at, across + float(rng.normal(0, 0.03)), 0.4 * j - 0.02, size, paint, yaw=float(rng.normal(0, 0.03))
+            )
 
 
 def parked_bicycles(builder: Builder, along: float, across: float) -> None:

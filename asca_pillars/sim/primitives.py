@@ -109,8 +109,9 @@ def cuboids(rows: npt.ArrayLike) -> Primitives:
 
 
 def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
-    """Round posts: rows (N,9) of x, y, bottom z, height, radius at the foot, radius at the top, reflectance, and by
-    how much they lean along x and y per height; the last two may be left out (N,7). 2 * `sides` triangles each, open at both ends (a lid is thinner than a laser's footprint)."""
+    """Round posts: rows (N,9) of x, y, bottom z, height, radius at the foot, radius at the top, reflectance, and how
+    far the top leans along x and y per metre of height; these two may be left out (N,7). 2 * `sides` triangles each,
+    open at both ends (a lid is thinner than a laser's footprint)."""
     rows = np.atleast_2d(np.asarray(rows, float))
     lean = rows[:, 7:9] if rows.shape[1] == 9 else np.zeros((len(rows), 2))
     angle = np.arange(sides) * (2 * np.pi / sides)

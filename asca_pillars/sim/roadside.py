@@ -35,7 +35,7 @@ def _line(builder: Builder, whole: Stretch) -> None:
     rng, kind = builder.rng, builder.kind
     makers, weights = zip(*LININGS[kind].items(), strict=True)
     share = np.array(weights) / sum(weights)
-    setback = float(rng.uniform(0.0, {"urban": 1.5, "alley": 0.5}.get(kind, 5.0)))
+    setback = float(rng.uniform(0.0, {"urban": 1.5, "alley": 0.5}.get(kind, 3.5)))
     if kind in ("road", "rural") and rng.random() < 0.5:
         _everywhere(builder, guard_rail, replace(whole, away_m=whole.away_m - 0.2))
     # On some streets one thing goes on and on; on others every neighbor has chosen otherwise.
@@ -55,7 +55,7 @@ def _line(builder: Builder, whole: Stretch) -> None:
         stretch = Stretch(start, length, whole.side, away, whole.cross)
         make(builder, stretch)
         if make not in (building, wood, high_wall) and rng.random() < 0.95:
-            behind = replace(stretch, away_m=away + rng.uniform(2.5, 12.0))
+            behind = replace(stretch, away_m=away + rng.uniform(2.0, 10.0))
             (building if kind not in ("rural", "road") and rng.random() < 0.5 else wood)(builder, behind)
         start += length + (0.0 if rng.random() < 0.7 else rng.uniform(0.5, 4.0))
 

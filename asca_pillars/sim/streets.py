@@ -20,7 +20,7 @@ PAVEMENT_M = {
 }  # fmt: skip
 DIVIDED_SHARE = {"road": 0.6, "urban": 0.2, "rural": 0.1}
 RAILS_FACTOR = {"urban": 2.0, "road": 2.0, "alley": 0.0, "residential": 0.5}
-STEEP_SHARE = {"rural": 0.5, "road": 0.4}
+STEEP_SHARE = {"rural": 0.45, "road": 0.35}
 
 
 def draw_kind(config: SceneConfig, rng: np.random.Generator) -> str:
@@ -40,7 +40,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
     kerb = 0.0 if rng.random() < 0.12 else float(rng.uniform(0.03, 0.17))
     median = half > 6.0 and rng.random() < config.median_share
     turning = kind != "alley" and rng.random() < config.turning_share
-    steep = rng.random() < STEEP_SHARE.get(kind, 0.1)
+    steep = rng.random() < STEEP_SHARE.get(kind, 0.05)
     shape = street(
         yaw_rad=rng.normal(0.0, config.heading_error_sigma_rad) + (rng.uniform(-0.5, 0.5) if turning else 0.0),
         bend_per_m=rng.normal(0.0, config.bend_sigma_per_m),
@@ -57,7 +57,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
         ditch_m=rng.uniform(*config.ditch_m) if steep and rng.random() < 0.6 else 0.0,
         median_half_m=rng.uniform(0.4, 1.5) if median else 0.0,
         rough_m=rng.uniform(*config.grass_m),
-        camber=rng.uniform(0.0, 0.02),
+        camber=rng.uniform(0.0, 0.03),
         **_beside(config, rng, kind, half),
     )  # fmt: skip
     asphalt = float(np.clip(rng.normal(0.26, 0.06), 0.12, 0.45))

@@ -65,18 +65,20 @@ def wood(builder: Builder, stretch: Stretch) -> None:
     if not len(free):
         return
     coarse = coarseness(builder, stretch.middle_m, front, cross)
-    height, density = float(rng.uniform(2.4, 5.0)), float(np.exp(rng.uniform(np.log(1.2), np.log(5.0))))
-    radius = 0.55 * coarse
-    count = max(int(len(free) * 3.0 * height * 1.3 / radius**2 / 3.0), 3)
+    # Far woods count only as far as they rise above what stands before them.
+    height = float(rng.uniform(2.6, 5.0)) + 1.2 * (coarse - 1.0)
+    density = float(np.exp(rng.uniform(np.log(1.5), np.log(6.0))))
+    radius = 0.36 * coarse
+    count = max(int(len(free) * 3.0 * height * 0.45 / radius**2), 3)
     along = rng.choice(free, count) + rng.uniform(-1.5, 1.5, count)
     waves = 0.6 * np.sin(along * rng.uniform(0.3, 1.2) + rng.uniform(0.0, 6.0))
     away = stretch.away_m + 0.7 + waves + np.abs(rng.normal(0.0, 0.6, count))
     _clusters(builder, along, side * away, rng.uniform(0.1, height, count), radius, density, cross)
     # What comes through meets the inside of the wood.
-    deep = max(count // 4, 2)
+    deep = max(count // 6, 2)
     along = rng.choice(free, deep) + rng.uniform(-1.5, 1.5, deep)
     away = stretch.away_m + rng.uniform(2.0, 5.0, deep)
-    _clusters(builder, along, side * away, rng.uniform(0.3, height, deep), 1.7 * radius, 0.5 * density, cross)
+    _clusters(builder, along, side * away, rng.uniform(0.3, height, deep), 2.2 * radius, 0.5 * density, cross)
     if rng.random() < 0.6:
         for place in stretch.along(float(rng.uniform(4.0, 9.0))):
             trunk(builder, place + rng.normal(0, 1.0), side * (stretch.away_m + rng.uniform(-1.0, 1.0)), 6.0, cross)
@@ -97,11 +99,11 @@ def crown(
     """Clusters of leaves about a middle z above the ground, within `size` (radius across, radius up)."""
     rng, (wide, tall) = builder.rng, size
     coarse = coarseness(builder, along, across, cross)
-    count = max(int(rng.integers(10, 28) / coarse), 3)
+    count = max(int(rng.integers(20, 50) / coarse), 3)
     way = rng.normal(0.0, 1.0, (count, 3))
     # Leaves grow where the light is: more of them outside than at the heart.
     way *= rng.uniform(0.3, 1.0, (count, 1)) ** 0.5 / np.linalg.norm(way, axis=1, keepdims=True)
-    radius = 0.30 * (wide + tall) / 2 * coarse**0.5
+    radius = 0.23 * (wide + tall) / 2 * coarse**0.5
     up = z + tall * way[:, 2]
     _clusters(builder, along + wide * way[:, 0], across + wide * way[:, 1], up, radius, density, cross)
 
@@ -117,9 +119,7 @@ def trees(builder: Builder, stretch: Stretch) -> None:
             shrub(builder, along + rng.normal(0, 2.0), place, stretch.cross)
 
 
-def tree(
-    builder: Builder, along: float, across: float, cross: bool = False, tall_m: float | None = None
-) -> None:
+def tree(builder: Builder, along: float, across: float, cross: bool = False, tall_m: float | None = None) -> None:
     """A trunk, often bare as high as a laser reaches, and a crown."""
     rng = builder.rng
     base = (float(rng.uniform(1.0, 5.0)) if tall_m is None else tall_m) * float(rng.uniform(0.85, 1.15))
