@@ -51,10 +51,14 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
     placer = Placer(rng, config, ground, occupied, kind)
     if rng.random() >= config.empty_share:
         for name, rate in _rates(config, kind):
+            crowds = name in ("Pedestrian", "Person_sitting", "Cyclist")
+            dispersion = config.people_dispersion if crowds else config.dispersion
             for ahead in (True, False):
                 # A gamma-distributed rate makes the counts negative binomial.
-                for _ in range(rng.poisson(rate * rng.gamma(config.dispersion) / config.dispersion)):
+                for _ in range(rng.poisson(rate * rng.gamma(dispersion) / dispersion)):
                     placer.place(name, ahead)
+        for _ in range(rng.poisson(config.beyond)):
+            placer.place_beyond()
     builder = Builder(rng, config, ground, occupied, kind)
     line_streets(builder)
     scatter(builder)
@@ -151,7 +155,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     name = target.type
     if name in ("Car", "Van"):
         # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
-        slack = rng.uniform((0.0, 0.0, -0.02), (0.16, 0.10, 0.09))
+        slack = rng.uniform((0.0, 0.0, -0.03), (0.16, 0.10, 0.09))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.2
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
@@ -168,7 +172,8 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         body = people.sitting_body(rng, height - 0.05)
     else:
         body = people.cyclist_body(rng, height - 0.08, width, length - 0.04)
-    return body.placed(x, y, z - height / 2, yaw)
+    dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
+    return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 
 
 def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: float) -> Bodies:
