@@ -74,8 +74,7 @@ class SceneConfig:
                     raise ConfigError(f"{item.name} is {value}: the lower bound comes first")
             elif value < 0:
                 raise ConfigError(f"{item.name} is {value}: it must not be negative")
-        if (
-            self.residential + self.urban + self.rural + self.campus <= 0
-            or min(self.dispersion, self.people_dispersion) <= 0
-        ):
+        if self.people_dispersion <= 0:
+            raise ConfigError(f"people_dispersion is {self.people_dispersion}: it must be positive")
+        if self.residential + self.urban + self.rural + self.campus <= 0 or self.dispersion <= 0:
             raise ConfigError("the shares of the kinds of streets must not all be 0, nor the dispersion")
