@@ -8,7 +8,8 @@ from asca_pillars.sim.groundcast import GROUND
 from asca_pillars.sim.primitives import BACKGROUND, Primitives, Surface, cuboids, ellipsoids, prisms, quads
 from asca_pillars.sim.raycast import NOTHING, Bodies, cast
 from asca_pillars.sim.sensor import Firings, Lidar, draw_firings
-from asca_pillars.sim.shapes.vehicles import SALOON, car_body
+from asca_pillars.sim.shapes.styles import SALOON
+from asca_pillars.sim.shapes.vehicles import car_body
 
 
 def bodies(primitives: Primitives, owner: int = BACKGROUND) -> Bodies:

@@ -9,7 +9,7 @@ import yaml
 from asca_pillars.errors import ConfigError
 from asca_pillars.schema import parse
 from asca_pillars.sim.ground import Ground, street
-from asca_pillars.sim.primitives import Primitives, Surface, quads
+from asca_pillars.sim.primitives import Surface, quads
 from asca_pillars.sim.raycast import Bodies, cast
 from asca_pillars.sim.returns import Returns, measure
 from asca_pillars.sim.sensor import Lidar, draw_firings
