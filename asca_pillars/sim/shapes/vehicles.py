@@ -36,7 +36,7 @@ class _Hull(NamedTuple):
 
 
 def car_body(
-    rng: np.random.Generator, length: float, width: float, height: float, profile: Profile, dark_share: float = 0.45
+    rng: np.random.Generator, length: float, width: float, height: float, profile: Profile, dark_share: float = 0.5
 ) -> Primitives:
     """A lofted car or van with wheels, mirrors, plates and seats behind its glass."""
     hull = _Hull(
