@@ -108,17 +108,15 @@ def _varied(profile: Profile, rng: np.random.Generator) -> Profile:
     x_to = (0.0, base + rng.normal(0.0, 0.02), tail + min(rng.normal(0.0, 0.015), 0.8 * (1.0 - tail)), 1.0)
     lift = float(np.clip(rng.normal(0.0, 0.018), -0.04, 0.04))
 
-    def moved(x: float) -> float:
-        return float(np.interp(x, x_from, x_to))
-
-    def lifted(z: float) -> float:
-        return float(np.interp(z, (0.0, profile.belt, 1.0), (0.0, profile.belt + lift, 1.0)))
-
+    outline = np.array(profile.top)
+    z = np.interp(outline[:, 1], (0.0, profile.belt, 1.0), (0.0, profile.belt + lift, 1.0))
+    x = np.interp([*outline[:, 0], *profile.cabin, *np.ravel(profile.glass)], x_from, x_to).tolist()
+    cabin, glass = x[len(z) : len(z) + 2], x[len(z) + 2 :]
     return replace(
         profile,
-        top=tuple((moved(x), lifted(z)) for x, z in profile.top),
-        glass=tuple((moved(a), moved(b)) for a, b in profile.glass),
-        cabin=(moved(profile.cabin[0]), moved(profile.cabin[1])),
+        top=tuple(zip(x[: len(z)], z.tolist(), strict=True)),
+        glass=tuple(zip(glass[::2], glass[1::2], strict=True)),
+        cabin=(cabin[0], cabin[1]),
         belt=profile.belt + lift,
         tumble=profile.tumble + float(rng.uniform(-0.03, 0.03)),
     )
