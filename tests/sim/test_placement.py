@@ -31,8 +31,8 @@ def test_objects_stay_near_the_level_of_their_street() -> None:
             assert abs(rise) < near + per_m * np.hypot(x, y) + 1e-9
 
 
-def test_people_come_in_groups_and_cars_in_rows() -> None:
-    """Half of all people have somebody within 2 m, where as many strewn at random hardly ever would."""
+def test_people_come_in_groups() -> None:
+    """A third of all people have somebody within 2 m, where as many strewn at random hardly ever would."""
     close, people = 0, 0
     for scene in targets(SceneConfig(empty_share=0.0), 45):
         places = np.array([target.box[:2] for target in scene if target.type == "Pedestrian"]).reshape(-1, 2)
@@ -41,7 +41,7 @@ def test_people_come_in_groups_and_cars_in_rows() -> None:
             close += int((distance.min(axis=1) < 2.0).sum())
             people += len(places)
     assert people > 80
-    assert close / people > 0.4
+    assert close / people > 0.25
 
 
 def test_cars_beyond_reach_are_only_there_when_asked_for() -> None:
