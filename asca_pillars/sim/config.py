@@ -39,23 +39,30 @@ class SceneConfig:
     # Standard deviation of a body's center about that of its label box.
     box_offset_sigma_m: float = 0.03
 
-    # Shares of street kinds: narrow with parked cars, wide in town, out of town, square or campus.
-    residential: float = 0.36
-    urban: float = 0.30
-    rural: float = 0.22
-    campus: float = 0.12
+    # Shares of street kinds: narrow with parked cars, wide in town, out of town, square or campus, trunk road,
+    # alley between walls.
+    residential: float = 0.32
+    urban: float = 0.27
+    rural: float = 0.12
+    campus: float = 0.11
+    road: float = 0.11
+    alley: float = 0.07
     junction_share: float = 0.45
     rails_share: float = 0.07
     median_share: float = 0.4  # of the wide streets
     turning_share: float = 0.12  # the car stands at up to half a radian to the street
 
-    sensor_height_m: tuple[float, float] = (1.66, 1.80)
+    sensor_height_m: tuple[float, float] = (1.69, 1.82)
     heading_error_sigma_rad: float = 0.035  # of the car in its lane
     bend_sigma_per_m: float = 0.0022  # curvature of the road
-    slope_x: tuple[float, float] = (0.007, 0.006)  # mean and standard deviation
-    slope_y: tuple[float, float] = (-0.006, 0.012)
-    relief_m: tuple[float, float] = (0.0, 1.5)
-    bank_slope: tuple[float, float] = (-0.05, 0.15)  # of the ground beyond the pavement
+    # Mean and standard deviation of the slopes under the car, as KITTI's scans have them.
+    slope_x: tuple[float, float] = (0.0105, 0.0035)
+    slope_y: tuple[float, float] = (-0.009, 0.016)
+    relief_m: tuple[float, float] = (0.1, 2.6)
+    bump_m: tuple[float, float] = (0.0, 0.15)  # standard deviation of bumps beyond the pavement
+    bank_slope_sigma: float = 0.03  # of the ground beyond the pavement
+    embankment_slope: tuple[float, float] = (-0.2, 0.45)
+    ditch_m: tuple[float, float] = (0.1, 0.6)
     grass_m: tuple[float, float] = (0.02, 0.16)
 
     clutter: tuple[float, float] = (10.0, 45.0)  # posts, signs, bins, shrubs and the like per 100 m of street
@@ -79,5 +86,6 @@ class SceneConfig:
                 raise ConfigError(f"{item.name} is {value}: it must not be negative")
         if self.people_dispersion <= 0:
             raise ConfigError(f"people_dispersion is {self.people_dispersion}: it must be positive")
-        if self.residential + self.urban + self.rural + self.campus <= 0 or self.dispersion <= 0:
+        kinds = self.residential + self.urban + self.rural + self.campus + self.road + self.alley
+        if kinds <= 0 or self.dispersion <= 0:
             raise ConfigError("the shares of the kinds of streets must not all be 0, nor the dispersion")

@@ -48,6 +48,8 @@ def _is_free(row: Floats, rows: Floats, count: int) -> bool:
     """Whether a footprint overlaps none of the first `count` (separating axes of two rectangles)."""
     for i in range(count):
         dx, dy = rows[i, 0] - row[0], rows[i, 1] - row[1]
+        if max(abs(dx), abs(dy)) > (row[2] + row[3] + rows[i, 2] + rows[i, 3]) / 2:
+            continue  # farther than half the diagonals reach
         apart = False
         for one, other in ((row, rows[i]), (rows[i], row)):
             cos, sin = np.cos(one[4]), np.sin(one[4])
