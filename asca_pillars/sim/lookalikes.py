@@ -4,7 +4,7 @@ import numpy as np
 
 from .builder import Builder, Material
 from .furniture import material
-from .shapes.people import bicycle
+from .shapes.cycles import motorbike_body, parked_bicycle_body
 
 
 def thin_cylinder(builder: Builder, along: float, across: float) -> None:
@@ -95,5 +95,14 @@ def parked_bicycles(builder: Builder, along: float, across: float) -> None:
     for place in along + step * np.arange(number):
         length, width = (0.4, 1.75) if leaning else (1.75, 0.55)
         if builder.claim(place, across, length, width):
-            body = bicycle(rng, float(rng.uniform(1.6, 1.85)))
-            builder.body(body, place, across, leaning + float(rng.normal(0, 0.12)))
+            builder.body(parked_bicycle_body(rng), place, across, leaning + float(rng.normal(0, 0.12)))
+
+
+def parked_motorbikes(builder: Builder, along: float, across: float) -> None:
+    """One to four motorcycles side by side."""
+    rng = builder.rng
+    turned = float(rng.choice([0.0, 0.9, np.pi / 2]))
+    length, width = (2.0, 0.8) if turned == 0.0 else (0.9, 2.1)
+    for place in along + (2.3 if turned == 0.0 else 1.0) * np.arange(int(rng.integers(1, 5))):
+        if builder.claim(place, across, length, width):
+            builder.body(motorbike_body(rng), place, across, turned + float(rng.normal(0, 0.1)))

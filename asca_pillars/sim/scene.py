@@ -15,7 +15,7 @@ from .placement import Occupied, Placer, Target
 from .primitives import BACKGROUND, Primitives
 from .raycast import Bodies
 from .roadside import line_streets
-from .shapes import people, vehicles
+from .shapes import heavy, people, styles, vehicles
 from .streets import draw_ground, draw_kind
 
 EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 2.6
@@ -103,21 +103,19 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     """The body of an object, placed: a little smaller than its label box, as KITTI's labels are loose."""
     x, y, z, length, width, height, yaw = target.box
     name = target.type
-    if name == "Car":
-        styles = vehicles.CAR_STYLES if height < 1.68 else ((vehicles.SUV, 0.45), (vehicles.MINIVAN, 0.55))
-        weights = np.array([weight for _, weight in styles])
-        profile = styles[int(rng.choice(len(styles), p=weights / weights.sum()))][0]
-        body = vehicles.car_body(rng, length - 0.08, width - 0.06, height - 0.07, profile, config.dark_paint_share)
-    elif name == "Van":
-        profile = vehicles.MINIVAN if height < 2.0 and rng.random() < 0.7 else vehicles.VAN
-        body = vehicles.car_body(rng, length - 0.08, width - 0.08, height - 0.08, profile, 0.2)
+    if name in ("Car", "Van"):
+        # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
+        slack = rng.uniform((0.0, 0.0, -0.02), (0.16, 0.10, 0.09))
+        profile = styles.draw_style(rng, length, height, van=name == "Van")
+        dark = config.dark_paint_share if name == "Car" else 0.2
+        body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
     elif name == "Truck":
         bus = rng.random() < 0.15
-        body = (vehicles.bus_body if bus else vehicles.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
+        body = (heavy.bus_body if bus else heavy.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
     elif name == "Tram":
-        body = vehicles.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
+        body = heavy.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
     elif name == "Misc":
-        body = vehicles.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
+        body = heavy.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
     elif name == "Pedestrian":
         body = people.pedestrian_body(rng, height - 0.05, width, length)
     elif name == "Person_sitting":

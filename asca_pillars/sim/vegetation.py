@@ -84,6 +84,37 @@ def wood(builder: Builder, stretch: Stretch) -> None:
             trunk(builder, place + rng.normal(0, 1.0), side * (stretch.away_m + rng.uniform(-1.0, 1.0)), 6.0, cross)
 
 
+def overgrow(builder: Builder, stretch: Stretch) -> None:
+    """Patches of ivy and shrubs before, on and behind what lines a stretch: few fences in KITTI stand bare."""
+    rng, side, cross = builder.rng, stretch.side, stretch.cross
+    radius = 0.26 * coarseness(builder, stretch.middle_m, side * stretch.away_m, cross)
+    for _ in range(1 + int(stretch.length_m / 8.0)):
+        middle, long = stretch.start_m + rng.uniform(0.0, stretch.length_m), rng.uniform(0.4, 3.0)
+        height, deep = rng.uniform(0.5, 3.0), rng.uniform(0.15, 0.7)
+        if not builder.claim(float(middle), side * (stretch.away_m - deep), 2 * long, deep, cross):
+            continue
+        count = max(int(2 * long * height * 0.5 / radius**2), 3)
+        # Thinner upward and to its ends.
+        along = middle + long * rng.normal(0.0, 0.5, count)
+        away = stretch.away_m - deep * np.abs(rng.normal(0.0, 0.5, count)) + rng.uniform(0.0, 0.4, count)
+        z = height * rng.random(count) ** 1.3
+        _clusters(builder, along, side * away, z, radius, float(rng.uniform(2.0, 8.0)), cross)
+
+
+def wood_across(builder: Builder, along: float, half_width: float) -> None:
+    """A wood's edge across the road's direction, where the view ends."""
+    rng = builder.rng
+    places = np.arange(-half_width, half_width, 3.0)
+    free = np.array([v for v in places if builder.claim(along, float(v), 1.8, 2.9)])
+    if not len(free):
+        return
+    radius = 0.4 * coarseness(builder, along, 0.0, cross=False)
+    count = max(int(len(free) * 3.0 * 5.0 * 0.45 / radius**2), 3)
+    across = rng.choice(free, count) + rng.uniform(-1.5, 1.5, count)
+    deep = along + np.sign(along) * np.abs(rng.normal(0.0, 0.8, count))
+    _clusters(builder, deep, across, rng.uniform(0.1, 5.0, count), radius, float(rng.uniform(1.5, 6.0)), cross=False)
+
+
 def _clusters(
     builder: Builder, along: Floats, across: Floats, z: Floats, radius: float, density: float, cross: bool
 ) -> None:
