@@ -33,7 +33,7 @@ def scatter(builder: Builder) -> None:
     rng, ground = builder.rng, builder.ground
     pavement = ground.pavement_m
     things, weights = zip(*SHARES.items(), strict=True)
-    share = np.array(weights) / sum(weights)
+    upto = np.cumsum(weights) / sum(weights)
     number = rng.uniform(*builder.config.clutter)
     for _ in range(rng.poisson(1.6 * number)):  # 160 m of street
         along = float(rng.uniform(-80, 80))
@@ -43,7 +43,7 @@ def scatter(builder: Builder) -> None:
         if rng.random() < 0.15:
             edge, beside = 0.0, rng.uniform(edge + 2.0, SCATTERED_WITHIN_M)
         if not builder.near_junction(along, along):
-            things[int(rng.choice(len(things), p=share))](builder, along, float(side * (edge + beside)))
+            things[int(np.searchsorted(upto, rng.random()))](builder, along, float(side * (edge + beside)))
     if ground.cross_half_m > 0 and rng.random() < 0.35:
         reach = ground.cross_half_m + rng.uniform(1.5, 5.0)
         island(builder, ground.cross_u_m + float(rng.choice([-1.0, 1.0])) * reach, 0.0)

@@ -92,10 +92,12 @@ def parked_bicycles(builder: Builder, along: float, across: float) -> None:
     leaning = np.pi / 2 if rng.random() < 0.6 else 0.0
     number = int(rng.integers(4, 12)) if leaning and rng.random() < 0.4 else int(rng.integers(1, 5))
     step = float(rng.uniform(0.45, 0.8)) if leaning else 2.0
-    for place in along + step * np.arange(number):
-        length, width = (0.4, 1.75) if leaning else (1.75, 0.55)
+    length, width = (0.4, 1.75) if leaning else (1.75, 0.55)
+    bodies = [parked_bicycle_body(rng) for _ in range(min(number, 2))]  # racks repeat them: they are dear to draw
+    for i in range(number):
+        place = along + i * step
         if builder.claim(place, across, length, width):
-            builder.body(parked_bicycle_body(rng), place, across, leaning + float(rng.normal(0, 0.12)))
+            builder.body(bodies[i % 2], place, across, leaning + float(rng.choice([0.0, np.pi]) + rng.normal(0, 0.12)))
 
 
 def parked_motorbikes(builder: Builder, along: float, across: float) -> None:

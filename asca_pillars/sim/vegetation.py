@@ -1,5 +1,7 @@
 """Trees, hedges, shrubs and woods: clusters of leaves with gaps between them, into which rays go."""
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -7,13 +9,14 @@ from .builder import Builder, Stretch
 
 Floats = npt.NDArray[np.float64]
 
-FINE_WITHIN_M, COARSER_PER_M = 15.0, 0.035  # far clusters are larger and fewer, as no ray tells the difference
+# Far clusters are larger and fewer, as no ray tells the difference.
+FINEST, FINE_WITHIN_M, COARSER_PER_M = 0.75, 8.0, 0.033
 
 
 def coarseness(builder: Builder, along: float, across: float, cross: bool) -> float:
-    """How many times larger clusters of leaves may be at a place than near the car."""
+    """How many times larger clusters of leaves may be at a place than some 17 m away."""
     x, y, _ = builder.to_lidar(along, across, cross)
-    return 1.0 + COARSER_PER_M * max(float(np.hypot(x, y)) - FINE_WITHIN_M, 0.0)
+    return FINEST + COARSER_PER_M * max(math.hypot(x, y) - FINE_WITHIN_M, 0.0)
 
 
 def hedge(builder: Builder, stretch: Stretch) -> None:
@@ -66,7 +69,7 @@ def wood(builder: Builder, stretch: Stretch) -> None:
         return
     coarse = coarseness(builder, stretch.middle_m, front, cross)
     # Far woods count only as far as they rise above what stands before them.
-    height = float(rng.uniform(2.6, 5.0)) + 1.2 * (coarse - 1.0)
+    height = float(rng.uniform(2.6, 5.0)) + 1.2 * max(coarse - 1.0, 0.0)
     density = float(np.exp(rng.uniform(np.log(1.5), np.log(6.0))))
     radius = 0.36 * coarse
     count = max(int(len(free) * 3.0 * height * 0.45 / radius**2), 3)
