@@ -50,6 +50,7 @@ class SceneConfig:
     junction_share: float = 0.45
     rails_share: float = 0.07
     median_share: float = 0.4  # of the wide streets
+    closed_end_share: float = 0.18  # streets that end before a wood or a house, on either end
     turning_share: float = 0.12  # the car stands at up to half a radian to the street
 
     sensor_height_m: tuple[float, float] = (1.69, 1.82)
@@ -60,7 +61,7 @@ class SceneConfig:
     slope_y: tuple[float, float] = (-0.009, 0.016)
     relief_m: tuple[float, float] = (0.1, 2.6)
     bump_m: tuple[float, float] = (0.0, 0.15)  # standard deviation of bumps beyond the pavement
-    bank_slope_sigma: float = 0.03  # of the ground beyond the pavement
+    bank_slope_sigma: float = 0.045  # of the ground beyond the pavement
     embankment_slope: tuple[float, float] = (-0.2, 0.45)
     ditch_m: tuple[float, float] = (0.1, 0.6)
     grass_m: tuple[float, float] = (0.02, 0.16)
