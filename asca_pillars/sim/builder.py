@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -12,6 +13,7 @@ from .primitives import Primitives, cuboids, ellipsoids, prisms
 
 Floats = npt.NDArray[np.float64]
 Material = tuple[float, float, float]  # reflectance, gloss, transparency
+HEAD_ROOM_M = 2.2  # leaves above may hang over objects
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,8 @@ class Builder:
         if self._posts:
             parts.append(prisms(self._grounded(np.array(self._posts)), sides=6))
         if self._blobs:
-            rows = self._grounded(_without_intruders(np.concatenate(self._blobs), self._kept_clear))
+            rows = np.concatenate(self._blobs)
+            rows = self._grounded(rows[~_intrudes(rows, self._kept_clear)])
             cos, sin, zero = np.cos(rows[:, 6]), np.sin(rows[:, 6]), np.zeros(len(rows))
             axes = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]).transpose(2, 0, 1)
             surface = np.column_stack([rows[:, 7], zero + 0.3, rows[:, 8]])
@@ -140,12 +143,20 @@ class Builder:
         return rows
 
 
-def _without_intruders(blobs: Floats, footprints: Floats) -> Floats:
-    """Foliage without the clouds that would hang into the car (its sensor would see nothing else) or an object."""
-    dx, dy = (blobs[:, None, axis] - footprints[None, :, axis] for axis in (0, 1))
-    cos, sin = np.cos(footprints[:, 4]), np.sin(footprints[:, 4])
-    along = np.maximum(np.abs(dx * cos + dy * sin) - footprints[:, 2] / 2, 0.0)
-    across = np.maximum(np.abs(dy * cos - dx * sin) - footprints[:, 3] / 2, 0.0)
-    radius = blobs[:, 3:5].max(axis=1, keepdims=True)
-    low = (blobs[:, 2] - blobs[:, 5] < 2.2)[:, None]
-    return np.asarray(blobs[~((np.hypot(along, across) < radius) & low).any(axis=1)])
+@numba.njit(cache=True)
+def _intrudes(blobs: Floats, footprints: Floats) -> npt.NDArray[np.bool_]:
+    """Which clouds would hang into the car (its sensor would see nothing else) or an object."""
+    result = np.zeros(len(blobs), np.bool_)
+    for i in range(len(blobs)):
+        if blobs[i, 2] - blobs[i, 5] >= HEAD_ROOM_M:
+            continue
+        radius = max(blobs[i, 3], blobs[i, 4])
+        for j in range(len(footprints)):
+            dx, dy = blobs[i, 0] - footprints[j, 0], blobs[i, 1] - footprints[j, 1]
+            cos, sin = np.cos(footprints[j, 4]), np.sin(footprints[j, 4])
+            along = max(abs(dx * cos + dy * sin) - footprints[j, 2] / 2, 0.0)
+            across = max(abs(dy * cos - dx * sin) - footprints[j, 3] / 2, 0.0)
+            if along * along + across * across < radius * radius:
+                result[i] = True
+                break
+    return result

@@ -21,7 +21,7 @@ from .furniture import (
     pole_group,
     shelter,
 )
-from .lookalikes import column, container, heap, parked_bicycles, post_with_box, stack, thin_cylinder
+from .lookalikes import column, container, heap, parked_bicycles, parked_motorbikes, post_with_box, stack, thin_cylinder
 from .vegetation import hedge_block, shrub, tree
 
 Thing = Callable[[Builder, float, float], None]
@@ -33,7 +33,7 @@ def scatter(builder: Builder) -> None:
     rng, ground = builder.rng, builder.ground
     pavement = ground.pavement_m
     things, weights = zip(*SHARES.items(), strict=True)
-    share = np.array(weights) / sum(weights)
+    upto = np.cumsum(weights) / sum(weights)
     number = rng.uniform(*builder.config.clutter)
     for _ in range(rng.poisson(1.6 * number)):  # 160 m of street
         along = float(rng.uniform(-80, 80))
@@ -43,7 +43,7 @@ def scatter(builder: Builder) -> None:
         if rng.random() < 0.15:
             edge, beside = 0.0, rng.uniform(edge + 2.0, SCATTERED_WITHIN_M)
         if not builder.near_junction(along, along):
-            things[int(rng.choice(len(things), p=share))](builder, along, float(side * (edge + beside)))
+            things[int(np.searchsorted(upto, rng.random()))](builder, along, float(side * (edge + beside)))
     if ground.cross_half_m > 0 and rng.random() < 0.35:
         reach = ground.cross_half_m + rng.uniform(1.5, 5.0)
         island(builder, ground.cross_u_m + float(rng.choice([-1.0, 1.0])) * reach, 0.0)
@@ -58,5 +58,5 @@ SHARES: dict[Thing, float] = {
     pole: 0.15, pole_group: 0.04, bollards: 0.07, delineators: 0.04, cabinet: 0.08, bins: 0.06, bench: 0.04,
     planter: 0.04, shelter: 0.015, billboard: 0.025, barrier_boards: 0.02, low_stones: 0.03,
     thin_cylinder: 0.04, post_with_box: 0.05, column: 0.03, container: 0.02, heap: 0.02, stack: 0.03,
-    hedge_block: 0.04, parked_bicycles: 0.05, any_shrub: 0.13, tree: 0.06,
+    hedge_block: 0.04, parked_bicycles: 0.045, parked_motorbikes: 0.015, any_shrub: 0.13, tree: 0.06,
 }  # fmt: skip

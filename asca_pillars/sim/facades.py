@@ -3,6 +3,7 @@
 import numpy as np
 
 from .builder import Builder, Material, Stretch
+from .vegetation import wood_across
 
 
 def building(builder: Builder, stretch: Stretch) -> None:
@@ -59,6 +60,25 @@ def _before_house(builder: Builder, place: float, side: float, away: float, ston
     elif extra < 0.7 and builder.claim(place, side * (away - 0.6), 0.2, 0.2, cross):  # porch
         builder.post(place, side * (away - 0.7), -0.2, 2.6, 0.07, stone[0], cross)
         builder.box(place, side * (away - 0.5), 2.3, (2.0, 1.2, 0.2), stone, cross)
+
+
+def close_view(builder: Builder, along: float, half_width: float) -> None:
+    """What stands across the end of a street: a wood or a house."""
+    rng = builder.rng
+    if rng.random() < 0.6:
+        wood_across(builder, along, half_width)
+        return
+    stone: Material = (float(rng.uniform(0.12, 0.5)), 0.3, 0.0)
+    glass: Material = (float(rng.uniform(0.03, 0.25)), 2.0, 0.0)
+    wide, toward = float(rng.uniform(9.0, 20.0)), -1.0 if along > 0 else 1.0
+    middle = float(rng.normal(0.0, 3.0))
+    if builder.claim(along, middle, 6.0, wide):
+        builder.box(along, middle, -1.5, (6.0, wide, 9.0), glass)
+        front = along + 3.1 * toward
+        builder.box(front, middle, -1.5, (0.2, wide, 2.3), stone)
+        builder.box(front, middle, 2.4, (0.2, wide, 5.0), stone)
+        for across in np.arange(middle - wide / 2 + 0.5, middle + wide / 2, float(rng.uniform(1.8, 3.2))):
+            builder.box(front, across, -1.5, (0.22, 1.0, 7.0), stone)
 
 
 def garages(builder: Builder, stretch: Stretch) -> None:

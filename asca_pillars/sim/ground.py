@@ -4,7 +4,9 @@ Road coordinates: u along the main road, v to its left, v = 0 at its middle, in 
 against the LiDAR frame, in which the car stands at the origin.
 """
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,20 +37,20 @@ class Ground:
 
     @property
     def half_width_m(self) -> float:
-        return float(self.shape[groundcast.HALF_WIDTH])
+        return self._numbers[groundcast.HALF_WIDTH]
 
     @property
     def pavement_m(self) -> float:
-        return float(self.shape[groundcast.WALK])
+        return self._numbers[groundcast.WALK]
 
     @property
     def cross_u_m(self) -> float:
-        return float(self.shape[groundcast.CROSS_U])
+        return self._numbers[groundcast.CROSS_U]
 
     @property
     def cross_half_m(self) -> float:
         """Half the width of the crossing road; 0 where there is none."""
-        return float(self.shape[groundcast.CROSS_HALF])
+        return self._numbers[groundcast.CROSS_HALF]
 
     @property
     def rails_v_m(self) -> float | None:
@@ -63,22 +65,26 @@ class Ground:
         bed = float(self.shape[groundcast.RAILS_V] + self.shape[groundcast.BED_HALF])
         return max(self.half_width_m, second, bed)
 
+    @cached_property
+    def _numbers(self) -> list[float]:
+        """The shape as plain numbers: places are asked for one by one, thousands per scene."""
+        return [float(number) for number in self.shape]
+
     def to_lidar(self, u_m: float, v_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
         """Road coordinates and a heading against the road -> x, y, heading in the LiDAR frame."""
-        yaw, bend = self.shape[groundcast.YAW], self.shape[groundcast.BEND]
-        across = v_m + self.shape[groundcast.OFFSET] + 0.5 * bend * u_m * u_m
-        x = u_m * np.cos(yaw) - across * np.sin(yaw)
-        y = u_m * np.sin(yaw) + across * np.cos(yaw)
-        return float(x), float(y), float(yaw + np.arctan(bend * u_m) + yaw_rad)
+        numbers = self._numbers
+        cos, sin, bend = numbers[groundcast.COS_YAW], numbers[groundcast.SIN_YAW], numbers[groundcast.BEND]
+        across = v_m + numbers[groundcast.OFFSET] + 0.5 * bend * u_m * u_m
+        yaw = numbers[groundcast.YAW] + math.atan(bend * u_m) + yaw_rad
+        return float(u_m * cos - across * sin), float(u_m * sin + across * cos), float(yaw)
 
     def cross_to_lidar(self, along_m: float, across_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
         """The same for the crossing road: along it to the left of the main road, across it ahead."""
-        tilt = self.shape[groundcast.CROSS_TILT]
-        u = self.shape[groundcast.CROSS_U] + across_m * np.cos(tilt) - along_m * np.sin(tilt)
-        v = along_m * np.cos(tilt) + across_m * np.sin(tilt)
-        x, y, _ = self.to_lidar(u, v)
-        yaw = self.shape[groundcast.YAW] + tilt + np.pi / 2 + yaw_rad
-        return x, y, float(yaw)
+        numbers = self._numbers
+        cos, sin = numbers[groundcast.COS_TILT], numbers[groundcast.SIN_TILT]
+        u = numbers[groundcast.CROSS_U] + across_m * cos - along_m * sin
+        x, y, _ = self.to_lidar(u, along_m * cos + across_m * sin)
+        return x, y, float(numbers[groundcast.YAW] + numbers[groundcast.CROSS_TILT] + math.pi / 2 + yaw_rad)
 
     def places(self, along_m: Floats, across_m: Floats, cross: bool = False) -> Floats:
         """Places (N,) beside the main or the crossing road -> (N,2) x and y in the LiDAR frame."""

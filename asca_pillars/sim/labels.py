@@ -14,7 +14,7 @@ from .returns import Returns
 # Visible share of the firings that would meet the object alone, above which KITTI's annotators would say
 # "fully visible" (0), "partly occluded" (1) and "largely occluded" (2); below the last it is "unknown" (3).
 # The steps give simulated cars the shares of KITTI's: 47, 28, 21 and 3 %.
-OCCLUSION_STEPS = (0.84, 0.36, 0.09)
+OCCLUSION_STEPS = (0.82, 0.36, 0.09)
 MAX_TRUNCATION = 0.95
 UNKNOWN_FROM_TRUNCATION = 0.85  # what hardly stands in the image, KITTI mostly marks as unknown, too
 

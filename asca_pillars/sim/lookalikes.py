@@ -4,7 +4,7 @@ import numpy as np
 
 from .builder import Builder, Material
 from .furniture import material
-from .shapes.people import bicycle
+from .shapes.cycles import motorbike_body, parked_bicycle_body
 
 
 def thin_cylinder(builder: Builder, along: float, across: float) -> None:
@@ -92,8 +92,19 @@ def parked_bicycles(builder: Builder, along: float, across: float) -> None:
     leaning = np.pi / 2 if rng.random() < 0.6 else 0.0
     number = int(rng.integers(4, 12)) if leaning and rng.random() < 0.4 else int(rng.integers(1, 5))
     step = float(rng.uniform(0.45, 0.8)) if leaning else 2.0
-    for place in along + step * np.arange(number):
-        length, width = (0.4, 1.75) if leaning else (1.75, 0.55)
+    length, width = (0.4, 1.75) if leaning else (1.75, 0.55)
+    bodies = [parked_bicycle_body(rng) for _ in range(min(number, 2))]  # racks repeat them: they are dear to draw
+    for i in range(number):
+        place = along + i * step
         if builder.claim(place, across, length, width):
-            body = bicycle(rng, float(rng.uniform(1.6, 1.85)))
-            builder.body(body, place, across, leaning + float(rng.normal(0, 0.12)))
+            builder.body(bodies[i % 2], place, across, leaning + float(rng.choice([0.0, np.pi]) + rng.normal(0, 0.12)))
+
+
+def parked_motorbikes(builder: Builder, along: float, across: float) -> None:
+    """One to four motorcycles side by side."""
+    rng = builder.rng
+    turned = float(rng.choice([0.0, 0.9, np.pi / 2]))
+    length, width = (2.0, 0.8) if turned == 0.0 else (0.9, 2.1)
+    for place in along + (2.3 if turned == 0.0 else 1.0) * np.arange(int(rng.integers(1, 5))):
+        if builder.claim(place, across, length, width):
+            builder.body(motorbike_body(rng), place, across, turned + float(rng.normal(0, 0.1)))

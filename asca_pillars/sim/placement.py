@@ -109,13 +109,17 @@ class Placer:
 
     def _put(self, name: str, size: Floats, place: Place, margin_m: float) -> bool:
         x, y, yaw = place
+        level = float(self.ground.heights((x, y))[0])
+        near, per_m = self.config.level_band_m
+        rise = self.config.slope_x[0] * x + self.config.slope_y[0] * y
+        if abs(level - self.ground.z_m - rise) > near + per_m * np.hypot(x, y):
+            return False
         if not self.occupied.take(x, y, size[0], size[1], yaw, margin_m):
             return False
         mean, deviation = self.config.box_lift_m[0 if name in ("Pedestrian", "Person_sitting", "Cyclist") else 1]
         lift = float(np.clip(self.rng.normal(mean, deviation), -0.12, 0.15))
-        z = float(self.ground.heights((x, y))[0]) + lift
         yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
-        self.targets.append(Target(name, np.array([x, y, z + size[2] / 2, *size, yaw]), lift))
+        self.targets.append(Target(name, np.array([x, y, level + lift + size[2] / 2, *size, yaw]), lift))
         return True
 
     def _distance(self, shape: float, scale: float) -> float:
@@ -126,11 +130,11 @@ class Placer:
         long = size[0] > 6.0
         habit = self.rng.random()
         parked = {"residential": 0.64, "urban": 0.44, "rural": 0.14, "campus": 0.47}[self.kind] * (0.3 if long else 1.0)
-        if self.ground.cross_half_m > 0 and habit > 0.87:
+        if self.ground.cross_half_m > 0 and habit > 0.88:
             return self._crossing()
         if habit < parked:
             return self._parked(size, way)
-        if habit < parked + 0.13:
+        if habit < parked + 0.15:
             return self._off_street(way)
         return self._moving(size, way)
 
@@ -154,7 +158,7 @@ class Placer:
             if not 0 < u * way < self.config.reach_m:
                 u = way * self._distance(1.9, 13.0)
         else:
-            u = way * self._distance(1.6, 16.0)
+            u = way * self._distance(1.6, 17.5)
             side = 1.0 if rng.random() < 0.55 else -1.0
             if rng.random() < 0.15:
                 v = side * (half + rng.uniform(0.2, 0.8) + size[0] / 2)
@@ -168,7 +172,7 @@ class Placer:
     def _off_street(self, way: float) -> Place:
         """In drives, yards and car parks."""
         rng, ground = self.rng, self.ground
-        v = (1.0 if rng.random() < 0.6 else -1.0) * (ground.half_width_m + ground.pavement_m + rng.uniform(2.0, 16.0))
+        v = (1.0 if rng.random() < 0.6 else -1.0) * (ground.half_width_m + ground.pavement_m + rng.uniform(2.0, 20.0))
         heading = float(rng.choice([0.0, np.pi, np.pi / 2, -np.pi / 2], p=[0.3, 0.3, 0.2, 0.2])) + rng.normal(0, 0.12)
         return ground.to_lidar(way * self._distance(2.0, 15.0), v, heading)
 
@@ -179,7 +183,7 @@ class Placer:
             u, v, heading, length = self._traffic[int(rng.integers(len(self._traffic)))]
             u += ((length + size[0]) / 2 + rng.gamma(2.0, 2.5) + 1.2) * rng.choice([-1.0, 1.0])
         else:
-            u = way * self._distance(1.9, 18.0)
+            u = way * self._distance(1.9, 20.0)
             lanes = max(int(half // 3.1), 1)
             lane = (int(rng.integers(lanes)) + 0.5) * min(half / lanes, 3.6)
             oncoming = rng.random() < 0.45
@@ -200,8 +204,8 @@ class Placer:
         else:
             u = way * self._distance(2.0, 6.6)
             place = rng.random()
-            across = rng.random() < 0.3
-            if place < 0.12 and way > 0:
+            across = rng.random() < 0.25
+            if place < 0.10 and way > 0:
                 u, v, across = self._zebra_u + rng.uniform(-1.5, 1.5), rng.uniform(-half - 1.0, half + 1.0), True
             elif self.kind == "campus" and place < 0.6:
                 v = rng.uniform(-12.0, 12.0)
@@ -256,6 +260,6 @@ class Placer:
             u = way * self._distance(2.0, 12.5)
             side = -1.0 if rng.random() < 0.6 else 1.0
             v = side * (half + (rng.uniform(-1.3, -0.3) if rng.random() < 0.5 else rng.uniform(0.4, 4.5)))
-            heading = (np.pi if (side > 0) != (rng.random() < 0.2) else 0.0) + rng.normal(0, 0.12)
+            heading = (np.pi if (side > 0) != (rng.random() < 0.3) else 0.0) + rng.normal(0, 0.12)
         self._riders.append((u, v, heading))
         return self.ground.to_lidar(u, v, heading)

@@ -7,10 +7,12 @@ import numpy as np
 
 from .barriers import bars, concrete_barrier, fence, guard_rail, high_wall, railing, wall
 from .builder import Builder, Stretch
-from .facades import building, garages, open_roof, scaffolding
-from .vegetation import hedge, tree, trees, wood
+from .facades import building, close_view, garages, open_roof, scaffolding
+from .vegetation import hedge, overgrow, tree, trees, wood
 
 Lining = Callable[[Builder, Stretch], None]
+OVERGROWN_SHARE = {"residential": 0.45, "urban": 0.25, "rural": 0.4, "campus": 0.35, "road": 0.4, "alley": 0.45}
+AVENUE_SHARE = {"residential": 0.2, "urban": 0.35, "rural": 0.15, "campus": 0.3, "road": 0.15, "alley": 0.0}
 
 
 def line_streets(builder: Builder) -> None:
@@ -26,8 +28,14 @@ def line_streets(builder: Builder) -> None:
             _line(builder, Stretch(beyond, 70.0 - beyond, side, across, cross=True))
             _line(builder, Stretch(-70.0, 70.0 - beyond, side, across, cross=True))
         _backdrop(builder, side, edge)
+        if builder.rng.random() < AVENUE_SHARE[builder.kind]:
+            _avenue(builder, side)
     if ground.left_edge_m > half:
         _part_carriageways(builder)
+    for way in (1.0, -1.0):
+        if builder.rng.random() < builder.config.closed_end_share:
+            end = float(builder.rng.uniform(18.0 if builder.kind == "campus" else 35.0, 85.0))
+            close_view(builder, way * end, half + pavement + 12.0)
 
 
 def _line(builder: Builder, whole: Stretch) -> None:
@@ -54,6 +62,8 @@ def _line(builder: Builder, whole: Stretch) -> None:
             away += max(setback + rng.normal(0, 0.7), 0.0)
         stretch = Stretch(start, length, whole.side, away, whole.cross)
         make(builder, stretch)
+        if make not in (wood, lawn, trees) and rng.random() < OVERGROWN_SHARE[kind]:
+            overgrow(builder, stretch)
         if make not in (building, wood, high_wall) and rng.random() < 0.95:
             behind = replace(stretch, away_m=away + rng.uniform(2.0, 10.0))
             (building if kind not in ("rural", "road") and rng.random() < 0.5 else wood)(builder, behind)
@@ -93,6 +103,16 @@ def _backdrop(builder: Builder, side: float, edge: float) -> None:
         start += length
         if rng.random() < 0.3:
             away = float(rng.uniform(14.0, 40.0))
+
+
+def _avenue(builder: Builder, side: float) -> None:
+    """Trees right behind the kerb, whose crowns begin above most lasers."""
+    rng, half = builder.rng, builder.ground.half_width_m
+    step, tall = float(rng.uniform(5.0, 14.0)), float(rng.uniform(2.2, 5.0))
+    across = side * (half + float(rng.uniform(0.4, max(0.8, 0.5 * builder.ground.pavement_m))))
+    for along in np.arange(-80.0, 80.0, step):
+        if rng.random() < 0.85 and not builder.near_junction(along, along):
+            tree(builder, float(along + rng.normal(0, 0.3)), float(across + rng.normal(0, 0.1)), tall_m=tall)
 
 
 def lawn(builder: Builder, stretch: Stretch) -> None:

@@ -57,7 +57,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
         ditch_m=rng.uniform(*config.ditch_m) if steep and rng.random() < 0.6 else 0.0,
         median_half_m=rng.uniform(0.4, 1.5) if median else 0.0,
         rough_m=rng.uniform(*config.grass_m),
-        camber=rng.uniform(0.0, 0.03),
+        camber=rng.uniform(0.0, 0.035),
         **_beside(config, rng, kind, half),
     )  # fmt: skip
     asphalt = float(np.clip(rng.normal(0.26, 0.06), 0.12, 0.45))

@@ -1,5 +1,7 @@
 """Trees, hedges, shrubs and woods: clusters of leaves with gaps between them, into which rays go."""
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -7,13 +9,14 @@ from .builder import Builder, Stretch
 
 Floats = npt.NDArray[np.float64]
 
-FINE_WITHIN_M, COARSER_PER_M = 15.0, 0.035  # far clusters are larger and fewer, as no ray tells the difference
+# Far clusters are larger and fewer, as no ray tells the difference.
+FINEST, FINE_WITHIN_M, COARSER_PER_M = 0.75, 8.0, 0.033
 
 
 def coarseness(builder: Builder, along: float, across: float, cross: bool) -> float:
-    """How many times larger clusters of leaves may be at a place than near the car."""
+    """How many times larger clusters of leaves may be at a place than some 17 m away."""
     x, y, _ = builder.to_lidar(along, across, cross)
-    return 1.0 + COARSER_PER_M * max(float(np.hypot(x, y)) - FINE_WITHIN_M, 0.0)
+    return FINEST + COARSER_PER_M * max(math.hypot(x, y) - FINE_WITHIN_M, 0.0)
 
 
 def hedge(builder: Builder, stretch: Stretch) -> None:
@@ -66,7 +69,7 @@ def wood(builder: Builder, stretch: Stretch) -> None:
         return
     coarse = coarseness(builder, stretch.middle_m, front, cross)
     # Far woods count only as far as they rise above what stands before them.
-    height = float(rng.uniform(2.6, 5.0)) + 1.2 * (coarse - 1.0)
+    height = float(rng.uniform(2.6, 5.0)) + 1.2 * max(coarse - 1.0, 0.0)
     density = float(np.exp(rng.uniform(np.log(1.5), np.log(6.0))))
     radius = 0.36 * coarse
     count = max(int(len(free) * 3.0 * height * 0.45 / radius**2), 3)
@@ -82,6 +85,37 @@ def wood(builder: Builder, stretch: Stretch) -> None:
     if rng.random() < 0.6:
         for place in stretch.along(float(rng.uniform(4.0, 9.0))):
             trunk(builder, place + rng.normal(0, 1.0), side * (stretch.away_m + rng.uniform(-1.0, 1.0)), 6.0, cross)
+
+
+def overgrow(builder: Builder, stretch: Stretch) -> None:
+    """Patches of ivy and shrubs before, on and behind what lines a stretch: few fences in KITTI stand bare."""
+    rng, side, cross = builder.rng, stretch.side, stretch.cross
+    radius = 0.26 * coarseness(builder, stretch.middle_m, side * stretch.away_m, cross)
+    for _ in range(1 + int(stretch.length_m / 8.0)):
+        middle, long = stretch.start_m + rng.uniform(0.0, stretch.length_m), rng.uniform(0.4, 3.0)
+        height, deep = rng.uniform(0.5, 3.0), rng.uniform(0.15, 0.7)
+        if not builder.claim(float(middle), side * (stretch.away_m - deep), 2 * long, deep, cross):
+            continue
+        count = max(int(2 * long * height * 0.5 / radius**2), 3)
+        # Thinner upward and to its ends.
+        along = middle + long * rng.normal(0.0, 0.5, count)
+        away = stretch.away_m - deep * np.abs(rng.normal(0.0, 0.5, count)) + rng.uniform(0.0, 0.4, count)
+        z = height * rng.random(count) ** 1.3
+        _clusters(builder, along, side * away, z, radius, float(rng.uniform(2.0, 8.0)), cross)
+
+
+def wood_across(builder: Builder, along: float, half_width: float) -> None:
+    """A wood's edge across the road's direction, where the view ends."""
+    rng = builder.rng
+    places = np.arange(-half_width, half_width, 3.0)
+    free = np.array([v for v in places if builder.claim(along, float(v), 1.8, 2.9)])
+    if not len(free):
+        return
+    radius = 0.4 * coarseness(builder, along, 0.0, cross=False)
+    count = max(int(len(free) * 3.0 * 5.0 * 0.45 / radius**2), 3)
+    across = rng.choice(free, count) + rng.uniform(-1.5, 1.5, count)
+    deep = along + np.sign(along) * np.abs(rng.normal(0.0, 0.8, count))
+    _clusters(builder, deep, across, rng.uniform(0.1, 5.0, count), radius, float(rng.uniform(1.5, 6.0)), cross=False)
 
 
 def _clusters(
