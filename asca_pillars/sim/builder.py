@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -12,6 +13,7 @@ from .primitives import Primitives, cuboids, ellipsoids, prisms
 
 Floats = npt.NDArray[np.float64]
 Material = tuple[float, float, float]  # reflectance, gloss, transparency
+HEAD_ROOM_M = 2.2  # leaves above may hang over objects
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,11 @@ class Builder:
         middle = self.ground.cross_u_m
         return self.ground.cross_half_m > 0 and start_m < middle + reach and end_m > middle - reach
 
+    def until_junction(self, start_m: float, length_m: float) -> float:
+        """As much of a piece of the main road's side as lies before the crossing road."""
+        first = self.ground.cross_u_m - self.ground.cross_half_m - self.ground.pavement_m - 1.0
+        return first - start_m if self.ground.cross_half_m > 0 and start_m < first < start_m + length_m else length_m
+
     def claim(self, along: float, across: float, length: float, width: float, cross: bool = False) -> bool:
         """Take a place aligned with the road; whether it was free."""
         x, y, yaw = self.to_lidar(along, across, cross)
@@ -85,33 +92,34 @@ class Builder:
 
     def post(
         self, along: float, across: float, z: float, height: float, radius: float, reflectance: float,
-        cross: bool = False, taper: float = 1.0,
+        cross: bool = False, taper: float = 1.0, lean: tuple[float, float] = (0.0, 0.0),
     ) -> None:  # fmt: skip
-        """A round post whose radius at the top is `taper` times that at the foot."""
+        """A round post whose radius at the top is `taper` times that at the foot, leaning by `lean` metres per metre
+        of height along x and y."""
         x, y, _ = self.to_lidar(along, across, cross)
-        self._posts.append((x, y, z, height, radius, taper * radius, reflectance))
+        self._posts.append((x, y, z, height, radius, taper * radius, reflectance, *lean))
 
-    def blob(
-        self, along: float, across: float, z: float, radii: tuple[float, float, float], reflectance: float,
-        density_per_m: float, cross: bool = False,
-    ) -> None:  # fmt: skip
-        """An ellipsoid around z above the ground: a cloud, or solid where the density is 0."""
-        x, y, yaw = self.to_lidar(along, across, cross)
-        self._blobs.append(np.array([[x, y, z, *radii, yaw, reflectance, density_per_m]]))
-
-    def foliage(
-        self, along: float, across: float, z: float, radius: float, blobs: int, density_per_m: float, cross: bool
+    def ball(
+        self, along: float, across: float, z: float, radii: tuple[float, float, float], reflectance: float
     ) -> None:
-        """Overlapping clouds of leaves: no two crowns alike, none a ball."""
-        rng = self.rng
-        x, y, _ = self.to_lidar(along, across, cross)
-        rows = np.empty((blobs, 9))
-        rows[:, :3] = rng.normal(0.0, 0.5, (blobs, 3)) * (radius, radius, 0.75 * radius) + (x, y, z)
-        rows[:, 3:6] = radius * rng.uniform(0.18, 0.75, (blobs, 3))
-        rows[:, 2] = np.maximum(rows[:, 2], 0.3 * rows[:, 5])
-        rows[:, 6] = rng.uniform(0.0, 3.1, blobs)
-        rows[:, 7] = rng.uniform(0.22, 0.55)
-        rows[:, 8] = density_per_m * np.exp(rng.normal(0.0, 0.6, blobs))
+        """A solid ellipsoid around z above the ground."""
+        x, y, yaw = self.to_lidar(along, across)
+        self._blobs.append(np.array([[x, y, z, *radii, yaw, reflectance, 0.0]]))
+
+    def clouds(
+        self, along: Floats, across: Floats, z: Floats, radii: Floats, reflectance: float, density_per_m: Floats,
+        cross: bool = False, turned: bool = True,
+    ) -> None:  # fmt: skip
+        """Leaves (N): ellipsoids of radii (N,3) around z above the ground, each turned at random or, for hedges,
+        along the road."""
+        rows = np.empty((len(along), 9))
+        rows[:, :2] = self.ground.places(along, across, cross)
+        rows[:, 2], rows[:, 3:6] = z, radii
+        if turned:
+            rows[:, 6] = self.rng.uniform(0.0, np.pi, len(along))
+        else:
+            rows[:, 6] = self.to_lidar(float(along[0]), float(across[0]), cross)[2]
+        rows[:, 7], rows[:, 8] = reflectance, density_per_m
         self._blobs.append(rows)
 
     def primitives(self) -> Primitives:
@@ -122,7 +130,8 @@ class Builder:
         if self._posts:
             parts.append(prisms(self._grounded(np.array(self._posts)), sides=6))
         if self._blobs:
-            rows = self._grounded(_without_intruders(np.concatenate(self._blobs), self._kept_clear))
+            rows = np.concatenate(self._blobs)
+            rows = self._grounded(rows[~_intrudes(rows, self._kept_clear)])
             cos, sin, zero = np.cos(rows[:, 6]), np.sin(rows[:, 6]), np.zeros(len(rows))
             axes = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]).transpose(2, 0, 1)
             surface = np.column_stack([rows[:, 7], zero + 0.3, rows[:, 8]])
@@ -134,12 +143,20 @@ class Builder:
         return rows
 
 
-def _without_intruders(blobs: Floats, footprints: Floats) -> Floats:
-    """Foliage without the clouds that would hang into the car (its sensor would see nothing else) or an object."""
-    dx, dy = (blobs[:, None, axis] - footprints[None, :, axis] for axis in (0, 1))
-    cos, sin = np.cos(footprints[:, 4]), np.sin(footprints[:, 4])
-    along = np.maximum(np.abs(dx * cos + dy * sin) - footprints[:, 2] / 2, 0.0)
-    across = np.maximum(np.abs(dy * cos - dx * sin) - footprints[:, 3] / 2, 0.0)
-    radius = blobs[:, 3:5].max(axis=1, keepdims=True)
-    low = (blobs[:, 2] - blobs[:, 5] < 2.2)[:, None]
-    return np.asarray(blobs[~((np.hypot(along, across) < radius) & low).any(axis=1)])
+@numba.njit(cache=True)
+def _intrudes(blobs: Floats, footprints: Floats) -> npt.NDArray[np.bool_]:
+    """Which clouds would hang into the car (its sensor would see nothing else) or an object."""
+    result = np.zeros(len(blobs), np.bool_)
+    for i in range(len(blobs)):
+        if blobs[i, 2] - blobs[i, 5] >= HEAD_ROOM_M:
+            continue
+        radius = max(blobs[i, 3], blobs[i, 4])
+        for j in range(len(footprints)):
+            dx, dy = blobs[i, 0] - footprints[j, 0], blobs[i, 1] - footprints[j, 1]
+            cos, sin = np.cos(footprints[j, 4]), np.sin(footprints[j, 4])
+            along = max(abs(dx * cos + dy * sin) - footprints[j, 2] / 2, 0.0)
+            across = max(abs(dy * cos - dx * sin) - footprints[j, 3] / 2, 0.0)
+            if along * along + across * across < radius * radius:
+                result[i] = True
+                break
+    return result

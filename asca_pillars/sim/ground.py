@@ -4,7 +4,9 @@ Road coordinates: u along the main road, v to its left, v = 0 at its middle, in 
 against the LiDAR frame, in which the car stands at the origin.
 """
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from . import groundcast
 from .groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M
 
 Floats = npt.NDArray[np.float64]
+LEVEL_WITHIN_M = 28.0
 
 
 @dataclass(frozen=True)
@@ -21,9 +24,9 @@ class Ground:
     """The surface under one scene.
 
     Attributes:
-        shape: (20,) numbers of the street, as `street` writes them.
+        shape: (28,) numbers of the street, as `street` writes them.
         relief: (R,R) heights in metres on a square lattice of RELIEF_STEP_M around the car, x by rows.
-        reflectance: (5,) of asphalt, pavement, verge, marking, rail.
+        reflectance: (6,) of asphalt, pavement, verge, marking, rail, ballast.
         z_m: height of the ground under the car in the LiDAR frame.
     """
 
@@ -34,20 +37,20 @@ class Ground:
 
     @property
     def half_width_m(self) -> float:
-        return float(self.shape[groundcast.HALF_WIDTH])
+        return self._numbers[groundcast.HALF_WIDTH]
 
     @property
     def pavement_m(self) -> float:
-        return float(self.shape[groundcast.WALK])
+        return self._numbers[groundcast.WALK]
 
     @property
     def cross_u_m(self) -> float:
-        return float(self.shape[groundcast.CROSS_U])
+        return self._numbers[groundcast.CROSS_U]
 
     @property
     def cross_half_m(self) -> float:
         """Half the width of the crossing road; 0 where there is none."""
-        return float(self.shape[groundcast.CROSS_HALF])
+        return self._numbers[groundcast.CROSS_HALF]
 
     @property
     def rails_v_m(self) -> float | None:
@@ -55,22 +58,43 @@ class Ground:
         v = float(self.shape[groundcast.RAILS_V])
         return v if v > NO_RAILS else None
 
+    @property
+    def left_edge_m(self) -> float:
+        """Where the left side's pavement begins: behind the second carriageway, if there is one, and the tracks."""
+        second = float(self.shape[groundcast.SECOND_V] + self.shape[groundcast.SECOND_HALF])
+        bed = float(self.shape[groundcast.RAILS_V] + self.shape[groundcast.BED_HALF])
+        return max(self.half_width_m, second, bed)
+
+    @cached_property
+    def _numbers(self) -> list[float]:
+        """The shape as plain numbers: places are asked for one by one, thousands per scene."""
+        return [float(number) for number in self.shape]
+
     def to_lidar(self, u_m: float, v_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
         """Road coordinates and a heading against the road -> x, y, heading in the LiDAR frame."""
-        yaw, bend = self.shape[groundcast.YAW], self.shape[groundcast.BEND]
-        across = v_m + self.shape[groundcast.OFFSET] + 0.5 * bend * u_m * u_m
-        x = u_m * np.cos(yaw) - across * np.sin(yaw)
-        y = u_m * np.sin(yaw) + across * np.cos(yaw)
-        return float(x), float(y), float(yaw + np.arctan(bend * u_m) + yaw_rad)
+        numbers = self._numbers
+        cos, sin, bend = numbers[groundcast.COS_YAW], numbers[groundcast.SIN_YAW], numbers[groundcast.BEND]
+        across = v_m + numbers[groundcast.OFFSET] + 0.5 * bend * u_m * u_m
+        yaw = numbers[groundcast.YAW] + math.atan(bend * u_m) + yaw_rad
+        return float(u_m * cos - across * sin), float(u_m * sin + across * cos), float(yaw)
 
     def cross_to_lidar(self, along_m: float, across_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
         """The same for the crossing road: along it to the left of the main road, across it ahead."""
-        tilt = self.shape[groundcast.CROSS_TILT]
-        u = self.shape[groundcast.CROSS_U] + across_m * np.cos(tilt) - along_m * np.sin(tilt)
-        v = along_m * np.cos(tilt) + across_m * np.sin(tilt)
-        x, y, _ = self.to_lidar(u, v)
-        yaw = self.shape[groundcast.YAW] + tilt + np.pi / 2 + yaw_rad
-        return x, y, float(yaw)
+        numbers = self._numbers
+        cos, sin = numbers[groundcast.COS_TILT], numbers[groundcast.SIN_TILT]
+        u = numbers[groundcast.CROSS_U] + across_m * cos - along_m * sin
+        x, y, _ = self.to_lidar(u, along_m * cos + across_m * sin)
+        return x, y, float(numbers[groundcast.YAW] + numbers[groundcast.CROSS_TILT] + math.pi / 2 + yaw_rad)
+
+    def places(self, along_m: Floats, across_m: Floats, cross: bool = False) -> Floats:
+        """Places (N,) beside the main or the crossing road -> (N,2) x and y in the LiDAR frame."""
+        u, v = along_m, across_m
+        if cross:
+            cos, sin = self.shape[groundcast.COS_TILT], self.shape[groundcast.SIN_TILT]
+            u, v = self.shape[groundcast.CROSS_U] + across_m * cos - along_m * sin, along_m * cos + across_m * sin
+        cos, sin = self.shape[groundcast.COS_YAW], self.shape[groundcast.SIN_YAW]
+        v = v + self.shape[groundcast.OFFSET] + 0.5 * self.shape[groundcast.BEND] * u * u
+        return np.stack([u * cos - v * sin, u * sin + v * cos], axis=-1)
 
     def heights(self, xy: npt.ArrayLike) -> Floats:
         """Height (N,) of the ground at (N,2) in the LiDAR frame, metres."""
@@ -84,25 +108,42 @@ def street(**numbers: float) -> Floats:
     order = (
         *("yaw_rad", "bend_per_m", "offset_m", "half_width_m", "cross_u_m", "cross_half_m", "cross_tilt_rad"),
         *("kerb_m", "pavement_m", "lane_m", "bank_left", "bank_right", "rails_v_m", "median_half_m", "rough_m"),
-        "camber",
+        *("camber", "tracks", "rail_m", "bed_m", "bed_half_m", "second_v_m", "second_half_m", "ditch_m"),
     )
     unknown = set(numbers) - set(order)
     if unknown:
         raise TypeError(f"a street has no {sorted(unknown)}")
     yaw, tilt = numbers.get("yaw_rad", 0.0), numbers.get("cross_tilt_rad", 0.0)
-    derived = [np.cos(yaw), np.sin(yaw), np.cos(tilt), np.sin(tilt)]
+    bank = max(numbers.get("bank_left", 0.0), numbers.get("bank_right", 0.0), 0.0)
+    edges = sum(numbers.get(name, 0.0) for name in ("kerb_m", "rail_m", "bed_m"))
+    rise = bank * groundcast.BANK_RUN_M + edges + 4.0 * numbers.get("camber", 0.0) + 0.05
+    derived = [np.cos(yaw), np.sin(yaw), np.cos(tilt), np.sin(tilt), rise]
     return np.array([numbers.get(name, 0.0) for name in order] + derived)
 
 
-def draw_relief(rng: np.random.Generator, slope: tuple[float, float], amplitude_m: float) -> Floats:
-    """Hills: a plane of `slope` (x, y) and a few long waves, flat under the car. Metres, (R,R)."""
+def draw_relief(
+    rng: np.random.Generator,
+    slope: tuple[float, float],
+    amplitude_m: float,
+    shape: Floats | None = None,
+    bump_m: float = 0.0,
+) -> Floats:
+    """Hills: a plane of `slope` (x, y), long waves that are level under the car, and bumps of standard deviation
+    `bump_m` beyond the pavements of the street `shape`. Metres, (R,R)."""
     axis = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
     x, y = np.meshgrid(axis, axis, indexing="ij")
     height: Any = slope[0] * x + slope[1] * y
-    for wavelength in (120.0, 70.0, 35.0, 18.0):
-        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+    # Roads are laid out level where one drives: hills begin some way off, with their crests or troughs at the car.
+    begun = 1.0 - np.exp(-(x**2 + y**2) / LEVEL_WITHIN_M**2)
+    for wavelength in (160.0, 90.0, 45.0):
+        angle = rng.uniform(0, 2 * np.pi)
         size = amplitude_m * wavelength / 120.0 * rng.normal(0.0, 0.6)
-        wave = np.sin((x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / wavelength + phase)
-        height = height + size * (wave - np.sin(phase))
+        along = (x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / wavelength
+        height = height + size * begun * (np.cos(along) - 1.0)
+    if shape is not None:
+        outside = groundcast.outside_roads(np.stack([x.ravel(), y.ravel()], axis=-1), shape).reshape(x.shape)
+        # A lattice point shapes the cells around it: none of these may reach a carriageway.
+        share = np.clip((outside - shape[groundcast.WALK] - 1.5 * RELIEF_STEP_M) / 4.0, 0.0, 1.0)
+        height = height + share * rng.normal(0.0, bump_m, x.shape)
     near = len(axis) // 2
     return np.asarray(height - height[near, near])

@@ -7,16 +7,22 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 
 GROUND = -2  # owner of what the ground returns
-BANKS_M = 1.5  # how far kerbs and banks may rise above the hills
+BANK_RUN_M = 6.0  # a bank rises over this way and is level beyond
+DITCH_HALF_M = 1.0
+TRACK_SPACING_HALF_M, GAUGE_HALF_M, RAIL_HALF_M = 1.7, 0.75, 0.06
 RELIEF_STEP_M = 4.0
 RELIEF_HALF_M = 96.0
 NO_RAILS = -1000.0
-ASPHALT, PAVEMENT, VERGE, MARKING, RAIL = range(5)
+GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
+CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
+ASPHALT, PAVEMENT, VERGE, MARKING, RAIL, BALLAST = range(6)
 
 # Positions of the fields of Ground.shape: what numba reads has no names.
 YAW, BEND, OFFSET, HALF_WIDTH, CROSS_U, CROSS_HALF, CROSS_TILT, KERB, WALK, LANE = range(10)
 BANK_LEFT, BANK_RIGHT, RAILS_V, MEDIAN_HALF, ROUGH, CAMBER = range(10, 16)
-COS_YAW, SIN_YAW, COS_TILT, SIN_TILT = range(16, 20)  # derived, because heights are asked for by the million
+TRACKS, RAIL_RISE, BED, BED_HALF, SECOND_V, SECOND_HALF, DITCH = range(16, 23)
+# Derived, because heights are asked for by the million; RISE is how far all that may stand above the hills.
+COS_YAW, SIN_YAW, COS_TILT, SIN_TILT, RISE = range(23, 28)
 
 
 @numba.njit(cache=True)
@@ -30,15 +36,35 @@ def heights(points: Floats, shape: Floats, relief: Floats, z_m: float) -> Floats
 
 @numba.njit(cache=True, inline="always")
 def road_distances(x: float, y: float, shape: Floats) -> tuple[float, float, float, float, float]:
-    """Road coordinates u, v, then how far outside the main road, the crossing road and either (negative inside)."""
+    """Road coordinates u, v, then how far outside the main road (either carriageway), the crossing road and both
+    (negative inside)."""
     cos, sin = shape[COS_YAW], shape[SIN_YAW]
     u = x * cos + y * sin
     v = y * cos - x * sin - shape[OFFSET] - 0.5 * shape[BEND] * u * u
     main = abs(v) - shape[HALF_WIDTH]
+    if shape[SECOND_HALF] > 0.0:
+        main = min(main, abs(v - shape[SECOND_V]) - shape[SECOND_HALF])
     cross = 1e3
     if shape[CROSS_HALF] > 0.0:
         cross = abs((u - shape[CROSS_U]) * shape[COS_TILT] + v * shape[SIN_TILT]) - shape[CROSS_HALF]
     return u, v, main, cross, min(main, cross)
+
+
+@numba.njit(cache=True)
+def outside_roads(points: Floats, shape: Floats) -> Floats:
+    """How far each of (N,2) points lies outside all roads (negative inside), metres."""
+    result = np.empty(len(points))
+    for i in range(len(points)):
+        _, _, _, _, result[i] = road_distances(points[i, 0], points[i, 1], shape)
+    return result
+
+
+@numba.njit(cache=True, inline="always")
+def on_rail(from_middle: float, tracks: float) -> bool:
+    """Whether a place that far from the middle of one track or of two lies on a rail."""
+    if tracks > 1.0:
+        from_middle = abs(from_middle - TRACK_SPACING_HALF_M)
+    return abs(from_middle - GAUGE_HALF_M) < RAIL_HALF_M
 
 
 @numba.njit(cache=True)
@@ -56,14 +82,21 @@ def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float)
         height += shape[CAMBER] * min(-main, 4.0) if main < 0 else 0.0
         if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF] and cross > 3.0:
             height += shape[KERB]
-        rails = abs(abs(v - shape[RAILS_V]) - 0.75)
-        if shape[RAILS_V] > NO_RAILS and rails < 0.06:
-            height += 0.03
     else:
         height += shape[KERB] * min(outside / 0.05, 1.0)
         beyond = outside - shape[WALK]
         if beyond > 0.0 and cross > 2.0:
-            height += (shape[BANK_LEFT] if v > 0 else shape[BANK_RIGHT]) * min(beyond, 8.0)
+            away = min((cross - 2.0) / 6.0, 1.0)  # banks and ditches end at a crossing, not as a cliff
+            if shape[DITCH] > 0.0:
+                height -= away * shape[DITCH] * max(1.0 - abs(beyond / DITCH_HALF_M - 1.0), 0.0)
+                beyond = max(beyond - 2.0 * DITCH_HALF_M, 0.0)
+            height += away * (shape[BANK_LEFT] if v > 0 else shape[BANK_RIGHT]) * min(beyond, BANK_RUN_M)
+    if shape[RAILS_V] > NO_RAILS:
+        from_middle = abs(v - shape[RAILS_V])
+        if from_middle < shape[BED_HALF] and cross > 1.0:
+            height += shape[BED] * min((shape[BED_HALF] - from_middle) / 0.25, 1.0)
+        if on_rail(from_middle, shape[TRACKS]):
+            height += shape[RAIL_RISE]
     return z_m + height
 
 
@@ -71,12 +104,16 @@ def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float)
 def ground_material(x: float, y: float, shape: Floats) -> int:
     """Material of the ground at (x, y)."""
     u, v, main, cross, outside = road_distances(x, y, shape)
+    if shape[RAILS_V] > NO_RAILS:
+        from_middle = abs(v - shape[RAILS_V])
+        if on_rail(from_middle, shape[TRACKS]):
+            return RAIL
+        if from_middle < shape[BED_HALF] and cross > 1.0:
+            return BALLAST
     if outside > 0.0:
         return VERGE if outside > shape[WALK] else PAVEMENT
     if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF]:
         return VERGE
-    if shape[RAILS_V] > NO_RAILS and abs(abs(v - shape[RAILS_V]) - 0.75) < 0.06:
-        return RAIL
     lane = shape[LANE]
     if lane > 0.0 and main < 0.0 and cross > 0.0:
         to_line = abs(v / lane - np.round(v / lane)) * lane
@@ -110,29 +147,47 @@ def cast_ground(shape, relief, materials, z_m, sensor, buffers, grass):  # type:
     rho, cosine, reflectance, owner, _, _ = buffers
     highest = highest_within(relief)
     rough = shape[ROUGH]
+    group = max(int(GROUP_DEG / 360.0 * len(cos_az)), 1)
     for k in range(len(slope)):
         cos_p, sin_p = np.cos(phase[k]), np.sin(phase[k])
         stretch = np.sqrt(1.0 + slope[k] ** 2)
         start, ring = 1.5, 0
-        while ring + 1 < len(highest) and origin_z[k] + slope[k] * start > z_m + highest[ring] + BANKS_M:
+        while ring + 1 < len(highest) and origin_z[k] + slope[k] * start > z_m + highest[ring] + shape[RISE]:
             # Up to the far edge of this ring of cells the ray stays above everything.
-            meet = (z_m + highest[ring] + BANKS_M - origin_z[k]) / slope[k] if slope[k] < 0.0 else 1e9
+            meet = (z_m + highest[ring] + shape[RISE] - origin_z[k]) / slope[k] if slope[k] < 0.0 else 1e9
             start = max(start, min(meet, (ring + 1) * RELIEF_STEP_M))
             if meet <= (ring + 1) * RELIEF_STEP_M:
                 break
             ring += 1
+        # A neighboring ray of this ring was high above everything up to `clear`; this one starts there. Neighbors
+        # come in small groups, so that a ray does not depend on whether those far from it are cast.
+        clear = start
         for j in range(len(cos_az)):
             if not cast_columns[j]:
                 continue
+            if j % group == 0 or not cast_columns[j - 1]:
+                clear = start
             dx = cos_az[j] * cos_p - sin_az[j] * sin_p
             dy = sin_az[j] * cos_p + cos_az[j] * sin_p
             limit = min(rho[k, j], 85.0)
-            near, reach, above = start, start, 0.0
+            near, reach, above = clear, clear, 0.0
             gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
+            if gap < CLEAR_M:
+                near, reach = start, start
+                gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
+            clear, descending = start, max(-slope[k], 0.0)
+            far_above = descending > 0.03  # flatter rays graze crests that a neighbor may just have missed
             while gap > 0.0 and reach < limit:
                 near, above = reach, gap
+                far_above &= gap >= CLEAR_M
+                if far_above:
+                    clear = reach
                 # Ground steeper than this is a kerb or a bank, which is wider than the step that passes its foot.
-                reach = near + max(gap / (0.22 + max(-slope[k], 0.0)), 0.04 + 0.006 * near)
+                # On flat ground half of the way down is quicker; kerbs are lower than what is left above them then.
+                step = max(gap / (0.22 + descending), 0.04 + 0.006 * near)
+                if descending > 0.0:
+                    step = max(step, min(0.5 * gap / descending, 3.0))
+                reach = near + step
                 gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
             if gap > 0.0:
                 continue

@@ -109,9 +109,11 @@ def cuboids(rows: npt.ArrayLike) -> Primitives:
 
 
 def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
-    """Upright round posts: rows (N,7) of x, y, bottom z, height, radius at the foot, radius at the top,
-    reflectance. 2 * `sides` triangles each, open at both ends (a lid is thinner than a laser's footprint)."""
-    rows = np.asarray(rows, float).reshape(-1, 7)
+    """Round posts: rows (N,9) of x, y, bottom z, height, radius at the foot, radius at the top, reflectance, and how
+    far the top leans along x and y per metre of height; these two may be left out (N,7). 2 * `sides` triangles each,
+    open at both ends (a lid is thinner than a laser's footprint)."""
+    rows = np.atleast_2d(np.asarray(rows, float))
+    lean = rows[:, 7:9] if rows.shape[1] == 9 else np.zeros((len(rows), 2))
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     foot = np.concatenate(
@@ -120,7 +122,7 @@ def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
     )
     top = np.concatenate(
         [
-            rows[:, None, :2] + ring * rows[:, 5, None, None],
+            (rows[:, :2] + lean * rows[:, 3, None])[:, None] + ring * rows[:, 5, None, None],
             np.broadcast_to((rows[:, 2] + rows[:, 3])[:, None, None], (len(rows), sides, 1)),
         ],
         axis=-1,

@@ -10,17 +10,15 @@ from asca_pillars.data.kitti import Calibration
 from .builder import Builder
 from .clutter import scatter
 from .config import SceneConfig
-from .ground import Ground, draw_relief, street
-from .groundcast import NO_RAILS
+from .ground import Ground
 from .placement import Occupied, Placer, Target
 from .primitives import BACKGROUND, Primitives
 from .raycast import Bodies
 from .roadside import line_streets
-from .shapes import people, vehicles
+from .shapes import heavy, people, styles, vehicles
+from .streets import draw_ground, draw_kind
 
 EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 2.6
-KINDS = ("residential", "urban", "rural", "campus")
-HALF_WIDTH_M = {"residential": (2.7, 4.3), "urban": (3.6, 8.0), "rural": (3.2, 8.0), "campus": (2.5, 6.0)}
 # Of cars, of people on foot and of cyclists.
 RATE_FACTORS = {
     "residential": (1.15, 0.75, 0.9),
@@ -28,7 +26,7 @@ RATE_FACTORS = {
     "rural": (0.7, 0.25, 0.7),
     "campus": (0.8, 1.9, 1.4),
 }
-PAVEMENT_M = {"residential": (1.0, 3.0), "urban": (2.0, 5.0), "rural": (0.3, 2.0), "campus": (1.0, 5.0)}
+HABITS_OF = {"road": "rural", "alley": "residential"}  # whose habits of traffic a kind of street shares
 
 
 @dataclass(frozen=True)
@@ -43,18 +41,22 @@ class Scene:
 
 def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
     """A random street with everything on it."""
-    shares = np.array([config.residential, config.urban, config.rural, config.campus])
-    kind = KINDS[int(rng.choice(4, p=shares / shares.sum()))]
-    ground = _draw_ground(config, rng, kind)
+    kind = draw_kind(config, rng)
+    habits = HABITS_OF.get(kind, kind)
+    ground = draw_ground(config, rng, kind)
     occupied = Occupied()
     occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
-    placer = Placer(rng, config, ground, occupied, kind)
+    placer = Placer(rng, config, ground, occupied, habits)
     if rng.random() >= config.empty_share:
-        for name, rate in _rates(config, kind):
+        for name, rate in _rates(config, habits):
+            crowds = name in ("Pedestrian", "Person_sitting", "Cyclist")
+            dispersion = config.people_dispersion if crowds else config.dispersion
             for ahead in (True, False):
                 # A gamma-distributed rate makes the counts negative binomial.
-                for _ in range(rng.poisson(rate * rng.gamma(config.dispersion) / config.dispersion)):
+                for _ in range(rng.poisson(rate * rng.gamma(dispersion) / dispersion)):
                     placer.place(name, ahead)
+        for _ in range(rng.poisson(config.beyond)):
+            placer.place_beyond()
     builder = Builder(rng, config, ground, occupied, kind)
     line_streets(builder)
     scatter(builder)
@@ -74,50 +76,6 @@ def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
         ("Pedestrian", config.pedestrians * walkers),
         ("Person_sitting", config.sitting * walkers),
     )
-
-
-def _draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Ground:
-    half = float(rng.uniform(*HALF_WIDTH_M[kind]))
-    lanes = max(int(half // 3.1), 1)
-    width = half / lanes
-    # The car keeps to a right-hand lane; the road's middle is then to its left.
-    offset = (int(rng.integers(lanes)) + 0.5) * width + rng.normal(0.0, 0.25)
-    junction = rng.random() < config.junction_share
-    kerb = 0.0 if rng.random() < 0.12 else float(rng.uniform(0.03, 0.17))
-    rails = rng.random() < config.rails_share
-    median = half > 6.0 and rng.random() < config.median_share
-    turning = rng.random() < config.turning_share
-    numbers = street(
-        yaw_rad=rng.normal(0.0, config.heading_error_sigma_rad) + (rng.uniform(-0.5, 0.5) if turning else 0.0),
-        bend_per_m=rng.normal(0.0, config.bend_sigma_per_m),
-        offset_m=offset,
-        half_width_m=half,
-        cross_u_m=rng.uniform(-30.0, 55.0),
-        cross_half_m=rng.uniform(2.5, 6.0) if junction else 0.0,
-        cross_tilt_rad=rng.normal(0.0, 0.12),
-        kerb_m=kerb,
-        pavement_m=rng.uniform(*PAVEMENT_M[kind]),
-        lane_m=width if kind in ("urban", "rural") and rng.random() < 0.8 else 0.0,
-        bank_left=_bank(config, rng, kind),
-        bank_right=_bank(config, rng, kind),
-        rails_v_m=rng.uniform(-0.3, 0.9) * half if rails else NO_RAILS,
-        median_half_m=rng.uniform(0.4, 1.5) if median else 0.0,
-        rough_m=rng.uniform(*config.grass_m),
-        camber=rng.uniform(0.0, 0.02),
-    )  # fmt: skip
-    asphalt = float(np.clip(rng.normal(0.26, 0.06), 0.12, 0.45))
-    reflectance = np.array(
-        [asphalt, asphalt * rng.uniform(0.85, 1.25), rng.uniform(0.22, 0.42), asphalt * rng.uniform(1.2, 1.9), 0.15]
-    )
-    slope = (rng.normal(*config.slope_x), rng.normal(*config.slope_y))
-    relief = draw_relief(rng, slope, rng.uniform(*config.relief_m))
-    return Ground(numbers, relief, reflectance, -float(rng.uniform(*config.sensor_height_m)))
-
-
-def _bank(config: SceneConfig, rng: np.random.Generator, kind: str) -> float:
-    """Slope of the ground beyond the pavement: mostly slight, steep beside some country roads."""
-    slope = float(rng.uniform(*config.bank_slope))
-    return slope if rng.random() < (0.5 if kind == "rural" else 0.1) else 0.15 * slope
 
 
 def draw_calibration(rng: np.random.Generator) -> Calibration:
@@ -149,28 +107,27 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     """The body of an object, placed: a little smaller than its label box, as KITTI's labels are loose."""
     x, y, z, length, width, height, yaw = target.box
     name = target.type
-    if name == "Car":
-        styles = vehicles.CAR_STYLES if height < 1.68 else ((vehicles.SUV, 0.45), (vehicles.MINIVAN, 0.55))
-        weights = np.array([weight for _, weight in styles])
-        profile = styles[int(rng.choice(len(styles), p=weights / weights.sum()))][0]
-        body = vehicles.car_body(rng, length - 0.08, width - 0.06, height - 0.07, profile, config.dark_paint_share)
-    elif name == "Van":
-        profile = vehicles.MINIVAN if height < 2.0 and rng.random() < 0.7 else vehicles.VAN
-        body = vehicles.car_body(rng, length - 0.08, width - 0.08, height - 0.08, profile, 0.2)
+    if name in ("Car", "Van"):
+        # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
+        slack = rng.uniform((0.0, 0.0, -0.03), (0.16, 0.10, 0.09))
+        profile = styles.draw_style(rng, length, height, van=name == "Van")
+        dark = config.dark_paint_share if name == "Car" else 0.2
+        body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
     elif name == "Truck":
         bus = rng.random() < 0.15
-        body = (vehicles.bus_body if bus else vehicles.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
+        body = (heavy.bus_body if bus else heavy.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
     elif name == "Tram":
-        body = vehicles.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
+        body = heavy.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
     elif name == "Misc":
-        body = vehicles.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
+        body = heavy.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
     elif name == "Pedestrian":
         body = people.pedestrian_body(rng, height - 0.05, width, length)
     elif name == "Person_sitting":
         body = people.sitting_body(rng, height - 0.05)
     else:
         body = people.cyclist_body(rng, height - 0.08, width, length - 0.04)
-    return body.placed(x, y, z - height / 2, yaw)
+    dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
+    return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 
 
 def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: float) -> Bodies:

@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from ..primitives import Primitives, Surface, ellipsoids, limbs, quads
+from ..primitives import Primitives, Surface, cuboids, ellipsoids, limbs, quads
 
 Floats = npt.NDArray[np.float64]
 
@@ -28,54 +28,103 @@ def _jointed(rows: list[Limb]) -> Primitives:
 def pedestrian_body(rng: np.random.Generator, height: float, width: float, length: float) -> Primitives:
     """A standing or walking person. `width` bounds the shoulders and arms, `length` the step and the swing."""
     h = height
-    shoulder = np.clip(0.36 * width + 0.02, 0.14, 0.24)
-    stride = np.clip(length / 2 - 0.12, 0.02, 0.5) * (1.0 if rng.random() < 0.85 else 0.2)
-    phase = rng.choice([-1.0, 1.0])
-    lean = rng.normal(0.02, 0.03) * h
-    hip, chest, neck = 0.52 * h, 0.80 * h, 0.86 * h
+    shoulder = float(np.clip(0.36 * width + 0.02, 0.14, 0.24)) * min(h / 1.6, 1.0)
+    lean = float(rng.normal(0.02, 0.03)) * h
     upper, lower, shoe = _cloth(rng, 3)
     skin = np.array([rng.uniform(0.3, 0.55), 0.2, 0.0])
-    thick = rng.uniform(0.85, 1.2)
+    thick = float(rng.uniform(0.9, 1.3))
+    # A box covers all the poses of a walk: in a single scan the feet are somewhere between together and far apart.
+    stride = float(np.clip(length / 2 - 0.12, 0.02, 0.5)) * (1.0 if rng.random() < 0.88 else 0.2)
+    phase = float(rng.uniform(0.0, 2 * np.pi))
     rows: list[Limb] = [
-        ((0, 0, hip), (lean, 0, chest), shoulder * 0.86, 0.115 * thick, upper),
-        ((lean * 0.8, 0, 0.70 * h), (lean, 0, 0.84 * h), shoulder, 0.10 * thick, upper),
-        ((0, 0, hip - 0.06 * h), (0, 0, hip + 0.04 * h), 0.16 * thick, 0.12 * thick, lower),
-        ((lean, 0, 0.82 * h), (lean + 0.01, 0, neck), 0.055, 0.06, skin),
+        ((0, 0, 0.52 * h), (lean, 0, 0.80 * h), shoulder * 0.88, 0.118 * thick, upper),
+        ((lean * 0.8, 0, 0.70 * h), (lean, 0, 0.84 * h), shoulder, 0.105 * thick, upper),
+        ((0, 0, 0.46 * h), (0, 0, 0.56 * h), 0.16 * thick, 0.125 * thick, lower),
+        ((lean, 0, 0.82 * h), (lean + 0.01, 0, 0.86 * h), 0.055, 0.06, skin),
     ]
     for side in (1.0, -1.0):
-        forward = stride * phase * side
-        knee = (0.55 * forward + 0.06 * (forward > 0) + 0.02, side * 0.10, 0.28 * h + 0.02 * (forward > 0))
-        foot = (forward, side * 0.09, 0.05)
-        swing = -0.75 * forward + rng.normal(0.0, 0.04)
-        bent = rng.uniform(0.0, 0.22) if rng.random() < 0.7 else rng.uniform(0.2, 0.35)
-        top = (lean, side * (shoulder + 0.02), 0.81 * h)
-        elbow = (lean + 0.45 * swing - 0.02, side * (shoulder + 0.05), 0.63 * h)
-        inward = 0.4 * bent * (bent > 0.2)
-        hand = (elbow[0] + 0.4 * swing + bent, side * (shoulder + 0.03 - inward), 0.50 * h + 0.5 * bent)
-        rows += [
-            ((0, side * 0.09, hip), knee, 0.075 * thick, 0.085 * thick, lower),
-            (knee, foot, 0.055 * thick, 0.06 * thick, lower),
-            ((forward - 0.07, side * 0.09, 0.04), (forward + 0.15, side * 0.10, 0.035), 0.045, 0.04, shoe),
-            (top, elbow, 0.048 * thick, 0.05 * thick, upper),
-            (elbow, hand, 0.036 * thick, 0.038 * thick, upper if rng.random() < 0.7 else skin),
-        ]
-    parts = [_jointed(rows)]
-    parts.append(ellipsoids([(lean + 0.02, 0, 0.935 * h)], [(0.098, 0.078, 0.066 * h)], np.array([[*skin[:2], 0.0]])))
-    if rng.random() < 0.3:  # a skirt or a coat
-        parts.append(
-            ellipsoids([(0, 0, 0.45 * h)], [(0.14 + 0.3 * stride, 0.19, rng.uniform(0.16, 0.26) * h)], lower[None])
-        )
-    burden = rng.random()
-    if burden < 0.22:  # a rucksack
-        parts.append(ellipsoids([(lean - 0.2, 0, 0.70 * h)], [(0.11, 0.15, 0.14 * h)], _cloth(rng, 1)))
-    elif burden < 0.42:  # a bag in one hand
-        side = rng.choice([-1.0, 1.0])
-        parts.append(
-            ellipsoids(
-                [(rng.normal(0, 0.05), side * (shoulder + 0.06), 0.36 * h)], [(0.16, 0.07, 0.13)], _cloth(rng, 1)
-            )
-        )
+        rows += _leg(h, side, stride, phase, thick, (lower, shoe))
+        rows += _arm(rng, h, side, -0.75 * stride * np.sin(phase) * side, (lean, shoulder), (upper, skin))
+    size = 0.066 if h > 1.4 else 0.076  # children have larger heads
+    head = [(lean + 0.02, 0, (1.0 - size) * h), (lean - 0.005, 0, (1.0 - 0.92 * size) * h)]
+    hair = _cloth(rng, 1)[0] * (0.6, 1.0, 1.0)
+    parts = [
+        _jointed(rows),
+        ellipsoids(head, [(0.098, 0.078, size * h), (0.10, 0.085, 0.88 * size * h)], np.stack([skin, hair])),
+    ]
+    dress = rng.random()
+    if dress < 0.2:  # a skirt
+        skirt = (0.14 + 0.3 * stride, 0.19, rng.uniform(0.16, 0.26) * h)
+        parts.append(ellipsoids([(0, 0, 0.45 * h)], [skirt], lower[None]))
+    elif dress < 0.45:  # a coat
+        coat = (0.15 * thick + 0.1 * stride, 0.95 * shoulder + 0.03, rng.uniform(0.24, 0.32) * h)
+        parts.append(ellipsoids([(0.3 * lean, 0, 0.58 * h)], [coat], upper[None]))
+    parts.append(_burden(rng, h, lean, shoulder))
     return Primitives.join(parts)
+
+
+def _leg(h: float, side: float, stride: float, phase: float, thick: float, cloth: tuple[Floats, Floats]) -> list[Limb]:
+    """Thigh, shin and shoe of a walker; the leg that swings forward is bent and off the ground."""
+    lower, shoe = cloth
+    forward = stride * np.sin(phase) * side
+    lift = 0.5 * min(stride, 0.3) * max(np.cos(phase) * side, 0.0)
+    foot = (forward - 0.3 * lift, side * 0.09, 0.05 + lift)
+    knee = (0.52 * forward + 0.03 + 0.06 * (forward > 0) + 0.6 * lift, side * 0.10, 0.28 * h + 0.35 * lift)
+    heel = 0.10 * max(-forward - 0.1, 0.0)
+    return [
+        ((0, side * 0.09, 0.52 * h), knee, 0.078 * thick, 0.088 * thick, lower),
+        (knee, foot, 0.056 * thick, 0.062 * thick, lower),
+        ((foot[0] - 0.07, foot[1], foot[2] - 0.01 + heel), (foot[0] + 0.15, side * 0.10, foot[2] - 0.015),
+         0.045, 0.04, shoe),
+    ]  # fmt: skip
+
+
+def _arm(
+    rng: np.random.Generator,
+    h: float,
+    side: float,
+    swing: float,
+    trunk: tuple[float, float],
+    cloth: tuple[Floats, Floats],
+) -> list[Limb]:
+    """Upper arm and forearm: hanging and swinging, or bent to hold, point or telephone. `trunk`: lean, shoulder."""
+    lean, shoulder = trunk
+    upper, skin = cloth
+    swing += float(rng.normal(0.0, 0.04))
+    habit = rng.random()
+    bent = rng.uniform(0.0, 0.22) if habit < 0.7 else rng.uniform(0.2, 0.35)
+    elbow = (lean + 0.45 * swing - 0.02, side * (shoulder + 0.05), 0.63 * h)
+    inward = 0.4 * bent * (bent > 0.2)
+    hand = (elbow[0] + 0.4 * swing + bent, side * (shoulder + 0.03 - inward), 0.50 * h + 0.5 * bent)
+    if habit > 0.95:  # at the ear
+        hand = (lean + 0.08, side * 0.12, 0.88 * h)
+    return [
+        ((lean, side * (shoulder + 0.02), 0.81 * h), elbow, 0.05, 0.053, upper),
+        (elbow, hand, 0.038, 0.04, upper if rng.random() < 0.7 else skin),
+    ]
+
+
+def _burden(rng: np.random.Generator, h: float, lean: float, shoulder: float) -> Primitives:
+    """What a person carries, pulls or pushes; often nothing."""
+    what = rng.random()
+    side = float(rng.choice([-1.0, 1.0]))
+    cloth = _cloth(rng, 1)
+    if what < 0.20:  # a rucksack
+        return ellipsoids([(lean - 0.2, 0, 0.70 * h)], [(0.11, 0.15, 0.14 * h)], cloth)
+    if what < 0.36:  # a bag in one hand
+        place = (rng.normal(0, 0.05), side * (shoulder + 0.06), 0.36 * h)
+        return ellipsoids([place], [(0.16, 0.07, 0.13)], cloth)
+    if what < 0.46:  # a bag at the hip
+        return ellipsoids([(-0.02, side * 0.2, 0.53 * h)], [(0.15, 0.07, 0.11)], cloth)
+    if what < 0.485:  # a suitcase on wheels
+        return cuboids([(-0.5, side * 0.2, 0.05, 0.25, 0.4, 0.6, 0.0, *cloth[0, :2], 0.0)])
+    if what < 0.515 and h > 1.5:  # a pram: its tub, its hood and its wheels
+        return Primitives.join([
+            ellipsoids([(0.75, 0, 0.72), (0.58, 0, 0.88)], [(0.38, 0.22, 0.17), (0.16, 0.22, 0.17)],
+                       np.repeat(cloth, 2, axis=0)),
+            cuboids([(x, y, 0.0, 0.2, 0.04, 0.22, 0.0, 0.1, 0.3, 0.4) for x in (0.5, 1.0) for y in (0.24, -0.24)]),
+        ])  # fmt: skip
+    return Primitives.join([])
 
 
 def sitting_body(rng: np.random.Generator, height: float) -> Primitives:
@@ -148,6 +197,7 @@ def cyclist_body(rng: np.random.Generator, height: float, width: float, length: 
     neck = np.array([hips[0] + bend, 0.0, neck_z])
     reach = length / 2 - float(np.clip(0.19 * length, 0.26, 0.35)) - 0.28
     pedal = rng.uniform(0, 2 * np.pi)
+    grip = float(np.clip(0.45 * width, 0.2, 0.29))
     rows: list[Limb] = [
         (hips + np.array([0, 0, -0.05]), neck + np.array([0, 0, -0.04]), shoulder, 0.12, upper),
         (hips + np.array([-0.02, 0, -0.06]), hips + np.array([0.06, 0, 0.08]), 0.16, 0.13, lower),
@@ -157,7 +207,7 @@ def cyclist_body(rng: np.random.Generator, height: float, width: float, length: 
         foot = np.array([-0.08 + 0.17 * np.cos(turn), side * 0.11, 0.30 + 0.17 * np.sin(turn)])
         middle = 0.5 * (hips + foot)
         knee = np.array([middle[0] + 0.24, side * 0.12, middle[2] + 0.08])
-        hand = np.array([reach, side * 0.27, 1.05])
+        hand = np.array([reach, side * grip, 1.05])
         elbow = 0.5 * (neck + hand) + np.array([-0.04, side * 0.10, -0.06])
         rows += [
             (hips + np.array([0, side * 0.08, 0]), knee, 0.08, 0.085, lower),
@@ -167,8 +217,18 @@ def cyclist_body(rng: np.random.Generator, height: float, width: float, length: 
             (elbow, hand, 0.038, 0.038, upper),
         ]
     body = _jointed(rows)
-    head = ellipsoids([(neck[0] + 0.05, 0, height - 0.13)], [(0.11, 0.085, 0.125)], skin[None])
-    parts = [bike, body, head]
-    if rng.random() < 0.25:
+    crown = _cloth(rng, 1)[0]  # hair or a helmet
+    head = [(neck[0] + 0.06, 0, height - 0.13), (neck[0] + 0.03, 0, height - 0.115)]
+    parts = [bike, body, ellipsoids(head, [(0.11, 0.082, 0.125), (0.12, 0.09, 0.11)], np.stack([skin, crown]))]
+    luggage = rng.random()
+    if luggage < 0.22:  # a rucksack
         parts.append(ellipsoids([(neck[0] - 0.24, 0, neck_z - 0.2)], [(0.12, 0.15, 0.2)], _cloth(rng, 1)))
+    elif luggage < 0.36:  # panniers
+        bag = np.repeat(_cloth(rng, 1), 2, axis=0)
+        parts.append(ellipsoids([(-0.55, y, 0.6) for y in (0.17, -0.17)], [(0.19, 0.09, 0.19)] * 2, bag))
+    elif luggage < 0.46:  # a basket over the front wheel
+        parts.append(cuboids([(reach + 0.2, 0, 0.8, 0.26, 0.34, 0.24, 0, 0.3, 0.3, 0.5)]))
+    elif luggage < 0.51:  # a child behind the saddle
+        seat = [(-0.56, 0, 0.92), (-0.58, 0, 1.26)]
+        parts.append(ellipsoids(seat, [(0.14, 0.15, 0.26), (0.095, 0.08, 0.11)], _cloth(rng, 2)))
     return Primitives.join(parts)
