@@ -38,7 +38,7 @@ class SceneConfig:
     road: float = 0.11
     alley: float = 0.07
     junction_share: float = 0.45
-    rails_share: float = 0.07
+    rails_share: float = 0.10
     median_share: float = 0.4  # of the wide streets
     closed_end_share: float = 0.18  # streets that end before a wood or a house, on either end
     turning_share: float = 0.12  # the car stands at up to half a radian to the street
