@@ -60,5 +60,6 @@ SHARES: dict[Thing, float] = {
     pole: 0.13, pole_group: 0.04, bollards: 0.07, delineators: 0.04, cabinet: 0.07, bins: 0.06, bench: 0.03,
     planter: 0.03, shelter: 0.012, billboard: 0.025, barrier_boards: 0.02, low_stones: 0.07,
     thin_cylinder: 0.035, post_with_box: 0.04, column: 0.025, container: 0.015, heap: 0.03, stack: 0.025,
-    hedge_block: 0.035, parked_bicycles: 0.04, parked_motorbikes: 0.013, any_shrub: 0.11, bush: 0.035, tree: 0.05, weeds: 0.13,
+    hedge_block: 0.035, parked_bicycles: 0.04, parked_motorbikes: 0.013, any_shrub: 0.11, bush: 0.035, tree: 0.05,
+    weeds: 0.13,
 }  # fmt: skip
