@@ -8,10 +8,10 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from .sensor import COUNT_DEG, COUNTS
-
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+TUFT_M = 0.2
+LONE_LEAVES = 0.35  # share of the rays through a cloud that meet it by a chance of their own
 
 
 @numba.njit(cache=True, inline="always")
@@ -52,15 +52,16 @@ def ring_window(
 @numba.njit(cache=True, inline="always")
 def column_window(low: float, width: float, phase: float, first_column: Ints, columns: int) -> tuple[int, int]:
     """Columns [first, last) whose azimuth lies in [low, low + width]; `last` may exceed the number of columns."""
-    unit = np.pi / 180.0 * COUNT_DEG
+    counts = len(first_column) - 1
+    unit = 2.0 * np.pi / counts
     start = (low - phase) / unit
-    start -= COUNTS * np.floor(start / COUNTS)
+    start -= counts * np.floor(start / counts)
     stop = start + width / unit
-    first = first_column[min(int(np.ceil(start)), COUNTS)]
+    first = first_column[min(int(np.ceil(start)), counts)]
     end = int(np.floor(stop)) + 1
-    if end <= COUNTS:
+    if end <= counts:
         return first, first_column[end]
-    return first, first_column[min(end - COUNTS, COUNTS)] + columns
+    return first, first_column[min(end - counts, counts)] + columns
 
 
 @numba.njit(cache=True)
@@ -210,6 +211,9 @@ def cast_ellipsoids(centers, matrices, inverses, surface, owners, salts, sensor,
             cz - half_z, cz + half_z, max(distance - radius, 0.0), distance + radius, slope, origin_z
         )
         density = surface[e, 2]
+        # Leaves grow in tufts: most rays through one share their chance, so that crowns have depth and not only noise.
+        tuft_columns = max(int(TUFT_M / (max(distance, 2.0) * 2.0 * np.pi / columns)), 1)
+        tuft_rings = max(int(TUFT_M / (max(distance, 2.0) * abs(slope[0] - slope[-1]) / len(slope))), 1)
         who = owners[e]
         for k in range(first_ring, last_ring):
             first, last = column_window(low, width, phase[k], first_column, columns)
@@ -244,6 +248,10 @@ def cast_ellipsoids(centers, matrices, inverses, surface, owners, salts, sensor,
                 reach = max((-pq - root) / qq, 0.0)
                 if density > 0.0:
                     chance = ray_hash(key, k, j, salts[e])
+                    if chance < LONE_LEAVES:
+                        chance /= LONE_LEAVES
+                    else:
+                        chance = ray_hash(key, k // tuft_rings, j // tuft_columns, salts[e] + 200_000_000)
                     reach -= np.log(chance) / (density * stretch)
                     if reach >= leave:
                         continue

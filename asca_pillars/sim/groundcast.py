@@ -13,6 +13,8 @@ TRACK_SPACING_HALF_M, GAUGE_HALF_M, RAIL_HALF_M = 1.7, 0.75, 0.06
 RELIEF_STEP_M = 4.0
 RELIEF_HALF_M = 96.0
 NO_RAILS = -1000.0
+GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
+CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
 ASPHALT, PAVEMENT, VERGE, MARKING, RAIL, BALLAST = range(6)
 
 # Positions of the fields of Ground.shape: what numba reads has no names.
@@ -145,6 +147,7 @@ def cast_ground(shape, relief, materials, z_m, sensor, buffers, grass):  # type:
     rho, cosine, reflectance, owner, _, _ = buffers
     highest = highest_within(relief)
     rough = shape[ROUGH]
+    group = max(int(GROUP_DEG / 360.0 * len(cos_az)), 1)
     for k in range(len(slope)):
         cos_p, sin_p = np.cos(phase[k]), np.sin(phase[k])
         stretch = np.sqrt(1.0 + slope[k] ** 2)
@@ -156,18 +159,35 @@ def cast_ground(shape, relief, materials, z_m, sensor, buffers, grass):  # type:
             if meet <= (ring + 1) * RELIEF_STEP_M:
                 break
             ring += 1
+        # A neighboring ray of this ring was high above everything up to `clear`; this one starts there. Neighbors
+        # come in small groups, so that a ray does not depend on whether those far from it are cast.
+        clear = start
         for j in range(len(cos_az)):
             if not cast_columns[j]:
                 continue
+            if j % group == 0 or not cast_columns[j - 1]:
+                clear = start
             dx = cos_az[j] * cos_p - sin_az[j] * sin_p
             dy = sin_az[j] * cos_p + cos_az[j] * sin_p
             limit = min(rho[k, j], 85.0)
-            near, reach, above = start, start, 0.0
+            near, reach, above = clear, clear, 0.0
             gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
+            if gap < CLEAR_M:
+                near, reach = start, start
+                gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
+            clear, descending = start, max(-slope[k], 0.0)
+            far_above = descending > 0.03  # flatter rays graze crests that a neighbor may just have missed
             while gap > 0.0 and reach < limit:
                 near, above = reach, gap
+                far_above &= gap >= CLEAR_M
+                if far_above:
+                    clear = reach
                 # Ground steeper than this is a kerb or a bank, which is wider than the step that passes its foot.
-                reach = near + max(gap / (0.22 + max(-slope[k], 0.0)), 0.04 + 0.006 * near)
+                # On flat ground half of the way down is quicker; kerbs are lower than what is left above them then.
+                step = max(gap / (0.22 + descending), 0.04 + 0.006 * near)
+                if descending > 0.0:
+                    step = max(step, min(0.5 * gap / descending, 3.0))
+                reach = near + step
                 gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
             if gap > 0.0:
                 continue

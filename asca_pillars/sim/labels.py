@@ -12,9 +12,11 @@ from .raycast import Hits
 from .returns import Returns
 
 # Visible share of the firings that would meet the object alone, above which KITTI's annotators would say
-# "fully visible" (0) and "partly occluded" (1); below the second it is "largely occluded" (2).
-OCCLUSION_STEPS = (0.80, 0.45)
+# "fully visible" (0), "partly occluded" (1) and "largely occluded" (2); below the last it is "unknown" (3).
+# The steps give simulated cars the shares of KITTI's: 47, 28, 21 and 3 %.
+OCCLUSION_STEPS = (0.82, 0.36, 0.09)
 MAX_TRUNCATION = 0.95
+UNKNOWN_FROM_TRUNCATION = 0.85  # what hardly stands in the image, KITTI mostly marks as unknown, too
 
 
 def make_labels(
@@ -42,6 +44,8 @@ def make_labels(
             areas.append(dont_care(item.bbox))
             continue
         occluded = int(np.searchsorted(-np.array(OCCLUSION_STEPS), -visible[index], side="right"))
+        if truncated[index] > UNKNOWN_FROM_TRUNCATION:
+            occluded = len(OCCLUSION_STEPS)
         labels.append(replace(item, truncated=round(float(truncated[index]), 2), occluded=occluded))
     return labels + areas
 

@@ -1,8 +1,7 @@
-"""Where labelled objects stand: sizes by KITTI's statistics, places by the habits of each class, none overlapping."""
+"""Where labelled objects stand: places by the habits of each class, none overlapping."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numba
 import numpy as np
@@ -10,65 +9,20 @@ import numpy.typing as npt
 
 from .config import SceneConfig
 from .ground import Ground
+from .sizes import draw_size
 
 Floats = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class SizeStatistics:
-    """Label sizes in metres, each (length, width, height), and the correlations length-width, length-height,
-    width-height."""
-
-    mean: tuple[float, float, float]
-    deviation: tuple[float, float, float]
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    correlation: tuple[float, float, float]
-
-    @cached_property
-    def spread(self) -> Floats:
-        """(3,3) turning independent normal numbers into deviations, metres."""
-        lw, lh, wh = self.correlation
-        factor = np.linalg.cholesky(np.array([[1.0, lw, lh], [lw, 1.0, wh], [lh, wh, 1.0]]))
-        return np.asarray(np.array(self.deviation)[:, None] * factor)
-
-
-# Of all of KITTI's training labels; the bounds are the 1st and 99th percentile, narrowed where a body needs it.
-SIZES = {
-    "Car": SizeStatistics(
-        (3.884, 1.629, 1.526), (0.426, 0.102, 0.137), (2.94, 1.36, 1.27), (4.89, 1.88, 1.97), (0.35, 0.17, 0.31)
-    ),
-    "Van": SizeStatistics(
-        (5.078, 1.902, 2.207), (0.831, 0.173, 0.325), (3.72, 1.56, 1.71), (6.86, 2.46, 2.87), (0.65, 0.82, 0.67)
-    ),
-    "Truck": SizeStatistics(
-        (10.11, 2.585, 3.252), (2.86, 0.217, 0.449), (5.42, 2.06, 2.32), (16.8, 2.97, 4.19), (0.41, 0.21, 0.38)
-    ),
-    "Tram": SizeStatistics(
-        (16.1, 2.544, 3.529), (7.85, 0.215, 0.176), (9.0, 2.17, 3.17), (35.2, 2.81, 3.84), (0.02, -0.21, 0.10)
-    ),
-    "Misc": SizeStatistics(
-        (3.58, 1.51, 1.91), (2.86, 0.67, 0.81), (1.3, 0.6, 0.9), (11.7, 2.68, 3.6), (0.74, 0.74, 0.65)
-    ),
-    "Pedestrian": SizeStatistics(
-        (0.842, 0.660, 1.761), (0.235, 0.143, 0.113), (0.35, 0.38, 1.10), (1.32, 0.96, 1.97), (0.20, 0.27, 0.13)
-    ),
-    "Cyclist": SizeStatistics(
-        (1.764, 0.597, 1.737), (0.177, 0.124, 0.095), (1.30, 0.36, 1.44), (2.12, 0.88, 1.97), (0.32, 0.37, 0.13)
-    ),
-    "Person_sitting": SizeStatistics(
-        (0.802, 0.595, 1.275), (0.222, 0.079, 0.110), (0.52, 0.48, 1.06), (1.33, 0.75, 1.64), (-0.33, 0.18, 0.33)
-    ),
-}
-CHILD_SHARE = 0.07
+Place = tuple[float, float, float]  # x, y, heading in the LiDAR frame
 
 
 @dataclass(frozen=True)
 class Target:
-    """A labelled object: KITTI type and label box (x, y, z, length, width, height, yaw)."""
+    """A labelled object: KITTI type and label box (x, y, z, length, width, height, yaw). The body stands on the
+    ground, `lift_m` below the bottom of the box."""
 
     type: str
     box: Floats
+    lift_m: float = 0.0
 
 
 @dataclass
@@ -111,16 +65,6 @@ def _is_free(row: Floats, rows: Floats, count: int) -> bool:
     return True
 
 
-def draw_size(rng: np.random.Generator, name: str) -> Floats:
-    """Length, width, height of a label box, metres."""
-    statistics = SIZES[name]
-    size = np.array(statistics.mean) + statistics.spread @ rng.standard_normal(3)
-    size = np.clip(size, statistics.low, statistics.high)
-    if name == "Pedestrian" and rng.random() < CHILD_SHARE:
-        size *= rng.uniform(0.62, 0.85)
-    return np.asarray(size)
-
-
 @dataclass
 class Placer:
     """Puts the objects of one scene on its street."""
@@ -132,116 +76,190 @@ class Placer:
     kind: str
     targets: list[Target] = field(default_factory=list)
     _rows: list[tuple[float, float, float, float]] = field(default_factory=list)  # parked: u, v, heading, length
+    _traffic: list[tuple[float, float, float, float]] = field(default_factory=list)  # moving: the same
     _groups: list[tuple[float, float, float]] = field(default_factory=list)  # people: u, v, heading
+    _riders: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        ground, rng = self.ground, self.rng
+        # Zebra crossings lie where roads meet, or anywhere.
+        at_junction = ground.cross_half_m > 0 and rng.random() < 0.6
+        beside = ground.cross_u_m - rng.choice([-1.0, 1.0]) * (ground.cross_half_m + 2.5)
+        self._zebra_u = float(beside if at_junction else rng.uniform(6.0, 45.0))
 
     def place(self, name: str, ahead: bool) -> None:
         """Place one object of a class, or give up after some tries."""
-        pick: Callable[[Floats, float], tuple[float, float, float]] = {
+        pick: Callable[[Floats, float], Place] = {
             "Pedestrian": self._pedestrian, "Person_sitting": self._sitting, "Cyclist": self._cyclist,
             "Tram": self._tram,
         }.get(name, self._vehicle)  # fmt: skip
         size = draw_size(self.rng, name)
-        margin = 0.12 if name in ("Pedestrian", "Person_sitting", "Cyclist") else 0.25
+        on_foot = name in ("Pedestrian", "Person_sitting")
+        margin = 0.04 if on_foot else 0.10 if name == "Cyclist" else 0.25
         for _ in range(14):
-            x, y, yaw = pick(size, 1.0 if ahead else -1.0)
-            if not self.occupied.take(x, y, size[0], size[1], yaw, margin):
-                continue
-            z = float(self.ground.heights((x, y))[0])
-            yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
-            self.targets.append(Target(name, np.array([x, y, z + size[2] / 2, *size, yaw])))
-            return
+            if self._put(name, size, pick(size, 1.0 if ahead else -1.0), margin):
+                return
+
+    def place_beyond(self) -> None:
+        """Place a car ahead that is out of the sensor's reach but not out of the camera's sight."""
+        size = draw_size(self.rng, "Car")
+        lane = self.rng.uniform(-1.2, 1.2) * (self.ground.half_width_m + 2.0)
+        heading = self.rng.choice([0.0, np.pi])
+        self._put("Car", size, self.ground.to_lidar(self.rng.uniform(80.5, 115.0), lane, heading), 0.25)
+
+    def _put(self, name: str, size: Floats, place: Place, margin_m: float) -> bool:
+        x, y, yaw = place
+        level = float(self.ground.heights((x, y))[0])
+        near, per_m = self.config.level_band_m
+        rise = self.config.slope_x[0] * x + self.config.slope_y[0] * y
+        if abs(level - self.ground.z_m - rise) > near + per_m * np.hypot(x, y):
+            return False
+        if not self.occupied.take(x, y, size[0], size[1], yaw, margin_m):
+            return False
+        mean, deviation = self.config.box_lift_m[0 if name in ("Pedestrian", "Person_sitting", "Cyclist") else 1]
+        lift = float(np.clip(self.rng.normal(mean, deviation), -0.12, 0.15))
+        yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
+        self.targets.append(Target(name, np.array([x, y, level + lift + size[2] / 2, *size, yaw]), lift))
+        return True
 
     def _distance(self, shape: float, scale: float) -> float:
         distance = float(self.rng.gamma(shape, scale))
-        return distance if 2.5 < distance < self.config.reach_m else float(self.rng.uniform(2.5, self.config.reach_m))
+        return distance if 2.0 < distance < self.config.reach_m else float(self.rng.uniform(2.0, self.config.reach_m))
 
-    def _vehicle(self, size: Floats, way: float) -> tuple[float, float, float]:
-        rng, ground = self.rng, self.ground
-        half = ground.half_width_m
+    def _vehicle(self, size: Floats, way: float) -> Place:
         long = size[0] > 6.0
-        habit = rng.random()
-        parked = {"residential": 0.62, "urban": 0.42, "rural": 0.12, "campus": 0.45}[self.kind] * (0.3 if long else 1.0)
-        if ground.cross_half_m > 0 and habit > 0.84:
-            along = rng.uniform(-45.0, 45.0)
-            lane = -1.0 if rng.random() < 0.5 else 1.0
-            # On the crossing road, traffic keeps to its right too.
-            across = lane * ground.cross_half_m * rng.uniform(0.4, 0.65)
-            return ground.cross_to_lidar(along, across, (0.0 if lane > 0 else np.pi) + rng.normal(0, 0.06))
+        habit = self.rng.random()
+        parked = {"residential": 0.64, "urban": 0.44, "rural": 0.14, "campus": 0.47}[self.kind] * (0.3 if long else 1.0)
+        if self.ground.cross_half_m > 0 and habit > 0.88:
+            return self._crossing()
         if habit < parked:
-            if self._rows and rng.random() < 0.6:
-                u, v, heading, length = self._rows[int(rng.integers(len(self._rows)))]
-                gap = (length + size[0]) / 2 + rng.uniform(0.4, 2.2)
-                turned = abs(np.sin(heading)) > 0.5
-                if turned:
-                    gap = size[1] + rng.uniform(0.5, 1.1)
-                u += gap * (1.0 if rng.random() < 0.5 else -1.0)
-                if not 0 < u * way < self.config.reach_m:
-                    u = way * self._distance(1.9, 13.0)
-            else:
-                u = way * self._distance(1.7, 15.0)
-                side = 1.0 if rng.random() < 0.55 else -1.0
-                turned = rng.random() < 0.18
-                if turned:
-                    v = side * (half + rng.uniform(0.2, 0.8) + size[0] / 2)
-                    heading = side * np.pi / 2 * rng.choice([-1, 1]) + rng.normal(0, 0.05) * 1.0
-                else:
-                    v = side * (half - size[1] / 2 + rng.uniform(-0.2, 1.0))
-                    heading = (np.pi if side > 0 else 0.0) + (np.pi if rng.random() < 0.15 else 0.0)
-            self._rows.append((u, v, heading, float(size[0])))
-            return ground.to_lidar(u, v + rng.normal(0, 0.08), heading + rng.normal(0, 0.02))
-        if habit < parked + 0.14:  # drives, yards, car parks
-            u = way * self._distance(2.0, 15.0)
-            v = (1.0 if rng.random() < 0.6 else -1.0) * (half + ground.pavement_m + rng.uniform(2.0, 16.0))
-            heading = rng.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + rng.normal(0, 0.12)
-            return ground.to_lidar(u, v, float(heading))
-        u = way * self._distance(2.0, 17.0)
-        lanes = max(int(half // 3.1), 1)
-        lane = (int(rng.integers(lanes)) + 0.5) * min(half / lanes, 3.6)
-        oncoming = rng.random() < 0.5
-        v = (lane if oncoming else -lane) + rng.normal(0, 0.2)
-        return ground.to_lidar(u, v, (np.pi if oncoming else 0.0) + rng.normal(0, 0.035))
+            return self._parked(size, way)
+        if habit < parked + 0.18:
+            return self._off_street(way)
+        return self._moving(size, way)
 
-    def _tram(self, size: Floats, way: float) -> tuple[float, float, float]:
+    def _crossing(self) -> Place:
+        """On the crossing road, where traffic keeps to its right too."""
+        rng, ground = self.rng, self.ground
+        lane = -1.0 if rng.random() < 0.5 else 1.0
+        across = lane * ground.cross_half_m * rng.uniform(0.4, 0.65)
+        heading = (0.0 if lane > 0 else np.pi) + rng.normal(0, 0.06)
+        return ground.cross_to_lidar(rng.uniform(-45.0, 45.0), across, heading)
+
+    def _parked(self, size: Floats, way: float) -> Place:
+        """At the kerb, half on the pavement or nose in; mostly next to one that is parked already."""
+        rng, half = self.rng, self.ground.half_width_m
+        row = self._rows[int(rng.integers(len(self._rows)))] if self._rows and rng.random() < 0.65 else None
+        if row is not None:
+            u, v, heading, length = row
+            nose_in = abs(np.sin(heading)) > 0.5
+            gap = size[1] + rng.uniform(0.5, 1.1) if nose_in else (length + size[0]) / 2 + rng.uniform(0.4, 1.8)
+            u += gap * (1.0 if rng.random() < 0.5 else -1.0)
+            if not 0 < u * way < self.config.reach_m:
+                u = way * self._distance(1.9, 13.0)
+        else:
+            u = way * self._distance(1.6, 17.5)
+            side = 1.0 if rng.random() < 0.55 else -1.0
+            if rng.random() < 0.15:
+                v = side * (half + rng.uniform(0.2, 0.8) + size[0] / 2)
+                heading = float(side * np.pi / 2 * rng.choice([-1, 1]) + rng.normal(0, 0.05))
+            else:
+                v = side * (half - size[1] / 2 + rng.uniform(-0.2, 1.0))
+                heading = (np.pi if side > 0 else 0.0) + (np.pi if rng.random() < 0.2 else 0.0)
+        self._rows.append((u, v, heading, float(size[0])))
+        return self.ground.to_lidar(u, v + rng.normal(0, 0.08), heading + rng.normal(0, 0.02))
+
+    def _off_street(self, way: float) -> Place:
+        """In drives, yards and car parks."""
+        rng, ground = self.rng, self.ground
+        v = (1.0 if rng.random() < 0.6 else -1.0) * (ground.half_width_m + ground.pavement_m + rng.uniform(2.0, 22.0))
+        heading = float(rng.choice([0.0, np.pi, np.pi / 2, -np.pi / 2], p=[0.3, 0.3, 0.2, 0.2])) + rng.normal(0, 0.12)
+        return ground.to_lidar(way * self._distance(2.0, 15.0), v, heading)
+
+    def _moving(self, size: Floats, way: float) -> Place:
+        """In a lane, alone or behind or before another one."""
+        rng, half = self.rng, self.ground.half_width_m
+        if self._traffic and rng.random() < 0.3:  # a queue
+            u, v, heading, length = self._traffic[int(rng.integers(len(self._traffic)))]
+            u += ((length + size[0]) / 2 + rng.gamma(2.0, 2.5) + 1.2) * rng.choice([-1.0, 1.0])
+        else:
+            u = way * self._distance(1.9, 20.0)
+            lanes = max(int(half // 3.1), 1)
+            lane = (int(rng.integers(lanes)) + 0.5) * min(half / lanes, 3.6)
+            oncoming = rng.random() < 0.45
+            v, heading = (lane if oncoming else -lane), (np.pi if oncoming else 0.0)
+        self._traffic.append((u, v, heading, float(size[0])))
+        return self.ground.to_lidar(u, v + rng.normal(0, 0.2), heading + rng.normal(0, 0.035))
+
+    def _tram(self, size: Floats, way: float) -> Place:
         rails = self.ground.rails_v_m
         v = self.ground.half_width_m + 3.0 if rails is None else rails
         return self.ground.to_lidar(way * self.rng.uniform(8.0, 74.0), v, self.rng.choice([0.0, np.pi]))
 
-    def _pedestrian(self, size: Floats, way: float) -> tuple[float, float, float]:
+    def _pedestrian(self, size: Floats, way: float) -> Place:
         rng, ground = self.rng, self.ground
         half, pavement = ground.half_width_m, ground.pavement_m
-        if self._groups and rng.random() < 0.35:  # company
-            u, v, heading = self._groups[int(rng.integers(len(self._groups)))]
-            u, v = u + rng.normal(0, 0.7), v + rng.normal(0, 0.7)
-            heading = heading if rng.random() < 0.6 else rng.uniform(-np.pi, np.pi)
+        if self._groups and rng.random() < 0.42:
+            u, v, heading = self._companion(self._groups[int(rng.integers(len(self._groups)))])
         else:
-            u = way * self._distance(2.0, 7.5)
+            u = way * self._distance(2.0, 6.6)
             place = rng.random()
-            if self.kind == "campus" and place < 0.6:
+            across = rng.random() < 0.25
+            if place < 0.10 and way > 0:
+                u, v, across = self._zebra_u + rng.uniform(-1.5, 1.5), rng.uniform(-half - 1.0, half + 1.0), True
+            elif self.kind == "campus" and place < 0.6:
                 v = rng.uniform(-12.0, 12.0)
             elif place < 0.2:
                 v = rng.uniform(-half, half)
             else:
-                v = (1.0 if rng.random() < 0.5 else -1.0) * (half + rng.uniform(0.2, max(pavement, 1.0) + 1.5))
-            along = 0.0 if rng.random() < 0.75 else np.pi / 2
-            heading = along + rng.choice([0.0, np.pi]) + rng.normal(0, 0.15)
+                v = (1.0 if rng.random() < 0.5 else -1.0) * (half + rng.uniform(0.1, max(pavement, 1.0) + 1.5))
+            heading = (np.pi / 2 if across else 0.0) + rng.choice([0.0, np.pi]) + rng.normal(0, 0.15)
             if rng.random() < self.config.pedestrian_uniform_heading:
                 heading = rng.uniform(-np.pi, np.pi)
         self._groups.append((u, v, float(heading)))
         return ground.to_lidar(u, v, float(heading))
 
-    def _sitting(self, size: Floats, way: float) -> tuple[float, float, float]:
-        v = self.ground.half_width_m + self.rng.uniform(0.8, max(self.ground.pavement_m, 1.0) + 3.0)
-        v *= 1.0 if self.rng.random() < 0.5 else -1.0
-        return self.ground.to_lidar(way * self._distance(2.5, 5.0), v, self.rng.uniform(-np.pi, np.pi))
+    def _companion(self, of: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Beside somebody with the same heading, behind, or face to face."""
+        rng = self.rng
+        u, v, heading = of
+        habit = rng.random()
+        if habit < 0.5:
+            along, across, turn = rng.normal(0, 0.15), rng.choice([-1, 1]) * rng.uniform(0.5, 0.9), rng.normal(0, 0.12)
+        elif habit < 0.75:
+            along, across = rng.choice([-1, 1]) * rng.uniform(0.8, 2.2), rng.normal(0, 0.5)
+            turn = rng.normal(0, 0.2)
+        else:
+            along, across, turn = rng.uniform(0.6, 1.2), rng.normal(0, 0.3), np.pi + rng.normal(0, 0.5)
+        cos, sin = np.cos(heading), np.sin(heading)
+        return float(u + along * cos - across * sin), float(v + along * sin + across * cos), float(heading + turn)
 
-    def _cyclist(self, size: Floats, way: float) -> tuple[float, float, float]:
+    def _sitting(self, size: Floats, way: float) -> Place:
         rng, ground = self.rng, self.ground
-        half = ground.half_width_m
-        u = way * self._distance(2.2, 11.0)
-        if rng.random() < self.config.cyclist_crossing:
-            v = rng.uniform(-half - 4.0, half + 4.0)
-            return ground.to_lidar(u, v, rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.45))
-        side = -1.0 if rng.random() < 0.55 else 1.0
-        v = side * (half + (rng.uniform(-1.3, -0.3) if rng.random() < 0.6 else rng.uniform(0.4, 2.5)))
-        against = rng.random() < 0.15
-        return ground.to_lidar(u, v, (np.pi if (side > 0) != against else 0.0) + rng.normal(0, 0.12))
+        if self._groups and rng.random() < 0.4:  # at a table
+            u, v, _ = self._groups[int(rng.integers(len(self._groups)))]
+            u, v = u + rng.normal(0, 1.0), v + rng.normal(0, 1.0)
+        else:
+            u = way * self._distance(2.5, 4.2)
+            v = ground.half_width_m + rng.uniform(0.6, max(ground.pavement_m, 1.0) + 2.0)
+            v *= 1.0 if rng.random() < 0.5 else -1.0
+        self._groups.append((u, v, 0.0))
+        return ground.to_lidar(u, v, rng.uniform(-np.pi, np.pi))
+
+    def _cyclist(self, size: Floats, way: float) -> Place:
+        rng, half = self.rng, self.ground.half_width_m
+        if self._riders and rng.random() < 0.2:  # side by side, or one behind the other
+            u, v, heading = self._riders[int(rng.integers(len(self._riders)))]
+            beside = rng.random() < 0.4
+            u += rng.normal(0, 0.4) if beside else rng.choice([-1, 1]) * rng.uniform(2.2, 6.0)
+            v += rng.choice([-1, 1]) * rng.uniform(0.8, 1.3) if beside else rng.normal(0, 0.3)
+        elif rng.random() < self.config.cyclist_crossing:
+            u, v = way * self._distance(2.0, 12.5), rng.uniform(-half - 4.0, half + 4.0)
+            heading = float(rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.45))
+        else:
+            u = way * self._distance(2.0, 12.5)
+            side = -1.0 if rng.random() < 0.6 else 1.0
+            v = side * (half + (rng.uniform(-1.3, -0.3) if rng.random() < 0.5 else rng.uniform(0.4, 7.0)))
+            heading = (np.pi if (side > 0) != (rng.random() < 0.3) else 0.0) + rng.normal(0, 0.12)
+        self._riders.append((u, v, heading))
+        return self.ground.to_lidar(u, v, heading)

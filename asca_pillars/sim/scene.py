@@ -15,7 +15,7 @@ from .placement import Occupied, Placer, Target
 from .primitives import BACKGROUND, Primitives
 from .raycast import Bodies
 from .roadside import line_streets
-from .shapes import heavy, people, styles, vehicles
+from .shapes import cycles, heavy, people, styles, vehicles
 from .streets import draw_ground, draw_kind
 
 EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 2.6
@@ -49,10 +49,14 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
     placer = Placer(rng, config, ground, occupied, habits)
     if rng.random() >= config.empty_share:
         for name, rate in _rates(config, habits):
+            crowds = name in ("Pedestrian", "Person_sitting")
+            dispersion = config.people_dispersion if crowds else config.dispersion
             for ahead in (True, False):
                 # A gamma-distributed rate makes the counts negative binomial.
-                for _ in range(rng.poisson(rate * rng.gamma(config.dispersion) / config.dispersion)):
+                for _ in range(rng.poisson(rate * rng.gamma(dispersion) / dispersion)):
                     placer.place(name, ahead)
+        for _ in range(rng.poisson(config.beyond)):
+            placer.place_beyond()
     builder = Builder(rng, config, ground, occupied, kind)
     line_streets(builder)
     scatter(builder)
@@ -105,7 +109,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     name = target.type
     if name in ("Car", "Van"):
         # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
-        slack = rng.uniform((0.0, 0.0, -0.02), (0.16, 0.10, 0.09))
+        slack = rng.uniform((0.0, 0.0, -0.03), (0.16, 0.10, 0.09))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.2
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
@@ -114,6 +118,8 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         body = (heavy.bus_body if bus else heavy.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
     elif name == "Tram":
         body = heavy.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
+    elif name == "Misc" and width < 1.0 and 1.4 < length < 2.5 and height > 1.35:
+        body = cycles.motorcyclist_body(rng, height - 0.08, length - 0.06)
     elif name == "Misc":
         body = heavy.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
     elif name == "Pedestrian":
@@ -122,7 +128,8 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         body = people.sitting_body(rng, height - 0.05)
     else:
         body = people.cyclist_body(rng, height - 0.08, width, length - 0.04)
-    return body.placed(x, y, z - height / 2, yaw)
+    dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
+    return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 
 
 def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: float) -> Bodies:

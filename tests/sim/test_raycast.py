@@ -8,7 +8,8 @@ from asca_pillars.sim.groundcast import GROUND
 from asca_pillars.sim.primitives import BACKGROUND, Primitives, Surface, cuboids, ellipsoids, prisms, quads
 from asca_pillars.sim.raycast import NOTHING, Bodies, cast
 from asca_pillars.sim.sensor import Firings, Lidar, draw_firings
-from asca_pillars.sim.shapes.vehicles import SALOON, car_body
+from asca_pillars.sim.shapes.styles import SALOON
+from asca_pillars.sim.shapes.vehicles import car_body
 
 
 def bodies(primitives: Primitives, owner: int = BACKGROUND) -> Bodies:
@@ -51,27 +52,39 @@ def opaque_street(seed: int) -> Primitives:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_triangles_agree_with_embree(firings: Firings, seed: int) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    ray = pytest.importorskip("trimesh.ray.ray_pyembree")
+    trimesh = pytest.importorskip(
+        "trimesh", reason="Embree's answers come through trimesh: pip install trimesh embreex"
+    )
+    ray = pytest.importorskip("trimesh.ray.ray_pyembree", reason="needs Embree: pip install embreex")
     primitives = opaque_street(seed)
     hits = cast(bodies(primitives), 0, None, firings, seed=1)
     mesh = trimesh.Trimesh(
         primitives.triangles.reshape(-1, 3), np.arange(3 * len(primitives.triangles)).reshape(-1, 3), process=False
     )
     caster = ray.RayMeshIntersector(mesh, scale_to_box=False)
-    rays = directions(firings)[:, ::5]
+    rays = directions(firings)[:, ::5].reshape(-1, 3)
     origin = np.zeros_like(rays)
-    origin[..., 2] = firings.origin_z_m[:, None]
-    index, ray_index, place = caster.intersects_id(
-        origin.reshape(-1, 3), rays.reshape(-1, 3), multiple_hits=False, return_locations=True
-    )
-    expected = np.full(rays.shape[:2], np.inf).ravel()
-    expected[ray_index] = np.hypot(place[:, 0], place[:, 1])
-    got = hits.rho_m[:, ::5].ravel()
-    assert len(index) > 10_000  # the scene fills a good part of the view
-    close = np.isclose(got, expected, rtol=1e-3, atol=2e-3) | (np.isinf(got) & np.isinf(expected))
-    # Single precision decides otherwise on edges only.
-    assert close.mean() > 0.9995
+    origin[:, 2] = np.repeat(firings.origin_z_m, len(rays) // len(firings.origin_z_m))
+
+    def embree(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Horizontal distance of the first hit, inf for none. Embree names the triangle; double precision the place."""
+        first, met = caster.intersects_id(origin, rays, multiple_hits=False)
+        corner = primitives.triangles[first]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        distance = np.full(len(rays), np.inf)
+        distance[met] = ((corner[:, 0] - origin[met]) * normal).sum(1) / (rays[met] * normal).sum(1)
+        return distance
+
+    got, expected = hits.rho_m[:, ::5].ravel(), embree(origin, rays)
+    assert np.isfinite(expected).sum() > 10_000  # the scene fills a good part of the view
+    same = np.isclose(got, expected, rtol=0, atol=1e-4) | (np.isinf(got) & np.isinf(expected))
+    assert same.mean() > 0.999
+    # What is left are rays along edges, which single precision puts on either side: one a hair beside them agrees.
+    left, found = np.flatnonzero(~same), np.zeros((~same).sum(), bool)
+    for turn in 3e-5 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]):
+        beside = embree(origin[left], rays[left] + turn)
+        found |= np.isclose(got[left], beside, rtol=5e-3, atol=1e-2) | (np.isinf(got[left]) & np.isinf(beside))
+    assert found.all()
 
 
 def test_a_solid_ellipsoid_is_hit_where_its_equation_says(firings: Firings) -> None:
@@ -97,10 +110,12 @@ def test_a_solid_ellipsoid_is_hit_where_its_equation_says(firings: Firings) -> N
 def test_a_cloud_lets_an_exponential_share_through(firings: Firings) -> None:
     """A slab of optical depth 1 (density 0.5 per metre, 2 m thick at its middle) stops 1 - 1/e of the rays."""
     cloud = ellipsoids([(10.0, 0.0, -1.0)], [(1.0, 40.0, 40.0)], np.array([[0.5, 0.0, 0.5]]))
-    hits = cast(bodies(cloud), 0, None, firings, seed=5)
     narrow = np.abs(np.arctan2(np.sin(firings.azimuth_rad), np.cos(firings.azimuth_rad))) < np.deg2rad(8)
-    stopped = np.isfinite(hits.rho_m[:, narrow][10:40])
-    assert stopped.mean() == pytest.approx(1 - np.exp(-1), abs=0.02)
+    hits = [cast(bodies(cloud), 0, None, firings, seed).rho_m[10:40, narrow] for seed in range(6)]
+    stopped = np.isfinite(np.stack(hits))
+    assert stopped.mean() == pytest.approx(1 - np.exp(-1), abs=0.03)
+    # Leaves grow in tufts: neighboring rays mostly share their fate, which chance alone would let agree at 53 %.
+    assert 0.6 < (stopped[:, :, 1:] == stopped[:, :, :-1]).mean() < 0.9
 
 
 def test_glass_passes_its_share_of_rays_and_the_wall_behind_gets_them(firings: Firings) -> None:

@@ -1,12 +1,18 @@
 """Bodies fit the label boxes they are made for, and look the part."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from asca_pillars.sim.config import SceneConfig
-from asca_pillars.sim.placement import SIZES, Target, draw_size
+from asca_pillars.sim.placement import Target
 from asca_pillars.sim.primitives import Primitives, cuboids, ellipsoids, limbs, prisms
 from asca_pillars.sim.scene import body_of
+from asca_pillars.sim.shapes.cycles import motorbike_body, parked_bicycle_body
+from asca_pillars.sim.shapes.styles import HATCHBACK, Profile, draw_style
+from asca_pillars.sim.shapes.vehicles import car_body
+from asca_pillars.sim.sizes import SIZES, draw_size
 
 
 def extent(body: Primitives) -> tuple[np.ndarray, np.ndarray]:
@@ -23,13 +29,14 @@ def test_a_body_fills_its_label_box_and_stays_in_it(name: str) -> None:
         size = draw_size(rng, name)
         box = np.array([0.0, 0.0, size[2] / 2, *size, 0.0])
         low, high = extent(body_of(Target(name, box), SceneConfig(), rng))
-        # Walking people swing their limbs out of their box now and then, as KITTI's do; mirrors stand out of cars.
-        over = 0.35 if name in ("Pedestrian", "Person_sitting") else 0.12
-        assert (low[:2] > -size[:2] / 2 - over).all()
-        assert (high[:2] < size[:2] / 2 + over).all()
-        assert -0.02 < low[2] < 0.4
+        # Walking people swing their limbs out of their box now and then, as KITTI's do, and some push a pram;
+        # mirrors stand out of cars.
+        ahead, beside = (1.0, 0.35) if name in ("Pedestrian", "Person_sitting") else (0.2, 0.3)
+        assert (low[:2] > -size[:2] / 2 - (0.6, beside)).all()
+        assert (high[:2] < size[:2] / 2 + (ahead, beside)).all()
+        assert -0.06 < low[2] < 0.4
         if name != "Truck":  # a flat bed does not reach the height of its cab
-            assert 0.02 < size[2] - high[2] < 0.30
+            assert -0.08 < size[2] - high[2] < 0.30
         if name not in ("Pedestrian", "Person_sitting"):
             assert (high - low)[0] > 0.85 * size[0]
 
@@ -75,3 +82,51 @@ def test_limbs_reach_from_joint_to_joint() -> None:
         unit = np.einsum("nij,nj->ni", body.unit_from_world, joint - body.centers)
         assert (np.linalg.norm(unit, axis=1) < 1.0).all()
     assert np.isfinite(body.unit_from_world).all()
+
+
+def car(seed: int, profile: Profile, size: tuple[float, float, float] = (4.2, 1.7, 1.5)) -> Primitives:
+    return car_body(np.random.default_rng(seed), *size, profile)
+
+
+def test_cars_are_as_large_as_asked_for_bowed_in_front_and_crowned() -> None:
+    for seed in range(10):
+        body = car(seed, HATCHBACK)
+        points = body.triangles.reshape(-1, 3)
+        assert np.ptp(points[:, 0]) == pytest.approx(4.2, abs=0.06)  # plates stand out
+        assert points[:, 2].max() == pytest.approx(1.5, abs=1e-6)
+        assert 1.7 <= np.ptp(points[:, 1]) < 2.05  # mirrors
+        # The corners of the nose stand back, the sides of the roof lie low.
+        nose = points[(points[:, 2] > 0.25) & (points[:, 0] > 1.5)]
+        corner = nose[np.abs(nose[:, 1]) > 0.6, 0].max()
+        assert 0.05 < nose[np.abs(nose[:, 1]) < 0.01, 0].max() - corner < 0.45
+        roof = points[np.abs(points[:, 0]) < 0.9]
+        assert roof[np.abs(roof[:, 1]) > 0.5, 2].max() < 1.5 - 0.02
+
+
+def test_a_size_has_its_body_style() -> None:
+    rng = np.random.default_rng(0)
+
+    def mean_roof(length: float, height: float) -> float:
+        """Share of the length over which the outline is higher than 0.9 of the height."""
+        shares = []
+        for _ in range(60):
+            top = np.array(draw_style(rng, length, height).top)
+            shares.append((np.interp(np.linspace(0, 1, 200), *top.T) > 0.9).mean())
+        return float(np.mean(shares))
+
+    # Tall cars are minivans and off-roaders with long roofs, long low ones often saloons.
+    assert mean_roof(4.3, 1.8) > mean_roof(4.6, 1.42) + 0.03
+    for _ in range(100):
+        style = draw_style(rng, 5.0, 2.3, van=True)
+        x = [share for share, _ in style.top]
+        assert x == sorted(x) and x[0] == 0.0 and x[-1] == 1.0
+        assert 0 < style.cabin[0] < style.cabin[1] < 1
+
+
+@pytest.mark.parametrize("draw", [parked_bicycle_body, motorbike_body])
+def test_parked_cycles_stand_on_their_wheels(draw: Callable[[np.random.Generator], Primitives]) -> None:
+    for seed in range(10):
+        low, high = extent(draw(np.random.default_rng(seed)))
+        assert -0.1 < low[2] < 0.05
+        assert 0.9 < high[2] < 1.3
+        assert 1.4 < (high - low)[0] < 2.5

@@ -108,17 +108,15 @@ def _varied(profile: Profile, rng: np.random.Generator) -> Profile:
     x_to = (0.0, base + rng.normal(0.0, 0.02), tail + min(rng.normal(0.0, 0.015), 0.8 * (1.0 - tail)), 1.0)
     lift = float(np.clip(rng.normal(0.0, 0.018), -0.04, 0.04))
 
-    def moved(x: float) -> float:
-        return float(np.interp(x, x_from, x_to))
-
-    def lifted(z: float) -> float:
-        return float(np.interp(z, (0.0, profile.belt, 1.0), (0.0, profile.belt + lift, 1.0)))
-
+    outline = np.array(profile.top)
+    z = np.interp(outline[:, 1], (0.0, profile.belt, 1.0), (0.0, profile.belt + lift, 1.0))
+    x = np.interp([*outline[:, 0], *profile.cabin, *np.ravel(profile.glass)], x_from, x_to).tolist()
+    cabin, glass = x[len(z) : len(z) + 2], x[len(z) + 2 :]
     return replace(
         profile,
-        top=tuple((moved(x), lifted(z)) for x, z in profile.top),
-        glass=tuple((moved(a), moved(b)) for a, b in profile.glass),
-        cabin=(moved(profile.cabin[0]), moved(profile.cabin[1])),
+        top=tuple(zip(x[: len(z)], z.tolist(), strict=True)),
+        glass=tuple(zip(glass[::2], glass[1::2], strict=True)),
+        cabin=(cabin[0], cabin[1]),
         belt=profile.belt + lift,
         tumble=profile.tumble + float(rng.uniform(-0.03, 0.03)),
     )
@@ -132,10 +130,10 @@ class Paint:
     flat: Surface
 
 
-def draw_paint(rng: np.random.Generator, dark_share: float = 0.45) -> Paint:
+def draw_paint(rng: np.random.Generator, dark_share: float = 0.5) -> Paint:
     """Paint: dark lacquers shine where they are met head on and send hardly anything back elsewhere."""
     if rng.random() < dark_share:
-        value, gloss = float(np.exp(rng.uniform(np.log(0.02), np.log(0.14)))), float(rng.uniform(0.8, 2.2))
+        value, gloss = float(np.exp(rng.uniform(np.log(0.012), np.log(0.12)))), float(rng.uniform(0.8, 2.2))
     else:
-        value, gloss = float(np.exp(rng.uniform(np.log(0.2), np.log(0.7)))), float(rng.uniform(0.3, 1.3))
-    return Paint(Surface(value, gloss), Surface(max(0.5 * value, 0.015), float(rng.uniform(0.25, 0.6))))
+        value, gloss = float(np.exp(rng.uniform(np.log(0.15), np.log(0.65)))), float(rng.uniform(0.3, 1.5))
+    return Paint(Surface(value, gloss), Surface(max(0.5 * value, 0.012), float(rng.uniform(0.25, 0.6))))

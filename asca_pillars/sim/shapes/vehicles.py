@@ -16,7 +16,21 @@ from .styles import Paint, Profile, draw_paint
 
 Floats = npt.NDArray[np.float64]
 MIRROR = np.array([1.0, -1.0, 1.0])
-_WHEEL = np.array([[np.cos(a), 0.0, np.sin(a)] for a in np.linspace(0, 2 * np.pi, 11)])
+_SPOKES = 10
+
+
+def _unit_wheel() -> Floats:
+    """Tread (without its width), sidewall and rim of a wheel of radius 1: corners (25,4,3), the rim's two by two."""
+    angle = np.linspace(0, 2 * np.pi, _SPOKES + 1)
+    ring = np.stack([np.cos(angle), np.zeros(_SPOKES + 1), np.sin(angle)], axis=1)
+    a, b = ring[:-1], ring[1:]
+    return np.concatenate(
+        [np.stack([a, b, b, a], 1), np.stack([a, b, 0.65 * b, 0.65 * a], 1),
+         0.65 * np.stack([a[::2], b[::2], b[1::2], np.zeros_like(a[::2])], 1)]
+    )  # fmt: skip
+
+
+_WHEEL = _unit_wheel()
 _LID = ((1.0, 1.0), (0.85, 0.66), (0.45, 0.2), (0.0, 0.0))  # across hood and roof: share of half width, of the crown
 
 
@@ -36,7 +50,7 @@ class _Hull(NamedTuple):
 
 
 def car_body(
-    rng: np.random.Generator, length: float, width: float, height: float, profile: Profile, dark_share: float = 0.45
+    rng: np.random.Generator, length: float, width: float, height: float, profile: Profile, dark_share: float = 0.5
 ) -> Primitives:
     """A lofted car or van with wheels, mirrors, plates and seats behind its glass."""
     hull = _Hull(
@@ -50,10 +64,7 @@ def car_body(
     )  # fmt: skip
     paint = draw_paint(rng, dark_share)
     trim = Surface(float(rng.uniform(0.01, 0.08)), 0.5)
-    corners, table = _shell(hull, paint, rng)
-    for x in (0.0, 1.0):
-        end, end_table = _end(hull, x, paint.upright, trim)
-        corners, table = np.concatenate([corners, end]), np.concatenate([table, end_table])
+    corners, table = _shell(hull, paint, trim, rng)
     corners = np.concatenate([corners, corners * MIRROR])
     floor = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (0.45 * length, 0.45 * width)
     underside = np.column_stack([floor, np.full(4, hull.clearance + 0.08)])
@@ -96,8 +107,8 @@ def _bow(hull: _Hull, x: Floats, y_m: Floats) -> Floats:
     )
 
 
-def _shell(hull: _Hull, paint: Paint, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """The left half between nose and tail: corners (Q,4,3) and surfaces (Q,3)."""
+def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """The left half of a body: corners (Q,4,3) and surfaces (Q,3)."""
     profile, top = hull.profile, np.array(hull.profile.top)
     pane = Surface(0.25, 6.0, float(rng.uniform(0.75, 0.97)))
     window = Surface(0.12, 3.0, float(rng.uniform(0.45, 0.95)))
@@ -107,7 +118,8 @@ def _shell(hull: _Hull, paint: Paint, rng: np.random.Generator) -> tuple[Floats,
     post = profile.cabin[0] + float(rng.uniform(0.40, 0.50)) * (profile.cabin[1] - profile.cabin[0])
     posts = [post - 0.012, post + 0.012]
     high = np.unique(np.concatenate([top[:, 0], profile.cabin, posts]).clip(0, 1))
-    lower, upper = _sections(hull, low)[:, :2], _sections(hull, high)[:, 1:]
+    sections = _sections(hull, np.concatenate([low, high]))
+    lower, upper = sections[: len(low), :2], sections[len(low) :, 1:]
 
     middle = (high[:-1] + high[1:]) / 2
     raised = np.interp(middle, top[:, 0], top[:, 1]) > profile.belt + 0.08
@@ -123,7 +135,11 @@ def _shell(hull: _Hull, paint: Paint, rng: np.random.Generator) -> tuple[Floats,
     table[in_cabin, 1] = window.row
     table[in_pane, 3:] = pane.row
     skirt = np.broadcast_to(paint.upright.row, (len(low) - 1, 3))
-    return np.concatenate([_panels(lower), _panels(upper)]), np.concatenate([skirt, table.reshape(-1, 3)])
+    ends = [_end(hull, x, sections[at]) for x, at in ((0.0, 0), (1.0, -1))]
+    bumper = np.tile(np.stack([trim.row, paint.upright.row]), (4, 1))
+    return np.concatenate([_panels(lower), _panels(upper), *ends]), np.concatenate(
+        [skirt, table.reshape(-1, 3), bumper]
+    )
 
 
 def _panels(grid: Floats) -> Floats:
@@ -131,9 +147,9 @@ def _panels(grid: Floats) -> Floats:
     return np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
 
 
-def _end(hull: _Hull, x: float, paint: Surface, trim: Surface) -> tuple[Floats, Floats]:
-    """Left half of the nose (x = 0) or the tail (x = 1): corners (6,4,3) and surfaces (6,3)."""
-    outline = _sections(hull, np.array([x]))[0]
+def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
+    """Left half of the nose (x = 0) or the tail (x = 1) inside its section (7,3): corners (4,4,3), low and high by
+    turns."""
     levels = outline[[0, 1, 3]]  # sill, waist, edge
     share = np.array([1.0, 0.6, 0.0])[:, None]
     y = share * levels[:, 1]
@@ -141,22 +157,16 @@ def _end(hull: _Hull, x: float, paint: Surface, trim: Surface) -> tuple[Floats, 
     z[:, 2] += hull.crown * (1 - share[:, 0] ** 2)
     along = (0.5 - x) * hull.length + _bow(hull, np.full_like(y, x), y)
     along[:, 0] -= np.sign(0.5 - x) * 0.06  # bumpers recede towards the road
-    table = np.tile(paint.row, (4, 1))
-    table[[0, 2]] = trim.row
-    return _panels(np.stack([along, y, z], axis=2)), table
+    return _panels(np.stack([along, y, z], axis=2))
 
 
 def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
     """A wheel at each x on both sides: tyre tread, and a dark sidewall around a rim that shines more or less."""
     rubber = Surface(float(rng.uniform(0.01, 0.05)), 0.5)
     rim = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.5)))), 1.0)
-    a, b = radius_m * _WHEEL[:-1], radius_m * _WHEEL[1:]
-    inward = np.array([0.0, min(0.2, half_track_m), 0.0])
-    faces = np.concatenate(
-        [np.stack([a, b, b - inward, a - inward], 1), np.stack([a, b, 0.65 * b, 0.65 * a], 1),
-         0.65 * np.stack([a[::2], b[::2], b[1::2], np.zeros_like(a[::2])], 1)]
-    )  # fmt: skip
-    table = np.repeat(np.stack([rubber.row, rim.row]), (2 * len(a), len(a) // 2), axis=0)
+    faces = radius_m * _WHEEL
+    faces[:_SPOKES, 2:, 1] -= min(0.2, half_track_m)  # the tread reaches inwards
+    table = np.repeat(np.stack([rubber.row, rim.row]), (2 * _SPOKES, _SPOKES // 2), axis=0)
     hubs = np.column_stack([np.atleast_1d(x_m), np.full(np.size(x_m), half_track_m), np.full(np.size(x_m), radius_m)])
     left = faces + hubs[:, None, None]  # (wheels,25,4,3) of 10 + 10 + 5 faces
     both = np.stack([left, left * MIRROR])
