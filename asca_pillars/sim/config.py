@@ -59,14 +59,14 @@ class SceneConfig:
     # Mean and standard deviation of the slopes under the car, as KITTI's scans have them.
     slope_x: tuple[float, float] = (0.0105, 0.0035)
     slope_y: tuple[float, float] = (-0.009, 0.016)
-    relief_m: tuple[float, float] = (0.1, 2.6)
+    relief_m: tuple[float, float] = (0.1, 2.4)
     bump_m: tuple[float, float] = (0.0, 0.15)  # standard deviation of bumps beyond the pavement
     bank_slope_sigma: float = 0.045  # of the ground beyond the pavement
-    embankment_slope: tuple[float, float] = (-0.2, 0.45)
+    embankment_slope: tuple[float, float] = (-0.25, 0.42)
     ditch_m: tuple[float, float] = (0.1, 0.6)
     grass_m: tuple[float, float] = (0.02, 0.16)
 
-    clutter: tuple[float, float] = (10.0, 45.0)  # posts, signs, bins, shrubs and the like per 100 m of street
+    clutter: tuple[float, float] = (15.0, 60.0)  # posts, signs, bins, shrubs and the like per 100 m of street
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
     dark_paint_share: float = 0.5
 

@@ -58,7 +58,7 @@ def container(builder: Builder, along: float, across: float) -> None:
 def heap(builder: Builder, along: float, across: float) -> None:
     """Earth, gravel, leaves, boulders, bags: low round mounds."""
     rng = builder.rng
-    wide = float(rng.uniform(0.5, 2.4))
+    wide = float(np.exp(rng.uniform(np.log(0.2), np.log(2.4))))
     if not builder.claim(along, across, 1.6 * wide, 1.2 * wide):
         return
     reflectance, tall = float(rng.uniform(0.15, 0.5)), float(rng.uniform(0.25, 0.6)) * wide

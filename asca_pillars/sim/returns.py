@@ -63,11 +63,11 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
     near, far = lidar.range_m
     kept = (power > firings.lost_power) & (luck >= firings.loss_share) & (slant > near) & (slant < far - 1e-3)
 
-    gain = firings.ring_gain[ring]
     value = PIVOT * (echoes.reflectance / PIVOT) ** lidar.response
-    value *= gain * _fade(echoes.slant_m, firings, ring)
+    value *= firings.ring_gain[ring] * _fade(echoes.slant_m, firings, ring)
     value += (firings.reflectance_sigma[ring] + lidar.reflectance_sigma_share * value) * speckle
-    value[(power < firings.zero_power) | (value < lidar.faint_reflectance * gain * faint)] = 0.0
+    weak = (power < firings.zero_power) | (value < firings.faint[ring] * faint)
+    value[weak | (luck > 1.0 - lidar.zero_share)] = 0.0
     value = np.floor(np.clip(value, 0.0, 0.995) * 100.0) / 100.0
 
     rho = slant / stretch[ring]

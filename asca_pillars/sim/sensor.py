@@ -51,20 +51,24 @@ class Lidar:
     loss_share: tuple[float, float] = (0.0, 0.003)  # returns lost for no reason, drawn once per scan
     # A return is kept without a reflectance below the first power, and lost below the second. Power is
     # reflectance * sqrt(cos(incidence)) / range^2; both thresholds are drawn together, once per scan.
-    zero_power: tuple[float, float] = (2e-5, 6e-5)
-    lost_share_of_zero_power: float = 0.4
+    zero_power: tuple[float, float] = (2.5e-5, 7.5e-5)
+    lost_share_of_zero_power: float = 0.32
     # The true reflectance is reported through a power law about 0.4 (1: as it is), times what each laser makes of
     # it (empty: 1). Beyond `focus_m` it fades with exp(-((range - focus) / fade)^1.3) (0: not), and the lasers of the
     # first block lose `near_fade` of it right before them.
     response: float = 0.6
     ring_gain: tuple[float, ...] = hdl64.RING_GAIN
-    ring_gain_sigma: float = 0.1  # of the logarithm, once per scan: no two sensors have the same lasers
+    ring_gain_sigma: float = 0.06  # of the logarithm, once per scan: no two sensors have the same lasers
     focus_m: float = 13.0
     fade_m: float = 33.0
     near_fade: float = 0.4
-    reflectance_sigma: tuple[float, float] = (0.04, 0.02)  # of each report, of the first block and of the others
-    reflectance_sigma_share: float = 0.1  # and in proportion to it
-    faint_reflectance: float = 0.2  # reflectances below a uniform draw up to this are reported as 0 too
+    # Noise of each report, of the first block and of the others; in proportion to it; and of a laser without gain.
+    reflectance_sigma: tuple[float, float] = (0.04, 0.02)
+    reflectance_sigma_share: float = 0.1
+    weak_laser_sigma: float = 0.12
+    # Reflectances below a uniform draw up to this are reported as 0 too, of the first block and of the others.
+    faint_reflectance: tuple[float, float] = (0.2, 0.12)
+    zero_share: float = 0.03  # of all returns, reported as 0 for no reason: so the best lasers do on near, bright road
     camera_half_angle_deg: float = 43.0
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
@@ -110,6 +114,7 @@ class Firings:
     ring_bias_m: npt.NDArray[np.float64]  # (K,)
     ring_gain: npt.NDArray[np.float64]  # (K,)
     reflectance_sigma: npt.NDArray[np.float64]  # (K,)
+    faint: npt.NDArray[np.float64]  # (K,)
     near_fade: npt.NDArray[np.float64]  # (K,)
     azimuth_rad: npt.NDArray[np.float64]  # (C,) of each column, without the phase
     first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
@@ -140,13 +145,15 @@ def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool) -> F
     in_camera = np.minimum(azimuth, 2 * np.pi - azimuth) <= np.deg2rad(lidar.camera_half_angle_deg)
     first_block = np.arange(rings) < per_block
     gain = np.asarray(lidar.ring_gain or np.ones(rings))
+    weak = np.maximum(1.0 - gain, 0.0)
     return Firings(
         slope=np.tan(np.deg2rad(elevation)),
         origin_z_m=origin_z,
         phase_rad=rng.uniform(0.0, lidar.mean_step * count_rad, rings),
         ring_bias_m=rng.normal(0.0, lidar.ring_bias_sigma_m, rings),
         ring_gain=gain * np.exp(rng.normal(0.0, lidar.ring_gain_sigma, rings)),
-        reflectance_sigma=np.where(first_block, *lidar.reflectance_sigma),
+        reflectance_sigma=np.where(first_block, *lidar.reflectance_sigma) + weak * lidar.weak_laser_sigma,
+        faint=np.where(first_block, *lidar.faint_reflectance),
         near_fade=np.where(first_block, lidar.near_fade, 0.0),
         azimuth_rad=azimuth,
         first_column=np.searchsorted(columns, np.arange(lidar.azimuth_counts + 1)),

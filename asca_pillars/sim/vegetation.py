@@ -194,3 +194,15 @@ def shrub(builder: Builder, along: float, across: float, cross: bool = False, ta
     if builder.claim(along, across, 1.6 * wide, 1.6 * wide, cross):
         density = float(np.exp(rng.uniform(np.log(1.0), np.log(8.0))))
         crown(builder, along, across, 0.5 * height, (0.8 * wide, 0.45 * height), density, cross)
+
+
+def weeds(builder: Builder, along: float, across: float) -> None:
+    """Tufts of grass, weeds and leaves, knee-high at most, along a kerb or anywhere."""
+    rng = builder.rng
+    long, wide = float(rng.uniform(0.3, 4.0)), float(rng.uniform(0.2, 0.9))
+    if builder.claim(along, across, long, wide):
+        count = 2 + int(4.0 * long * wide**0.5)
+        radii = rng.uniform(0.08, 0.28, (count, 1)) * rng.uniform(0.7, 1.4, (count, 3))
+        places = along + long * rng.uniform(-0.5, 0.5, count), across + wide * rng.uniform(-0.5, 0.5, count)
+        z = rng.uniform(0.02, 0.45, count) * rng.random(count)
+        builder.clouds(*places, z, radii, rng.uniform(0.2, 0.5), np.exp(rng.uniform(0.7, 2.7, count)))

@@ -12,7 +12,7 @@ from asca_pillars.sim.sensor import Firings, Lidar, draw_firings
 # Nothing but what a test switches on.
 QUIET = Lidar(
     ego_first_ring=(), ego_beyond_ring=(), ring_gain=(), ring_gain_sigma=0.0, reflectance_sigma=(0.0, 0.0),
-    reflectance_sigma_share=0.0, faint_reflectance=0.0, loss_share=(0.0, 0.0), beam_split_share=0.0,
+    reflectance_sigma_share=0.0, faint_reflectance=(0.0, 0.0), weak_laser_sigma=0.0, zero_share=0.0, loss_share=(0.0, 0.0), beam_split_share=0.0,
     range_sigma_m=(0.0, 0.0), ring_bias_sigma_m=0.0, response=1.0, fade_m=0.0, near_fade=0.0,
 )  # fmt: skip
 
@@ -64,7 +64,7 @@ def test_reflectance_fades_with_range_and_weak_returns_become_zero_before_they_a
 
 
 def test_faint_reflectances_are_zero_and_bright_ones_never() -> None:
-    lidar = replace(QUIET, faint_reflectance=0.2)
+    lidar = replace(QUIET, faint_reflectance=(0.2, 0.2))
     share = {value: (scan(lidar, 10.0, value)[0].points[:, 3] == 0).mean() for value in (0.05, 0.1, 0.25)}
     assert share[0.05] == pytest.approx(0.75, abs=0.02)
     assert share[0.1] == pytest.approx(0.5, abs=0.02)
