@@ -70,6 +70,12 @@ class Row:
             return None
         return self.value < self.bar if self.measure == "distance" else abs(self.value - 1) <= self.bar
 
+    @property
+    def excused(self) -> bool:
+        """Whether a bar is missed by no more than chance would: better cannot be told from as little real data."""
+        away = self.value if self.measure == "distance" else abs(self.value - 1)
+        return self.within is False and self.noise is not None and away <= self.noise
+
 
 @dataclass(frozen=True)
 class Comparison:

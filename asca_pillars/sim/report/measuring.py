@@ -41,7 +41,6 @@ def measure(root: str | Path, *, max_scans: int = MAX_SCANS, progress: bool = Tr
     chosen = np.linspace(0, len(frame_ids) - 1, min(max_scans, len(frame_ids))).round().astype(int)
     sensor = kitti_reference().sensor
     records = [
-        measure_scan(split, frame_ids[index], sensor, labelled=True)
-        for index in track(chosen, "Measuring", disable=not progress)
+        measure_scan(split, frame_ids[index], sensor) for index in track(chosen, "Measuring", disable=not progress)
     ]
     return Measured(Statistics(str(root), scan_statistics(records), len(frame_ids), labels, dont_care), records)

@@ -40,7 +40,7 @@ def write_plots(folder: Path, comparison: Comparison, measured: Measured, sensor
 def _figure(rows: int, columns: int, width: float, height: float) -> tuple["Figure", list["Axes"]]:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained", dpi=100)
+    figure = Figure(figsize=(width * columns, height * rows), layout="tight", dpi=100)
     return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 

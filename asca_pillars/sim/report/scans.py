@@ -63,8 +63,8 @@ class ScanRecord:
     cars: NDArray[np.float64]
 
 
-def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor, *, labelled: bool) -> ScanRecord:
-    """Read and measure one scan, with the objects in it if there are labels.
+def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor) -> ScanRecord:
+    """Read and measure one scan and the labelled objects in it.
 
     Raises:
         DatasetError: its calibration or labels are missing or damaged.
@@ -80,10 +80,7 @@ def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor, *, labelled: 
     sums = [[np.bincount(band, q**power, BANDS)[:BANDS] for q in quantities] for power in (0, 1, 2)]
     reflectance = {"overall": _histogram(value)[None], "ground": _histogram(value[ground])[None]}
     reflectance["non_ground"] = reflectance["overall"] - reflectance["ground"]
-    cars = np.zeros((0, 2))
-    if labelled:
-        of_objects, cars = _objects(split, frame_id, points, value)
-        reflectance |= of_objects
+    of_objects, cars = _objects(split, frame_id, points, value)
     return ScanRecord(
         len(points),
         int(camera.sum()),
@@ -93,7 +90,7 @@ def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor, *, labelled: 
         np.bincount((_azimuth(points) * (SECTORS / (2 * np.pi))).astype(np.int64), minlength=SECTORS)[:SECTORS],
         np.bincount(np.minimum(slant, RANGE_BINS).astype(np.int64), minlength=RANGE_BINS)[:RANGE_BINS],
         np.array(sums),
-        reflectance,
+        reflectance | of_objects,
         cars,
     )
 

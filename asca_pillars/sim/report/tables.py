@@ -54,9 +54,11 @@ def notes(comparison: Comparison) -> list[str]:
     """How many bars are kept, what was left out, and how to read the distances."""
     barred = [row for row in comparison.rows if row.within is not None]
     missed = "; ".join(row.name for row in comparison.missed)
+    excused = "; ".join(row.name for row in comparison.missed if row.excused)
     return [
         f"{len(barred) - len(comparison.missed)} of {len(barred)} bars kept"
         + (f"; missed: {missed}" if missed else ""),
+        *([f"Missed, but no farther off than chance: {excused}"] if excused else []),
         *(f"Left out: {line}" for line in comparison.skipped),
         "JS: Jensen-Shannon distance (base 2: 0 alike, 1 disjoint); of reflectances over 21 bins, exactly 0 and 20 of "
         "0.05, beside their means.",

@@ -57,6 +57,14 @@ def test_the_bar_of_a_ratio_bounds_both_sides(value: float, kept: bool) -> None:
     assert Row("reflectance", "car", None, None, "distance", 0.149, 0.15).within is True
 
 
+def test_few_real_objects_excuse_what_chance_explains() -> None:
+    assert Row("reflectance", "van", None, None, "distance", 0.3, 0.15, noise=0.33).excused
+    assert not Row("reflectance", "van", None, None, "distance", 0.3, 0.15, noise=0.29).excused
+    assert not Row("reflectance", "van", None, None, "distance", 0.1, 0.15, noise=0.33).excused, "nothing to excuse"
+    assert Row("points per car", "at 10 m", 100, 80, "ratio", 0.8, 0.15, noise=0.21).excused
+    assert not Row("points per car", "at 10 m", 100, 80, "ratio", 0.8, 0.15).excused
+
+
 def test_what_cannot_be_compared_is_said(measured: Measured, tmp_path: Path) -> None:
     view = measure(write_set(tmp_path, camera_view=True), progress=False)
     comparison = compare(view, kitti_reference().statistics)
