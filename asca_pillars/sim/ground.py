@@ -54,9 +54,11 @@ class Ground:
 
     @property
     def rails_v_m(self) -> float | None:
-        """Middle of the tracks in road coordinates, if there are any."""
-        v = float(self.shape[groundcast.RAILS_V])
-        return v if v > NO_RAILS else None
+        """Middle of a track in road coordinates, of the left one of two, if there is any."""
+        v = self._numbers[groundcast.RAILS_V]
+        if v <= NO_RAILS:
+            return None
+        return v + (groundcast.TRACK_SPACING_HALF_M if self._numbers[groundcast.TRACKS] > 1.0 else 0.0)
 
     @property
     def left_edge_m(self) -> float:

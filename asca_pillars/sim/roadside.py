@@ -72,6 +72,9 @@ def _line(builder: Builder, whole: Stretch) -> None:
 
 def _everywhere(builder: Builder, make: Lining, whole: Stretch) -> None:
     """One lining along a whole side, open at a junction only."""
+    if whole.cross:
+        make(builder, whole)
+        return
     start, end = whole.start_m, whole.start_m + whole.length_m
     while start < end:
         length = builder.until_junction(start, end - start)
