@@ -2,10 +2,10 @@
 
     OMP_NUM_THREADS=1 python -m benchmarks.simulator --frames 60 --workers 1,2
 
-Stages are those of `simulate_frame`, in milliseconds of processor time on one core, so that other programs disturb
-them little (and so OMP_NUM_THREADS: linear algebra would wait on every core): median, and the 5th and 95th percentile over the frames. Frames per second are wall-clock time of whole
-frames in memory, without writing them; the first frames of each process, which compile or load the ray caster, are
-left out.
+Stages are those of `simulate_frame`, in milliseconds of processor time on one core, so that other programs disturb them
+little (nor does linear algebra wait on every core, see OMP_NUM_THREADS): median, and the 5th and 95th percentile over
+the frames. Frames per second are wall-clock time of whole frames in memory, without writing them; the first frames of
+each process, which compile or load the ray caster, are left out.
 """
 
 import multiprocessing

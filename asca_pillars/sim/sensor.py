@@ -42,8 +42,8 @@ class Lidar:
     ego_beyond_ring: tuple[int, ...] = hdl64.EGO_BEYOND_RING
     elevation_jitter_deg: float = 0.03  # known to the sensor: a scan of other angles, not an error
     range_m: tuple[float, float] = (2.0, 80.0)
-    range_sigma_m: tuple[float, float] = (0.006, 0.011)  # drawn once per scan
-    ring_bias_sigma_m: float = 0.016  # with it, points of several rings on a plane spread over 2 to 3 cm
+    range_sigma_m: tuple[float, float] = (0.005, 0.010)  # drawn once per scan
+    ring_bias_sigma_m: float = 0.022  # with it, points of several rings on a plane spread over 2 to 3 cm
     # A footprint that leans over an edge meets two surfaces: the share of firings that lean to either side, and
     # the share of those that report nothing. KITTI misses one firing at every fifth step in depth.
     beam_split_share: float = 0.3
