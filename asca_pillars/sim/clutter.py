@@ -22,7 +22,7 @@ from .furniture import (
     shelter,
 )
 from .lookalikes import column, container, heap, parked_bicycles, parked_motorbikes, post_with_box, stack, thin_cylinder
-from .vegetation import hedge_block, shrub, tree, weeds
+from .vegetation import bush, hedge_block, shrub, tree, weeds
 
 Thing = Callable[[Builder, float, float], None]
 SCATTERED_WITHIN_M = 38.0  # of the road's middle
@@ -42,6 +42,8 @@ def scatter(builder: Builder) -> None:
         beside = rng.uniform(0.25, 0.8) if rng.random() < 0.35 else rng.uniform(0.3, pavement + 6.0)
         if rng.random() < 0.22:
             edge, beside = 0.0, rng.uniform(edge + 2.0, SCATTERED_WITHIN_M)
+        elif rng.random() < 0.07:  # between parked cars, as planted build-outs of the kerb are
+            beside = -rng.uniform(0.3, 1.8)
         if not builder.near_junction(along, along):
             things[int(np.searchsorted(upto, rng.random()))](builder, along, float(side * (edge + beside)))
     if ground.cross_half_m > 0 and rng.random() < 0.35:
@@ -58,5 +60,6 @@ SHARES: dict[Thing, float] = {
     pole: 0.13, pole_group: 0.04, bollards: 0.07, delineators: 0.04, cabinet: 0.07, bins: 0.06, bench: 0.03,
     planter: 0.03, shelter: 0.012, billboard: 0.025, barrier_boards: 0.02, low_stones: 0.07,
     thin_cylinder: 0.035, post_with_box: 0.04, column: 0.025, container: 0.015, heap: 0.03, stack: 0.025,
-    hedge_block: 0.035, parked_bicycles: 0.04, parked_motorbikes: 0.013, any_shrub: 0.13, tree: 0.05, weeds: 0.13,
+    hedge_block: 0.035, parked_bicycles: 0.04, parked_motorbikes: 0.013, any_shrub: 0.11, bush: 0.035, tree: 0.05,
+    weeds: 0.13,
 }  # fmt: skip

@@ -42,15 +42,15 @@ class SceneConfig:
     # Shares of street kinds: narrow with parked cars, wide in town, out of town, square or campus, trunk road,
     # alley between walls.
     residential: float = 0.32
-    urban: float = 0.27
+    urban: float = 0.28
     rural: float = 0.12
     campus: float = 0.11
-    road: float = 0.11
-    alley: float = 0.07
+    road: float = 0.12
+    alley: float = 0.05
     junction_share: float = 0.45
-    rails_share: float = 0.07
+    rails_share: float = 0.10
     median_share: float = 0.4  # of the wide streets
-    closed_end_share: float = 0.18  # streets that end before a wood or a house, on either end
+    closed_end_share: float = 0.14  # streets that end before a wood or a house, on either end
     turning_share: float = 0.12  # the car stands at up to half a radian to the street
 
     sensor_height_m: tuple[float, float] = (1.69, 1.82)

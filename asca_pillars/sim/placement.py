@@ -134,7 +134,7 @@ class Placer:
             return self._crossing()
         if habit < parked:
             return self._parked(size, way)
-        if habit < parked + 0.15:
+        if habit < parked + 0.18:
             return self._off_street(way)
         return self._moving(size, way)
 
@@ -172,7 +172,7 @@ class Placer:
     def _off_street(self, way: float) -> Place:
         """In drives, yards and car parks."""
         rng, ground = self.rng, self.ground
-        v = (1.0 if rng.random() < 0.6 else -1.0) * (ground.half_width_m + ground.pavement_m + rng.uniform(2.0, 20.0))
+        v = (1.0 if rng.random() < 0.6 else -1.0) * (ground.half_width_m + ground.pavement_m + rng.uniform(2.0, 22.0))
         heading = float(rng.choice([0.0, np.pi, np.pi / 2, -np.pi / 2], p=[0.3, 0.3, 0.2, 0.2])) + rng.normal(0, 0.12)
         return ground.to_lidar(way * self._distance(2.0, 15.0), v, heading)
 
@@ -259,7 +259,7 @@ class Placer:
         else:
             u = way * self._distance(2.0, 12.5)
             side = -1.0 if rng.random() < 0.6 else 1.0
-            v = side * (half + (rng.uniform(-1.3, -0.3) if rng.random() < 0.5 else rng.uniform(0.4, 4.5)))
+            v = side * (half + (rng.uniform(-1.3, -0.3) if rng.random() < 0.5 else rng.uniform(0.4, 7.0)))
             heading = (np.pi if (side > 0) != (rng.random() < 0.3) else 0.0) + rng.normal(0, 0.12)
         self._riders.append((u, v, heading))
         return self.ground.to_lidar(u, v, heading)

@@ -43,7 +43,7 @@ def _line(builder: Builder, whole: Stretch) -> None:
     rng, kind = builder.rng, builder.kind
     makers, weights = zip(*LININGS[kind].items(), strict=True)
     share = np.array(weights) / sum(weights)
-    setback = float(rng.uniform(0.0, {"urban": 1.5, "alley": 0.5}.get(kind, 3.5)))
+    setback = float(rng.uniform(0.0, {"urban": 1.5, "alley": 0.5}.get(kind, 4.5)))
     if kind in ("road", "rural") and rng.random() < 0.5:
         _everywhere(builder, guard_rail, replace(whole, away_m=whole.away_m - 0.2))
     # On some streets one thing goes on and on; on others every neighbor has chosen otherwise.

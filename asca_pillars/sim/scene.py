@@ -15,7 +15,7 @@ from .placement import Occupied, Placer, Target
 from .primitives import BACKGROUND, Primitives
 from .raycast import Bodies
 from .roadside import line_streets
-from .shapes import heavy, people, styles, vehicles
+from .shapes import cycles, heavy, people, styles, vehicles
 from .streets import draw_ground, draw_kind
 
 EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 2.6
@@ -49,7 +49,7 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
     placer = Placer(rng, config, ground, occupied, habits)
     if rng.random() >= config.empty_share:
         for name, rate in _rates(config, habits):
-            crowds = name in ("Pedestrian", "Person_sitting", "Cyclist")
+            crowds = name in ("Pedestrian", "Person_sitting")
             dispersion = config.people_dispersion if crowds else config.dispersion
             for ahead in (True, False):
                 # A gamma-distributed rate makes the counts negative binomial.
@@ -118,6 +118,8 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         body = (heavy.bus_body if bus else heavy.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
     elif name == "Tram":
         body = heavy.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
+    elif name == "Misc" and width < 1.0 and 1.4 < length < 2.5 and height > 1.35:
+        body = cycles.motorcyclist_body(rng, height - 0.08, length - 0.06)
     elif name == "Misc":
         body = heavy.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
     elif name == "Pedestrian":

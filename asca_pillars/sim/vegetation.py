@@ -206,3 +206,18 @@ def weeds(builder: Builder, along: float, across: float) -> None:
         places = along + long * rng.uniform(-0.5, 0.5, count), across + wide * rng.uniform(-0.5, 0.5, count)
         z = rng.uniform(0.02, 0.45, count) * rng.random(count)
         builder.clouds(*places, z, radii, rng.uniform(0.2, 0.5), np.exp(rng.uniform(0.7, 2.7, count)))
+
+
+def bush(builder: Builder, along: float, across: float) -> None:
+    """A bush or a clump of them as large as a car, broad at the foot or at the top."""
+    rng = builder.rng
+    long, wide, height = float(rng.uniform(0.7, 2.3)), float(rng.uniform(0.6, 1.3)), float(rng.uniform(0.9, 2.6))
+    if not builder.claim(along, across, 1.8 * long, 1.8 * wide):
+        return
+    count = int(30 * long * wide * height**0.5)
+    up = rng.random(count)
+    shape = float(rng.uniform(-0.7, 0.7))  # how much broader its top is than its foot
+    spread = np.sqrt(rng.random(count)) * np.clip(1.0 + shape * (up - 0.5), 0.2, 1.5)
+    way = rng.uniform(0.0, 2 * np.pi, count)
+    places = along + 0.85 * long * spread * np.cos(way), across + 0.85 * wide * spread * np.sin(way)
+    _clusters(builder, *places, 0.1 + height * up, 0.2, float(rng.uniform(2.0, 7.0)), cross=False)
