@@ -91,21 +91,45 @@ def bench(
 @app.command()
 def simulate(
     out: Annotated[Path, typer.Argument(help="Folder for the KITTI-layout dataset.")],
-    frames: Annotated[int, typer.Option("--frames", "-n", min=1, help="Frames to write.")] = 100,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            "--frames",
+            "-n",
+            min=1,
+            help="Frames to write. Default: 100; with --report none where there are scans already.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same bytes, whatever the number of workers.")] = 0,
     workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+    config: Annotated[
+        str | None,
+        typer.Option(
+            "--config", "-c", help="YAML of scenes and sensor, or the name of one that ships. Default: KITTI's."
+        ),
+    ] = None,
     view: Annotated[
-        str,
-        typer.Option(help="full: 360 degrees, as KITTI stores scans; camera: only what the camera sees, 6x smaller."),
-    ] = "full",
+        str | None,
+        typer.Option(
+            help="full: 360 degrees, as KITTI stores scans; camera: only what the camera sees, 6x smaller. "
+            "Default: the config's; without one, full."
+        ),
+    ] = None,
     val_share: Annotated[
         float, typer.Option(min=0, max=1, help="Share of the frames listed in ImageSets/val.txt.")
     ] = 0.1,
+    report: Annotated[
+        bool,
+        typer.Option("--report", help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/."),
+    ] = False,
 ) -> None:
-    """Write simulated street scans with labels in KITTI's layout."""
+    """Write simulated street scans with labels in KITTI's layout, and say how like real ones they are.
+
+    With --report, a folder that holds scans already, simulated or real, is compared as it is unless --frames is given.
+    """
     from asca_pillars.commands.simulate import run
 
-    run(out, frames, seed, workers, view, val_share)
+    run(out, frames, seed, workers, config, view, val_share, report)
 
 
 @app.command()

@@ -4,16 +4,18 @@ One is not: inserting objects reads a prepared dataset, so it is off until a con
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import yaml
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.spec import DetectorSpec
 from asca_pillars.schema import Strict, parse
+
+T = TypeVar("T")
 
 CpaReading = Literal["none", "paper", "channel", "point"]
 InsertMethod = Literal["none", "gt_aug", "rs_aug"]
@@ -188,10 +190,14 @@ class Config(Strict):
             raise ConfigError("augment.insert.proportions: all are 0; set augment.insert.method=none to insert nothing")
 
 
-def shipped_configs() -> dict[str, Path]:
-    """The configurations that come along, by name: those of the installed package, or of the checkout."""
+def shipped_configs(kind: str = "") -> dict[str, Path]:
+    """The configurations that come along, by name: those of the installed package, or of the checkout.
+
+    Args:
+        kind: folder below configs/ for those of something else than a model.
+    """
     package = Path(__file__).parent
-    folders = (package / "configs", package.parent / "configs")
+    folders = (package / "configs" / kind, package.parent / "configs" / kind)
     return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
 
 
@@ -205,25 +211,32 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     Raises:
         ConfigError: unreadable YAML, an unknown key anywhere (the nearest is named), an impossible value.
     """
-    path = shipped_configs().get(str(path), Path(path))
+    return read_settings(Config, path, overrides, shipped_configs())
+
+
+def read_settings(type_: type[T], path: str | Path, overrides: Sequence[str], shipped: Mapping[str, Path]) -> T:
+    """Settings of any dataclass, as `load_config` reads those of a model; `shipped` are the names that stand for files.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    path = shipped.get(str(path), Path(path))
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error.strerror}); these ship: {', '.join(shipped_configs())}"
-        ) from None
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); these ship: {', '.join(shipped)}") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date like 2026-99-99
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if data is None:
         data = {}
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: expected `key: value` lines, found a {type(data).__name__}")
-    config = parse(Config, data, str(path))
+    settings = parse(type_, data, str(path))
     if not overrides:
-        return config
+        return settings
     for override in overrides:
         _apply(data, override)
-    return parse(Config, data, f"{path} with {' '.join(overrides)}")
+    return parse(type_, data, f"{path} with {' '.join(overrides)}")
 
 
 def _require(section: str, settings: Strict, names: Sequence[str], *, low: float, high: float = math.inf) -> None:

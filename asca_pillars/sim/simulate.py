@@ -134,6 +134,9 @@ def _claim_folder(root: Path, seed: int, config: SimulationConfig) -> None:
     path = root / "simulation.json"
     text = json.dumps({"seed": seed, **asdict(config)}, indent=2) + "\n"
     if not path.exists():
+        scans = KittiSplit(root).folder / "velodyne"
+        if any(scans.glob("*.bin")):
+            raise DatasetError(f"{scans}: holds scans that were not simulated; choose another folder")
         with atomic_path(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
     elif path.read_text(encoding="utf-8") != text:

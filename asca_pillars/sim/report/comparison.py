@@ -1,0 +1,217 @@
+"""A measured data set beside KITTI: row by row, and whether each is as near as it should be."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from .distance import coarse, jensen_shannon, noise_of_points, noise_of_units
+from .measuring import Measured
+from .scans import MATERIALS, OBJECTS, unit_histograms
+from .statistics import BAND_M, PERCENTILES, REFLECTANCES, Band, ScanStatistics, Statistics
+
+RATIO_BAR = 0.15
+DISTANCE_BAR = 0.15
+BARRED_RANGES_M = (10, 20, 30, 40)
+CAR_RANGES_M = (*BARRED_RANGES_M, 50)
+
+_MEANS = {
+    "points per scan": "points",
+    "points in camera view": "camera_points",
+    "ground share": "ground_share",
+    "ground share in view": "camera_ground_share",
+}
+_PLACES = {
+    "points per ring": "points_per_ring",
+    "azimuths, bins of 5 degrees": "sector_points",
+    "ranges, bins of 1 m": "range_points",
+}
+_SHARES = {"heads as we do": "yaw_same", "comes towards us": "yaw_oncoming", "heads across": "yaw_across"}
+_HISTOGRAMS = {
+    "number per frame": "per_frame",
+    "distances, bins of 5 m": "range_counts",
+    "headings, bins of 15 degrees": "yaw_counts",
+    "occlusion states": "occlusion",
+    "truncation groups": "truncation",
+}
+
+Measure = Literal["ratio", "difference", "distance"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One thing compared.
+
+    Attributes:
+        group: heading under which the row stands.
+        real, simulated: the two values; of histograms their means, where these say something.
+        measure: what `value` is: simulated / real, simulated - real, or the Jensen-Shannon distance.
+        bar: how far a ratio may be from 1, or how large a distance; None where the row is for information.
+        noise: what chance alone would do, where it is known: the standard error of a ratio; the distance to expect
+            of as few objects (or scans) as the real reflectances come from, or of as few labels as this set has.
+        noise_of_points: the distance to expect of as many independent points as the real reflectances are.
+    """
+
+    group: str
+    name: str
+    real: float | None
+    simulated: float | None
+    measure: Measure
+    value: float
+    bar: float | None = None
+    noise: float | None = None
+    noise_of_points: float | None = None
+
+    @property
+    def within(self) -> bool | None:
+        """Whether the row keeps its bar; None without one."""
+        if self.bar is None:
+            return None
+        return self.value < self.bar if self.measure == "distance" else abs(self.value - 1) <= self.bar
+
+    @property
+    def excused(self) -> bool:
+        """Whether a bar is missed by no more than chance would: better cannot be told from as little real data."""
+        away = self.value if self.measure == "distance" else abs(self.value - 1)
+        return self.within is False and self.noise is not None and away <= self.noise
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The rows, and in words which could not be made and why."""
+
+    real: Statistics
+    simulated: Statistics
+    rows: tuple[Row, ...]
+    skipped: tuple[str, ...]
+
+    @property
+    def missed(self) -> tuple[Row, ...]:
+        """Rows that do not keep their bar."""
+        return tuple(row for row in self.rows if row.within is False)
+
+
+def compare(measured: Measured, real: Statistics) -> Comparison:
+    """All rows that both sides have the numbers for."""
+    ours = measured.statistics
+    rows = [
+        *_scan_rows(real.scan, ours.scan),
+        *_car_rows(real.scan, ours.scan),
+        *_reflectance_rows(real.scan, measured),
+        *_band_rows(real.scan, ours.scan),
+        *(row for name in real.labels if name in ours.labels for row in _label_rows(name, real, ours)),
+        _ratio("labels", "DontCare per frame", real.dont_care_per_frame, ours.dont_care_per_frame),
+    ]
+    return Comparison(real, ours, tuple(rows), tuple(_skipped(real, ours)))
+
+
+def _scan_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
+    for name, field in _MEANS.items():
+        first, second = getattr(real, field), getattr(ours, field)
+        if first is not None and second is not None:
+            error = np.hypot(first.std / np.sqrt(real.scans), second.std / np.sqrt(ours.scans)) / first.mean
+            yield _ratio("scans", name, first.mean, second.mean, RATIO_BAR, float(error))
+    for name, field in _PLACES.items():
+        first, second = getattr(real, field), getattr(ours, field)
+        if first is not None and second is not None and len(first) == len(second):
+            yield Row("scans", name, None, None, "distance", float(jensen_shannon(first, second)))
+
+
+def _car_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
+    for name, field in (("points of a car", "car_fit"), ("of near cars alone", "near_car_fit")):
+        first, second = getattr(real, field), getattr(ours, field)
+        if first is None or second is None:
+            continue
+        for range_m in CAR_RANGES_M:
+            bar = RATIO_BAR if range_m in BARRED_RANGES_M else None
+            points = first.points_at(range_m), second.points_at(range_m)
+            error = points[1] / points[0] * np.hypot(first.error_at(range_m), second.error_at(range_m))
+            yield _ratio("points per car", f"{name} at {range_m} m", *points, bar, float(error))
+
+
+def _reflectance_rows(real: ScanStatistics, measured: Measured) -> Iterator[Row]:
+    levels = np.arange(REFLECTANCES) / REFLECTANCES
+    for name in MATERIALS:
+        first, second = real.reflectance.get(name), measured.statistics.scan.reflectance.get(name)
+        if first is None or second is None:
+            continue
+        p, q = np.array(first.counts), np.array(second.counts)
+        units = coarse(unit_histograms(measured.records, name))
+        noise = (
+            noise_of_units(units, first.units) if len(units) >= first.units else None,
+            noise_of_points(coarse(q), round(p.sum())),
+        )
+        means = float(levels @ p / p.sum()), float(levels @ q / q.sum())
+        distance = float(jensen_shannon(coarse(p), coarse(q)))
+        yield Row("reflectance", f"reflectance: {name}", *means, "distance", distance, DISTANCE_BAR, *noise)
+        yield Row("reflectance", f"{name}, bins of 0.01", None, None, "distance", float(jensen_shannon(p, q)))
+        yield _ratio("reflectance", f"{name}, share of 0", float(p[0] / p.sum()), float(q[0] / q.sum()))
+
+
+def _band_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
+    z, reflectance = real.ground_z_m, real.ground_reflectance
+    if z is None or reflectance is None or ours.ground_z_m is None or ours.ground_reflectance is None:
+        return
+    yield from _by_range("ground", "mean height (m)", z, ours.ground_z_m)
+    for band, (first, second) in enumerate(zip(reflectance, ours.ground_reflectance, strict=True)):
+        if first and second:
+            yield _ratio("ground", f"mean reflectance, {_range_name(band)}", first.mean, second.mean)
+
+
+def _label_rows(name: str, real: Statistics, ours: Statistics) -> Iterator[Row]:
+    first, second = real.labels[name], ours.labels[name]
+    yield _ratio(name, "per frame", first.count / real.frames, second.count / ours.frames)
+    for size in ("height_m", "width_m", "length_m"):
+        of_first, of_second = getattr(first, size), getattr(second, size)
+        yield _ratio(name, f"{size.removesuffix('_m')}, mean (m)", of_first.mean, of_second.mean)
+        yield _ratio(name, f"{size.removesuffix('_m')}, deviation (m)", of_first.std, of_second.std)
+    for title, field in _SHARES.items():
+        yield _ratio(name, title, getattr(first, field), getattr(second, field))
+    for title, counts in (("occlusion", "occlusion"), ("truncation", "truncation")):
+        p, q = np.array(getattr(first, counts)), np.array(getattr(second, counts))
+        yield _ratio(name, f"{title}: share of none", p[0] / p.sum(), q[0] / q.sum())
+    for title, field in _HISTOGRAMS.items():
+        p, q = getattr(first, field), getattr(second, field)
+        noise = noise_of_points(p, sum(q))
+        yield Row(name, title, None, None, "distance", float(jensen_shannon(p, q)), None, noise)
+    for index in (0, 2, 4):
+        place = first.left_m.percentiles[index], second.left_m.percentiles[index]
+        yield _difference(name, f"to the left (m), {PERCENTILES[index]} %", *place)
+    yield from _by_range(name, "bottom (m)", first.bottom_z_m, second.bottom_z_m)
+
+
+def _by_range(group: str, what: str, real: tuple[Band | None, ...], ours: tuple[Band | None, ...]) -> Iterator[Row]:
+    for band, (first, second) in enumerate(zip(real, ours, strict=True)):
+        if first and second:
+            yield _difference(group, f"{what}, {_range_name(band)}", first.mean, second.mean)
+
+
+def _range_name(band: int) -> str:
+    return f"{band * BAND_M:.0f}-{(band + 1) * BAND_M:.0f} m"
+
+
+def _ratio(
+    group: str, name: str, real: float, ours: float, bar: float | None = None, noise: float | None = None
+) -> Row:
+    return Row(group, name, real, ours, "ratio", ours / real if real else float("nan"), bar, noise)
+
+
+def _difference(group: str, name: str, real: float, ours: float) -> Row:
+    return Row(group, name, real, ours, "difference", ours - real)
+
+
+def _skipped(real: Statistics, ours: Statistics) -> Iterator[str]:
+    if ours.scan.points is None:
+        yield (
+            "the scans hold only what the camera sees: no points per scan and ring, ranges, ground by range, "
+            "reflectances of all, ground and non_ground returns; simulate with --view full to compare them"
+        )
+    elif ours.scan.points_per_ring is None or len(ours.scan.points_per_ring) != len(real.scan.points_per_ring or ()):
+        yield "the scans have another number of rings than KITTI's: no points per ring"
+    if ours.scan.car_fit is None:
+        yield "too few unoccluded, untruncated cars between 12 and 70 m: no points per car"
+    for name in sorted(set(real.labels) - set(ours.labels)):
+        yield f"no {name} is labelled"
+    for name in sorted(set(real.scan.reflectance) & set(OBJECTS) - set(ours.scan.reflectance)):
+        yield f"no returns of a {name}: no reflectance"

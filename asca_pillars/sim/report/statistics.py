@@ -1,0 +1,181 @@
+"""The statistics that are compared, and those of KITTI that come with the package.
+
+What a scan that was cut to the camera's view cannot tell is None. Ranges are in metres, reflectances in hundredths.
+"""
+
+import json
+import math
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+from asca_pillars.schema import Strict, parse
+
+CLASSES = ("Car", "Pedestrian", "Cyclist")
+BAND_M = 10.0  # of what is told by range, from 0 to 80 m
+BANDS = 8
+SECTORS = 72  # of 5 degrees of azimuth, counter-clockwise from straight ahead
+RANGE_BINS = 80  # of 1 m, of slant range
+LABEL_RANGE_BINS = 20  # of 5 m, of horizontal distance
+YAW_BINS = 24  # of 15 degrees from -pi
+REFLECTANCES = 100  # 0.00 to 0.99
+MAX_PER_FRAME = 20
+PERCENTILES = (5, 25, 50, 75, 95)
+CAR_FIT_RANGE_M = (12.0, 70.0)
+"""Where KITTI's cars of the fit stand. A power law holds piecewise only: fits are alike over the same span alone."""
+NEAR_CARS_M = (12.0, 50.0)
+"""Beyond, cars have so few returns that one more or less turns the whole line, and many have no label."""
+TRUNCATION_EDGES = (0.0, 0.15, 0.30, 0.50)  # shares above the last are the fifth group
+
+
+@dataclass(frozen=True)
+class Spread(Strict):
+    """How a quantity is distributed; percentiles are those of PERCENTILES."""
+
+    mean: float
+    std: float
+    percentiles: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Band(Strict):
+    """Mean and standard deviation of a quantity, in one band of range or over the scans."""
+
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True)
+class Reflectance(Strict):
+    """A histogram of reflectance (REFLECTANCES,), and how many scans or objects its points come from."""
+
+    counts: tuple[float, ...]
+    units: int
+
+
+@dataclass(frozen=True)
+class CarFit(Strict):
+    """Points of an unoccluded, untruncated car at range r: exp(a) r^b, by least squares of the logarithms.
+
+    Attributes:
+        a, b: the line.
+        cars: that it was fitted to.
+        residual: standard deviation of the logarithms of the points about it.
+        log_range: mean and standard deviation of the logarithms of the cars' ranges.
+    """
+
+    a: float
+    b: float
+    cars: int
+    residual: float
+    log_range: Band
+
+    def points_at(self, range_m: float) -> float:
+        """Returns that such a car has at `range_m`."""
+        return math.exp(self.a + self.b * math.log(range_m))
+
+    def error_at(self, range_m: float) -> float:
+        """Relative standard error of `points_at`, from the scatter of the cars and their distance to `range_m`."""
+        away = (math.log(range_m) - self.log_range.mean) / self.log_range.std
+        return self.residual * math.sqrt((1 + away**2) / self.cars)
+
+
+@dataclass(frozen=True)
+class ScanStatistics(Strict):
+    """Of scans; what is not said to be otherwise is a mean over the scans.
+
+    Attributes:
+        scans: how many were measured.
+        points, camera_points: returns of a scan, and those in the image.
+        ground_share, camera_ground_share: of these returns.
+        points_per_ring: (rings,) from the top, None also where scans disagree about their number.
+        sector_points: (SECTORS,) points per 5 degrees of azimuth.
+        range_points: (RANGE_BINS,) points per metre of slant range.
+        ground_z_m, ground_reflectance: (BANDS,) of slant range, of all ground returns together.
+        reflectance: by "overall", "ground", "non_ground" and the classes of objects in small letters. An object's
+            points are those in its box more than 0.1 m above its bottom.
+        car_fit, near_car_fit: over CAR_FIT_RANGE_M and NEAR_CARS_M; None where there are too few cars.
+    """
+
+    scans: int
+    camera_points: Band
+    camera_ground_share: Band
+    reflectance: dict[str, Reflectance]
+    car_fit: CarFit | None
+    near_car_fit: CarFit | None
+    points: Band | None = None
+    ground_share: Band | None = None
+    points_per_ring: tuple[float, ...] | None = None
+    sector_points: tuple[float, ...] | None = None
+    range_points: tuple[float, ...] | None = None
+    ground_z_m: tuple[Band | None, ...] | None = None
+    ground_reflectance: tuple[Band | None, ...] | None = None
+
+
+@dataclass(frozen=True)
+class LabelStatistics(Strict):
+    """Of the labels of one class; boxes in the LiDAR frame.
+
+    Attributes:
+        count: labelled objects.
+        per_frame: (MAX_PER_FRAME + 1,) frames with 0, 1, 2 ... objects; the last holds those with more, too.
+        height_m, width_m, length_m: sizes.
+        left_m: the center's lateral position.
+        range_counts: (LABEL_RANGE_BINS,) of horizontal distance.
+        bottom_z_m: (BANDS,) of horizontal distance.
+        yaw_counts: (YAW_BINS,); 0 is our direction.
+        yaw_same, yaw_oncoming, yaw_across: shares within 15 degrees of ours, of the opposite, and across.
+        occlusion: (4,) objects of each state.
+        truncation: (5,) objects truncated by nothing, up to 0.15, 0.30, 0.50, and by more.
+    """
+
+    count: int
+    per_frame: tuple[int, ...]
+    height_m: Spread
+    width_m: Spread
+    length_m: Spread
+    left_m: Spread
+    range_counts: tuple[int, ...]
+    bottom_z_m: tuple[Band | None, ...]
+    yaw_counts: tuple[int, ...]
+    yaw_same: float
+    yaw_oncoming: float
+    yaw_across: float
+    occlusion: tuple[int, ...]
+    truncation: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Statistics(Strict):
+    """Of a data set: its scans, the labels of CLASSES (those of which there are any), and DontCare areas per frame."""
+
+    source: str
+    scan: ScanStatistics
+    frames: int
+    labels: dict[str, LabelStatistics]
+    dont_care_per_frame: float
+
+
+@dataclass(frozen=True)
+class Sensor(Strict):
+    """KITTI's HDL-64E: a point of ring k at horizontal distance rho lies at z = origin_z_m[k] + rho tan(elevation)."""
+
+    elevation_deg: tuple[float, ...]
+    origin_z_m: tuple[float, ...]
+    firings_per_ring: float
+
+
+@dataclass(frozen=True)
+class Reference(Strict):
+    """KITTI's statistics and sensor, as they come with the package."""
+
+    statistics: Statistics
+    sensor: Sensor
+
+
+@cache
+def kitti_reference() -> Reference:
+    """What real scans are like: the statistics of KITTI that the package carries."""
+    name = "kitti_statistics.json"
+    text = resources.files("asca_pillars.sim").joinpath(name).read_text(encoding="utf-8")
+    return parse(Reference, json.loads(text), name)

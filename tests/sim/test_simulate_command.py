@@ -1,0 +1,47 @@
+"""`asca simulate --report` as a user meets it: when it simulates, what it compares, what it leaves alone."""
+
+from pathlib import Path
+
+import pytest
+
+from asca_pillars.commands import extras
+from asca_pillars.commands.simulate import run
+from asca_pillars.errors import AscaError, DatasetError
+from tests.sim.report.made_up import write_set
+
+
+def simulate(out: Path, frames: int | None, *, view: str | None = "camera", report: bool = True) -> None:
+    run(out, frames, 0, 1, None, view, 0.5, report)
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_frames_are_simulated_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulate(tmp_path, 2)
+    told = capsys.readouterr().out
+    assert "2 frames below" in told and "points in camera view" in told and "bars kept" in told
+    names = {path.name for path in (tmp_path / "report").iterdir()}
+    assert names == {"report.md", "report.json", "cars.png", "labels.png", "reflectance.png"}
+    before = written(tmp_path)
+    simulate(tmp_path, None, view=None)
+    assert "frames below" not in capsys.readouterr().out, "what is there is compared as it is"
+    assert written(tmp_path) == before
+
+
+def test_scans_that_were_not_simulated_are_compared_and_never_added_to(tmp_path: Path) -> None:
+    before = written(write_set(tmp_path))
+    simulate(tmp_path, None)
+    assert {name: data for name, data in written(tmp_path).items() if not name.startswith("report/")} == before
+    for report in (True, False):
+        with pytest.raises(DatasetError, match="holds scans that were not simulated; choose another folder"):
+            simulate(tmp_path, 8, report=report)
+    assert {name: data for name, data in written(tmp_path).items() if not name.startswith("report/")} == before
+
+
+def test_plots_need_matplotlib_and_say_so_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(extras.EXTRAS, "eval", ("no_such_plotter",))
+    with pytest.raises(AscaError, match=r"asca-pillars\[eval\]"):
+        simulate(tmp_path / "out", 2)
+    assert not (tmp_path / "out").exists()
