@@ -14,7 +14,7 @@ Ints = npt.NDArray[np.int64]
 Owners = npt.NDArray[np.int32]
 
 FADING = 0.5  # spread of the power from firing to firing, in logarithm
-PIVOT = 0.4  # the reflectance that a response of any power leaves as it is
+PIVOT = 0.4  # the reflectance that the response leaves as it is
 UPDOWN_SPLIT = 0.3  # rings lie farther apart than firings: a footprint leans over fewer of their edges
 EDGE_M = 0.3  # less is a slant, not an edge
 PULSE_M = 0.6  # nearer together, two surfaces make one return
@@ -63,7 +63,7 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
     near, far = lidar.range_m
     kept = (power > firings.lost_power) & (luck >= firings.loss_share) & (slant > near) & (slant < far - 1e-3)
 
-    value = PIVOT * (echoes.reflectance / PIVOT) ** lidar.response
+    value = (PIVOT + lidar.dark_offset) * (echoes.reflectance / PIVOT) ** lidar.response - lidar.dark_offset
     value *= firings.ring_gain[ring] * _fade(echoes.slant_m, firings, ring)
     value += (firings.reflectance_sigma[ring] + lidar.reflectance_sigma_share * value) * speckle
     weak = (power < firings.zero_power) | (value < firings.faint[ring] * faint)
@@ -75,7 +75,7 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
     z = firings.origin_z_m[ring] + rho * firings.slope[ring]
     points = np.empty((len(rho), 4), np.float32)
     points[:, 0], points[:, 1], points[:, 2] = rho * np.cos(azimuth), rho * np.sin(azimuth), z
-    np.round(points, 3, out=points)
+    np.round(points[:, :3], 3, out=points[:, :3])
     points[:, 3] = value
     return Returns(points[kept], echoes.owner[kept], ring[kept])
 
