@@ -16,7 +16,7 @@ from . import groundcast
 from .groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M
 
 Floats = npt.NDArray[np.float64]
-LEVEL_WITHIN_M = 28.0
+LEVEL_WITHIN_M, SLOPE_LASTS_M = 28.0, 40.0
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,11 @@ class Ground:
 
     @property
     def rails_v_m(self) -> float | None:
-        """Middle of the tracks in road coordinates, if there are any."""
-        v = float(self.shape[groundcast.RAILS_V])
-        return v if v > NO_RAILS else None
+        """Middle of a track in road coordinates, of the left one of two, if there is any."""
+        v = self._numbers[groundcast.RAILS_V]
+        if v <= NO_RAILS:
+            return None
+        return v + (groundcast.TRACK_SPACING_HALF_M if self._numbers[groundcast.TRACKS] > 1.0 else 0.0)
 
     @property
     def left_edge_m(self) -> float:
@@ -128,11 +130,13 @@ def draw_relief(
     shape: Floats | None = None,
     bump_m: float = 0.0,
 ) -> Floats:
-    """Hills: a plane of `slope` (x, y), long waves that are level under the car, and bumps of standard deviation
-    `bump_m` beyond the pavements of the street `shape`. Metres, (R,R)."""
+    """Hills: a plane of `slope` (x, y) that levels out far away, long waves that are level under the car, and bumps
+    of standard deviation `bump_m` beyond the pavements of the street `shape`. Metres, (R,R)."""
     axis = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
     x, y = np.meshgrid(axis, axis, indexing="ij")
-    height: Any = slope[0] * x + slope[1] * y
+    # A slope lasts as far as one sees the street; KITTI's far ground lies as high, on average, as that near the car.
+    lasting = SLOPE_LASTS_M * np.tanh(axis / SLOPE_LASTS_M)
+    height: Any = slope[0] * lasting[:, None] + slope[1] * lasting[None, :]
     # Roads are laid out level where one drives: hills begin some way off, with their crests or troughs at the car.
     begun = 1.0 - np.exp(-(x**2 + y**2) / LEVEL_WITHIN_M**2)
     for wavelength in (160.0, 90.0, 45.0):

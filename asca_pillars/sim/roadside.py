@@ -72,6 +72,9 @@ def _line(builder: Builder, whole: Stretch) -> None:
 
 def _everywhere(builder: Builder, make: Lining, whole: Stretch) -> None:
     """One lining along a whole side, open at a junction only."""
+    if whole.cross:
+        make(builder, whole)
+        return
     start, end = whole.start_m, whole.start_m + whole.length_m
     while start < end:
         length = builder.until_junction(start, end - start)
@@ -93,12 +96,12 @@ def _part_carriageways(builder: Builder) -> None:
 def _backdrop(builder: Builder, side: float, edge: float) -> None:
     """Houses and woods behind the second row, with some gaps: few views in a valley are open to the horizon."""
     rng = builder.rng
-    away = float(rng.uniform(14.0, 40.0))
+    away, share = float(rng.uniform(14.0, 40.0)), float(rng.uniform(0.55, 1.0))
     start = -85.0
     while start < 85.0:
         length = float(rng.uniform(10.0, 30.0))
         stretch = Stretch(start, length, side, edge + away + float(rng.normal(0.0, 2.0)))
-        if rng.random() < 0.85 and not builder.near_junction(start, start + length):
+        if rng.random() < share and not builder.near_junction(start, start + length):
             (building if rng.random() < 0.4 else wood)(builder, stretch)
         start += length
         if rng.random() < 0.3:

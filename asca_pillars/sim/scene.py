@@ -18,7 +18,8 @@ from .roadside import line_streets
 from .shapes import cycles, heavy, people, styles, vehicles
 from .streets import draw_ground, draw_kind
 
-EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 2.6
+# Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
+EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 4.0
 # Of cars, of people on foot and of cyclists.
 RATE_FACTORS = {
     "residential": (1.15, 0.75, 0.9),

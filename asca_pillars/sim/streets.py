@@ -20,7 +20,7 @@ PAVEMENT_M = {
 }  # fmt: skip
 DIVIDED_SHARE = {"road": 0.6, "urban": 0.2, "rural": 0.1}
 RAILS_FACTOR = {"urban": 2.0, "road": 2.0, "alley": 0.0, "residential": 0.5}
-STEEP_SHARE = {"rural": 0.45, "road": 0.35}
+STEEP_SHARE = {"rural": 0.35, "road": 0.3}
 
 
 def draw_kind(config: SceneConfig, rng: np.random.Generator) -> str:

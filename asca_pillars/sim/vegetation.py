@@ -174,7 +174,7 @@ def trunk(builder: Builder, along: float, across: float, height: float, cross: b
     boles = int(rng.choice([1, 1, 1, 2, 3]))
     bark = float(rng.uniform(0.1, 0.4))
     for _ in range(boles):
-        lean = rng.normal(0.0, 0.05 if boles == 1 and rng.random() < 0.8 else 0.2, 2)
+        lean = rng.normal(0.0, 0.05 if boles == 1 and rng.random() < 0.8 else 0.16, 2)
         builder.post(
             along, across, -0.3, height + 0.3, radius * (1.15 if boles == 1 else 0.7), bark, cross, taper=0.6,
             lean=(float(lean[0]), float(lean[1])),
