@@ -52,7 +52,7 @@ class Lidar:
     # A return is kept without a reflectance below the first power, and lost below the second. Power is
     # reflectance * sqrt(cos(incidence)) / range^2; both thresholds are drawn together, once per scan.
     zero_power: tuple[float, float] = (2.5e-5, 7.5e-5)
-    lost_share_of_zero_power: float = 0.32
+    lost_share_of_zero_power: float = 0.2
     # The true reflectance is reported through a power law about 0.4 (1: as it is) that starts at `dark_offset` below
     # 0, times what each laser makes of it (empty: 1). Beyond `focus_m` it fades with exp(-((range - focus) / fade)^1.3)
     # (0: not), and the lasers of the first block lose `near_fade` of it right before them.
