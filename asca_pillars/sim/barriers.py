@@ -18,7 +18,7 @@ def high_wall(builder: Builder, stretch: Stretch) -> None:
 def _wall(builder: Builder, stretch: Stretch, height: float, pillars: bool) -> None:
     rng, across, cross = builder.rng, stretch.side * stretch.away_m, stretch.cross
     thick = float(rng.uniform(0.15, 0.4))
-    stone = (float(rng.uniform(0.12, 0.45)), 0.3, 0.0)
+    stone = (float(rng.uniform(0.2, 0.55)), 0.3, 0.0)
     uneven = float(rng.choice([0.0, 0.0, 0.15]))
     for along in stretch.along(4.0):
         if builder.claim(along, across, 3.6, thick, cross):
@@ -32,7 +32,7 @@ def fence(builder: Builder, stretch: Stretch) -> None:
     """Boards, pickets or wire between posts: the thinner, the more rays pass."""
     rng, across, cross = builder.rng, stretch.side * stretch.away_m, stretch.cross
     height, step = float(rng.uniform(0.8, 2.2)), float(rng.uniform(2.0, 3.5))
-    reflectance = float(rng.uniform(0.1, 0.45))
+    reflectance = float(rng.uniform(0.15, 0.55))
     board = (reflectance, 0.4, float(rng.choice([0.0, 0.3, 0.6, 0.8, 0.93])))
     for along in stretch.along(step):
         if builder.claim(along, across, step - 0.2, 0.05, cross):

@@ -68,7 +68,7 @@ class SceneConfig:
 
     clutter: tuple[float, float] = (15.0, 60.0)  # posts, signs, bins, shrubs and the like per 100 m of street
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
-    dark_paint_share: float = 0.5
+    dark_paint_share: float = 0.33
 
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
     min_points: int = 2

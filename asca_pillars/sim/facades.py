@@ -25,7 +25,7 @@ def _house(
     """A core with recessed windows behind pillars, plinth and lintel; steps, balconies, awnings, drainpipes."""
     rng, (width, depth, height) = builder.rng, size
     recess = float(rng.uniform(0.06, 0.35))
-    stone: Material = (float(rng.uniform(0.12, 0.5)), 0.3, 0.0)
+    stone: Material = (float(rng.uniform(0.2, 0.6)), 0.3, 0.0)
     glass: Material = (float(rng.uniform(0.03, 0.25)), 2.0, float(rng.choice([0.0, 0.0, 0.1])))
     front, core = side * (away + recess / 2), side * (away + recess + depth / 2)
     builder.box(middle, core, -1.5, (width, depth, height + 1.0), glass, cross)
@@ -68,7 +68,7 @@ def close_view(builder: Builder, along: float, half_width: float) -> None:
     if rng.random() < 0.6:
         wood_across(builder, along, half_width)
         return
-    stone: Material = (float(rng.uniform(0.12, 0.5)), 0.3, 0.0)
+    stone: Material = (float(rng.uniform(0.2, 0.6)), 0.3, 0.0)
     glass: Material = (float(rng.uniform(0.03, 0.25)), 2.0, 0.0)
     wide, toward = float(rng.uniform(9.0, 20.0)), -1.0 if along > 0 else 1.0
     middle = float(rng.normal(0.0, 3.0))
@@ -85,7 +85,7 @@ def garages(builder: Builder, stretch: Stretch) -> None:
     """Flat boxes with recessed gates, open ones here and there, set back from the street."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     height, depth = float(rng.uniform(2.1, 2.7)), float(rng.uniform(4.5, 6.5))
-    stone: Material = (float(rng.uniform(0.15, 0.5)), 0.3, 0.0)
+    stone: Material = (float(rng.uniform(0.2, 0.6)), 0.3, 0.0)
     gate: Material = (float(rng.uniform(0.1, 0.4)), 0.5, 0.0)
     away = stretch.away_m + float(rng.choice([0.0, 2.0, 5.0]))
     for along in stretch.along(3.0):
@@ -117,7 +117,7 @@ def open_roof(builder: Builder, stretch: Stretch) -> None:
 def scaffolding(builder: Builder, stretch: Stretch) -> None:
     """Thin tubes and planks before a wall."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
-    wood: Material = (float(rng.uniform(0.2, 0.5)), 0.3, 0.0)
+    wood: Material = (float(rng.uniform(0.22, 0.6)), 0.3, 0.0)
     net: Material = (0.25, 0.3, float(rng.choice([0.6, 0.9, 1.0])))
     building(builder, Stretch(stretch.start_m, stretch.length_m, side, stretch.away_m + 1.3, cross))
     for along in stretch.along(2.2):

@@ -31,8 +31,9 @@ def make_labels(
         return []
     boxes = np.array([target.box for target in targets])
     _, truncated = image_boxes(boxes, calib)
-    seen = in_image(returns.points, calib) & (returns.owner >= 0)
-    points = np.bincount(returns.owner[seen], minlength=len(targets))
+    owned = returns.owner >= 0
+    seen = in_image(returns.points[owned], calib)
+    points = np.bincount(returns.owner[owned][seen], minlength=len(targets))
     visible = hits.visible / np.maximum(hits.alone, 1)
     objects = objects_from_boxes(boxes, [target.type for target in targets], calib)
     labels, areas = [], []

@@ -18,6 +18,7 @@ from .primitives import Primitives
 from .sensor import Firings
 
 Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 NOTHING = -3  # owner of a firing that met nothing
 
@@ -26,9 +27,9 @@ class Hits(NamedTuple):
     """What each firing (K rings, C columns) met first."""
 
     rho_m: Floats  # (K,C) horizontal distance from the sensor's axis; inf for nothing
-    cosine: Floats  # (K,C) of the angle of incidence
-    reflectance: Floats  # (K,C) of the material at this incidence
-    owner: Ints  # (K,C) object index, BACKGROUND, GROUND or NOTHING
+    cosine: Singles  # (K,C) of the angle of incidence
+    reflectance: Singles  # (K,C) of the material at this incidence
+    owner: npt.NDArray[np.int32]  # (K,C) object index, BACKGROUND, GROUND or NOTHING
     alone: Ints  # (objects,) firings in the camera's columns that would hit the object if it stood alone
     visible: Ints  # (objects,) those that do hit it
 
@@ -49,10 +50,10 @@ def cast(bodies: Bodies, objects: int, ground: Ground | None, firings: Firings, 
     primitives = bodies.primitives
     rings, columns = len(firings.slope), len(firings.azimuth_rad)
     rho = np.full((rings, columns), np.inf)
-    cosine = np.zeros((rings, columns))
-    reflectance = np.zeros((rings, columns))
-    owner = np.full((rings, columns), NOTHING, np.int64)
-    stamp = np.full((rings, columns), -1, np.int64)
+    cosine = np.zeros((rings, columns), np.float32)
+    reflectance = np.zeros((rings, columns), np.float32)
+    owner = np.full((rings, columns), NOTHING, np.int32)
+    stamp = np.full((rings, columns), -1, np.int32)
     alone = np.zeros(objects, np.int64)
     sensor = (firings.slope, firings.origin_z_m, firings.phase_rad, np.cos(firings.azimuth_rad),
               np.sin(firings.azimuth_rad), firings.first_column, firings.cast, firings.in_camera)  # fmt: skip

@@ -11,10 +11,10 @@ from .sensor import Firings
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Words = npt.NDArray[np.uint64]
+Owners = npt.NDArray[np.int32]
 
 FADING = 0.5  # spread of the power from firing to firing, in logarithm
-PIVOT = 0.4  # the reflectance that a response of any power leaves as it is
+PIVOT = 0.4  # the reflectance that the response leaves as it is
 UPDOWN_SPLIT = 0.3  # rings lie farther apart than firings: a footprint leans over fewer of their edges
 EDGE_M = 0.3  # less is a slant, not an edge
 PULSE_M = 0.6  # nearer together, two surfaces make one return
@@ -28,7 +28,7 @@ class Returns(NamedTuple):
     """Points in the order of KITTI's files: ring by ring from the top, each counter-clockwise from straight ahead."""
 
     points: npt.NDArray[np.float32]  # (N,4) x, y, z metres, reflectance 0..0.99 in steps of 0.01
-    owner: Ints  # (N,) object index, BACKGROUND or GROUND
+    owner: Owners  # (N,) object index, BACKGROUND or GROUND
     ring: Ints  # (N,)
 
 
@@ -38,7 +38,7 @@ class _Echoes(NamedTuple):
     slant_m: Floats  # (N,)
     cosine: Floats  # (N,)
     reflectance: Floats  # (N,)
-    owner: Ints  # (N,)
+    owner: Owners  # (N,)
     share: Floats  # (N,) of the beam's power that met it; 0 for an echo that is lost
 
 
@@ -48,14 +48,14 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
     Random numbers are drawn for every firing, cast or not, so that a firing's noise does not depend on the others.
     """
     lidar = firings.lidar
-    # Two words hold all the chance of a firing: eight draws of 12 or 16 bits are plenty, and cheap.
-    chance = rng.integers(0, 2**64, (2, *hits.rho_m.shape), np.uint64)
+    # Two words hold all the chance of a firing: draws of 16 bits are fine enough, and cheap.
+    chance = rng.integers(0, 2**64, (*hits.rho_m.shape, 2), np.uint64)
     ring, column = np.nonzero(np.isfinite(hits.rho_m) & ~firings.hidden)
-    chance = chance[:, ring, column]
-    noise, fading, speckle = (_NORMAL[chance[0] >> np.uint64(12 * i) & np.uint64(_LEVELS - 1)] for i in range(3))
-    luck, faint = _uniform(chance[1], 0), _uniform(chance[1], 1)
+    draws = chance[ring, column].view(np.uint16).T  # (8,N)
+    noise, fading, speckle = _NORMAL[draws[:3] // (65536 // _LEVELS)]
+    luck, faint, lean, fate = draws[3:7] / 65536.0
     stretch = np.sqrt(1.0 + firings.slope**2)
-    echoes = _split_at_edges(hits, firings, ring, column, stretch, _uniform(chance[1], 2), _uniform(chance[1], 3))
+    echoes = _split_at_edges(hits, firings, ring, column, stretch, lean, fate)
 
     # Rough surfaces keep answering at grazing incidence: the root of the cosine, not the cosine.
     power = echoes.reflectance * np.sqrt(echoes.cosine) / echoes.slant_m**2 * echoes.share * np.exp(FADING * fading)
@@ -63,7 +63,7 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
     near, far = lidar.range_m
     kept = (power > firings.lost_power) & (luck >= firings.loss_share) & (slant > near) & (slant < far - 1e-3)
 
-    value = PIVOT * (echoes.reflectance / PIVOT) ** lidar.response
+    value = (PIVOT + lidar.dark_offset) * (echoes.reflectance / PIVOT) ** lidar.response - lidar.dark_offset
     value *= firings.ring_gain[ring] * _fade(echoes.slant_m, firings, ring)
     value += (firings.reflectance_sigma[ring] + lidar.reflectance_sigma_share * value) * speckle
     weak = (power < firings.zero_power) | (value < firings.faint[ring] * faint)
@@ -71,18 +71,13 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
     value = np.floor(np.clip(value, 0.0, 0.995) * 100.0) / 100.0
 
     rho = slant / stretch[ring]
-    azimuth = firings.azimuth_rad[column] + firings.phase_rad[ring]
+    azimuth = (firings.azimuth_rad[column] + firings.phase_rad[ring]).astype(np.float32)
     z = firings.origin_z_m[ring] + rho * firings.slope[ring]
     points = np.empty((len(rho), 4), np.float32)
     points[:, 0], points[:, 1], points[:, 2] = rho * np.cos(azimuth), rho * np.sin(azimuth), z
-    np.round(points, 3, out=points)
+    np.round(points[:, :3], 3, out=points[:, :3])
     points[:, 3] = value
     return Returns(points[kept], echoes.owner[kept], ring[kept])
-
-
-def _uniform(words: Words, part: int) -> Floats:
-    """Numbers in [0, 1) from one of the four quarters of 64-bit words."""
-    return np.asarray((words >> np.uint64(16 * part) & np.uint64(0xFFFF)).astype(float) / 65536.0)
 
 
 def _fade(slant_m: Floats, firings: Firings, ring: Ints) -> Floats:
@@ -106,9 +101,9 @@ def _split_at_edges(
     """
     lidar = firings.lidar
     slant = hits.rho_m[ring, column] * stretch[ring]
-    echoes = _Echoes(
-        slant, hits.cosine[ring, column], hits.reflectance[ring, column], hits.owner[ring, column], np.ones(len(ring))
-    )
+    at = ring * len(firings.azimuth_rad) + column
+    cosine, reflectance, owner = (of.ravel()[at] for of in (hits.cosine, hits.reflectance, hits.owner))
+    echoes = _Echoes(slant, cosine.astype(float), reflectance.astype(float), owner, np.ones(len(ring)))
     sideways, updown = lidar.beam_split_share, lidar.beam_split_share * UPDOWN_SPLIT
     aside = np.minimum(lean, 1.0 - lean)
     some = np.flatnonzero(aside < sideways + updown)

@@ -112,7 +112,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
         slack = rng.uniform((0.0, 0.0, -0.03), (0.16, 0.10, 0.09))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
-        dark = config.dark_paint_share if name == "Car" else 0.2
+        dark = config.dark_paint_share if name == "Car" else 0.1
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
     elif name == "Truck":
         bus = rng.random() < 0.15

@@ -42,8 +42,8 @@ class Lidar:
     ego_beyond_ring: tuple[int, ...] = hdl64.EGO_BEYOND_RING
     elevation_jitter_deg: float = 0.03  # known to the sensor: a scan of other angles, not an error
     range_m: tuple[float, float] = (2.0, 80.0)
-    range_sigma_m: tuple[float, float] = (0.006, 0.011)  # drawn once per scan
-    ring_bias_sigma_m: float = 0.016  # with it, points of several rings on a plane spread over 2 to 3 cm
+    range_sigma_m: tuple[float, float] = (0.005, 0.010)  # drawn once per scan
+    ring_bias_sigma_m: float = 0.022  # with it, points of several rings on a plane spread over 2 to 3 cm
     # A footprint that leans over an edge meets two surfaces: the share of firings that lean to either side, and
     # the share of those that report nothing. KITTI misses one firing at every fifth step in depth.
     beam_split_share: float = 0.3
@@ -52,11 +52,12 @@ class Lidar:
     # A return is kept without a reflectance below the first power, and lost below the second. Power is
     # reflectance * sqrt(cos(incidence)) / range^2; both thresholds are drawn together, once per scan.
     zero_power: tuple[float, float] = (2.5e-5, 7.5e-5)
-    lost_share_of_zero_power: float = 0.32
-    # The true reflectance is reported through a power law about 0.4 (1: as it is), times what each laser makes of
-    # it (empty: 1). Beyond `focus_m` it fades with exp(-((range - focus) / fade)^1.3) (0: not), and the lasers of the
-    # first block lose `near_fade` of it right before them.
+    lost_share_of_zero_power: float = 0.2
+    # The true reflectance is reported through a power law about 0.4 (1: as it is) that starts at `dark_offset` below
+    # 0, times what each laser makes of it (empty: 1). Beyond `focus_m` it fades with exp(-((range - focus) / fade)^1.3)
+    # (0: not), and the lasers of the first block lose `near_fade` of it right before them.
     response: float = 0.6
+    dark_offset: float = 0.03
     ring_gain: tuple[float, ...] = hdl64.RING_GAIN
     ring_gain_sigma: float = 0.06  # of the logarithm, once per scan: no two sensors have the same lasers
     focus_m: float = 13.0
@@ -67,7 +68,7 @@ class Lidar:
     reflectance_sigma_share: float = 0.1
     weak_laser_sigma: float = 0.12
     # Reflectances below a uniform draw up to this are reported as 0 too, of the first block and of the others.
-    faint_reflectance: tuple[float, float] = (0.2, 0.12)
+    faint_reflectance: tuple[float, float] = (0.2, 0.13)
     zero_share: float = 0.03  # of all returns, reported as 0 for no reason: so the best lasers do on near, bright road
     camera_half_angle_deg: float = 43.0
 

@@ -60,7 +60,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
         camber=rng.uniform(0.0, 0.035),
         **_beside(config, rng, kind, half),
     )  # fmt: skip
-    asphalt = float(np.clip(rng.normal(0.26, 0.06), 0.12, 0.45))
+    asphalt = float(np.clip(rng.normal(0.22, 0.03), 0.13, 0.33))
     of_asphalt = np.array([1.0, rng.uniform(0.85, 1.25), 0.0, rng.uniform(1.2, 1.9), 0.0, rng.uniform(0.6, 1.2)])
     reflectance = asphalt * of_asphalt + (0.0, 0.0, rng.uniform(0.22, 0.42), 0.0, 0.15, 0.0)
     slope = (rng.normal(*config.slope_x), rng.normal(*config.slope_y))

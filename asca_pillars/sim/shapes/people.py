@@ -8,10 +8,10 @@ from ..primitives import Primitives, Surface, cuboids, ellipsoids, limbs, quads
 Floats = npt.NDArray[np.float64]
 
 
-def _cloth(rng: np.random.Generator, n: int) -> Floats:
+def _cloth(rng: np.random.Generator, n: int, dark_share: float = 0.1) -> Floats:
     """(n,3) surfaces: skin and cloth are bright in the near infrared, whatever their colour; some cloth is black."""
-    dark = rng.random(n) < 0.09
-    value = np.where(dark, rng.uniform(0.003, 0.06, n), rng.uniform(0.18, 0.58, n))
+    dark = rng.random(n) < dark_share
+    value = np.where(dark, rng.uniform(0.003, 0.06, n), rng.uniform(0.12, 0.8, n))
     return np.column_stack([value, rng.uniform(0.05, 0.4, n), np.zeros(n)])
 
 
@@ -164,7 +164,7 @@ def bicycle(rng: np.random.Generator, length: float) -> Primitives:
     reach = length / 2 - radius
     angle = np.linspace(0, 2 * np.pi, 17)
     ring = radius * np.stack([np.cos(angle), np.zeros(17), np.sin(angle)], axis=1)
-    rubber, spokes = Surface(0.06, 0.3), Surface(0.3, 0.3, 0.9)
+    rubber, spokes = Surface(0.07, 0.3), Surface(0.08, 0.3, 0.9)
     a, b, side = ring[:-1], ring[1:], np.array([0.0, 0.025, 0.0])
     faces = np.stack(
         [np.stack([a + side, b + side, b - side, a - side], 1), np.stack([a, b, 0.86 * b, 0.86 * a], 1),
@@ -173,7 +173,7 @@ def bicycle(rng: np.random.Generator, length: float) -> Primitives:
     hubs = np.array([[reach, 0.0, radius], [-reach, 0.0, radius]])
     corners = faces + hubs[:, None, None, None]
     table = np.stack([rubber.row, rubber.row, spokes.row])[None, :, None]
-    frame = float(rng.uniform(0.08, 0.5))
+    frame = float(np.exp(rng.uniform(np.log(0.03), np.log(0.2))))
     head, crank, post = (reach - 0.22, 0.0, 0.80), (-0.08, 0.0, 0.30), (-0.26, 0.0, 0.80)
     tubes = [(head, crank), (post, crank), (head, post), (post, (-reach, 0, radius)), (crank, (-reach, 0, radius)),
              (head, (reach, 0, radius)), (head, (head[0] - 0.06, 0, 1.02)), (post, (post[0] - 0.04, 0, 0.95)),
@@ -188,7 +188,7 @@ def bicycle(rng: np.random.Generator, length: float) -> Primitives:
 def cyclist_body(rng: np.random.Generator, height: float, width: float, length: float) -> Primitives:
     """A bicycle and its rider, upright to bent over; `height` is that of the head above the ground."""
     bike = bicycle(rng, length)
-    upper, lower = _cloth(rng, 2)
+    upper, lower = _cloth(rng, 2, dark_share=0.22)
     skin = np.array([rng.uniform(0.3, 0.55), 0.2, 0.0])
     shoulder = float(np.clip(0.33 * width, 0.14, 0.22))
     bend = rng.uniform(0.05, 0.42)

@@ -133,7 +133,7 @@ class Paint:
 def draw_paint(rng: np.random.Generator, dark_share: float = 0.5) -> Paint:
     """Paint: dark lacquers shine where they are met head on and send hardly anything back elsewhere."""
     if rng.random() < dark_share:
-        value, gloss = float(np.exp(rng.uniform(np.log(0.018), np.log(0.12)))), float(rng.uniform(0.8, 2.2))
+        value, gloss = float(np.exp(rng.uniform(np.log(0.012), np.log(0.035)))), float(rng.uniform(0.5, 1.8))
     else:
-        value, gloss = float(np.exp(rng.uniform(np.log(0.15), np.log(0.65)))), float(rng.uniform(0.3, 1.5))
-    return Paint(Surface(value, gloss), Surface(max(0.5 * value, 0.012), float(rng.uniform(0.25, 0.6))))
+        value, gloss = float(np.exp(rng.uniform(np.log(0.24), np.log(0.58)))), float(rng.uniform(0.1, 0.6))
+    return Paint(Surface(value, gloss), Surface(max(0.1 * value, 0.012), float(rng.uniform(0.25, 0.6))))

@@ -63,7 +63,7 @@ def car_body(
         tail_bow=float(rng.uniform(0.05, 0.16)),
     )  # fmt: skip
     paint = draw_paint(rng, dark_share)
-    trim = Surface(float(rng.uniform(0.01, 0.08)), 0.5)
+    trim = Surface(float(rng.uniform(0.005, 0.04)), 0.5)
     corners, table = _shell(hull, paint, trim, rng)
     corners = np.concatenate([corners, corners * MIRROR])
     floor = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (0.45 * length, 0.45 * width)
@@ -110,8 +110,9 @@ def _bow(hull: _Hull, x: Floats, y_m: Floats) -> Floats:
 def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """The left half of a body: corners (Q,4,3) and surfaces (Q,3)."""
     profile, top = hull.profile, np.array(hull.profile.top)
-    pane = Surface(0.25, 6.0, float(rng.uniform(0.75, 0.97)))
-    window = Surface(0.12, 3.0, float(rng.uniform(0.45, 0.95)))
+    # What a pane does not let through it mirrors away: most windows of KITTI's cars are holes.
+    pane = Surface(0.05, 15.0, float(rng.uniform(0.1, 0.7)))
+    window = Surface(0.05, 15.0, float(rng.uniform(0.05, 0.6)))
     arch = (hull.wheel_radius + 0.06) / hull.length
     arches = (hull.wheel_x[:, None] + np.array([-1.0, -0.8, -0.4, 0.4, 0.8, 1.0]) * arch).ravel()
     low = np.unique(np.concatenate([[0.0, 0.03, 0.08], arches, [0.93, 0.98, 1.0]]).clip(0, 1))
@@ -162,7 +163,7 @@ def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
 
 def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
     """A wheel at each x on both sides: tyre tread, and a dark sidewall around a rim that shines more or less."""
-    rubber = Surface(float(rng.uniform(0.01, 0.05)), 0.5)
+    rubber = Surface(float(rng.uniform(0.005, 0.025)), 0.5)
     rim = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.5)))), 1.0)
     faces = radius_m * _WHEEL
     faces[:_SPOKES, 2:, 1] -= min(0.2, half_track_m)  # the tread reaches inwards
@@ -178,8 +179,8 @@ def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface) -> Primitiv
     length, width, height, profile = hull.length, hull.width, hull.height, hull.profile
     plate = min(0.45 * height, 0.75)
     rows: list[tuple[float, ...]] = [
-        (length / 2 - 0.01, 0, 0.27 * height, 0.03, 0.52, 0.11, 0, 0.95, 0.3, 0),
-        (-length / 2 + 0.01, 0, plate - 0.1, 0.03, 0.52, 0.11, 0, 0.95, 0.3, 0),
+        (length / 2 - 0.01, 0, 0.27 * height, 0.03, 0.52, 0.11, 0, 3.0, 0.3, 0),
+        (-length / 2 + 0.01, 0, plate - 0.1, 0.03, 0.52, 0.11, 0, 3.0, 0.3, 0),
         (length * (0.46 - profile.cabin[0]), 0, 0.45 * height, 0.4, 0.8 * width, 0.14 * height, 0, 0.05, 0.5, 0),
     ]
     nose, tail = length / 2 - 0.55 * hull.nose_bow, -length / 2 + 0.6 * hull.tail_bow
@@ -187,8 +188,8 @@ def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface) -> Primitiv
     stands_out = float(rng.uniform(0.03, 0.08))
     for sign in (1, -1):
         rows += [
-            (tail, sign * width * 0.39, 0.5 * height, 0.06, 0.16, 0.14, 0, 0.7, 0.6, 0),
-            (nose - 0.02 * length, sign * width * 0.37, 0.40 * height, 0.06, 0.24, 0.11, 0, 0.5, 1.0, 0),
+            (tail, sign * width * 0.39, 0.5 * height, 0.06, 0.16, 0.14, 0, 1.2, 0.6, 0),
+            (nose - 0.02 * length, sign * width * 0.37, 0.40 * height, 0.06, 0.24, 0.11, 0, 0.8, 1.0, 0),
             (mirror, sign * (width / 2 + stands_out), profile.belt * height, 0.10, 0.17, 0.13, 0,
              paint.reflectance, paint.gloss, 0),
         ]  # fmt: skip

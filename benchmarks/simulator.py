@@ -1,0 +1,128 @@
+"""How fast the simulator draws labelled frames, by stage and by number of processes.
+
+    OMP_NUM_THREADS=1 python -m benchmarks.simulator --frames 60 --workers 1,2
+
+Stages are those of `simulate_frame`, in milliseconds of processor time on one core, so that other programs disturb them
+little (nor does linear algebra wait on every core, see OMP_NUM_THREADS): median, and the 5th and 95th percentile over
+the frames. Frames per second are wall-clock time of whole frames in memory, without writing them; the first frames of
+each process, which compile or load the ray caster, are left out.
+"""
+
+import multiprocessing
+import os
+import platform
+import time
+from collections import defaultdict
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Literal
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from asca_pillars.data.kitti import in_image
+from asca_pillars.sim.labels import make_labels
+from asca_pillars.sim.raycast import cast
+from asca_pillars.sim.returns import measure
+from asca_pillars.sim.scene import build, draw_scene
+from asca_pillars.sim.sensor import draw_firings
+from asca_pillars.sim.simulate import SimulationConfig, simulate_frame
+
+STAGES = ("scene", "bodies", "cast", "returns", "labels", "frame")
+VIEWS: tuple[Literal["camera", "full"], ...] = ("camera", "full")
+WARM_UP = 3
+ROUNDS = 5
+
+
+def main(
+    frames: Annotated[int, typer.Option(help="Frames that are timed, per view and number of processes.")] = 60,
+    workers: Annotated[str, typer.Option(help="Numbers of processes, separated by commas.")] = "1,2",
+    seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
+) -> None:
+    """Print frames per second and milliseconds per stage."""
+    console = Console()
+    console.print(
+        f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+    )
+    counts = [int(count) for count in workers.split(",")]
+    for view in VIEWS:
+        config = replace(SimulationConfig(), field_of_view=view)
+        console.print(_stage_table(view, _stages(config, frames, seed)))
+        table = Table(title=f"Frames per second, {view} view: median of {ROUNDS} rounds (slowest to fastest)")
+        for column in ("processes", "all", "per process"):
+            table.add_column(column, justify="right")
+        for count in counts:
+            rates = _rates(config, frames, seed, count)
+            spread = f"{np.median(rates):.1f} ({min(rates):.1f} to {max(rates):.1f})"
+            table.add_row(str(count), spread, f"{np.median(rates) / count:.1f}")
+        console.print(table)
+
+
+def _stages(config: SimulationConfig, frames: int, seed: int) -> dict[str, list[float]]:
+    """Milliseconds of processor time of each frame, by stage."""
+    spent: dict[str, list[float]] = defaultdict(list)
+    for index in range(frames + WARM_UP):
+        marks = [time.process_time()]
+        camera_only = config.field_of_view == "camera"
+        scene = draw_scene(config.scene, np.random.default_rng([seed, index, 0]))
+        marks.append(time.process_time())
+        reach = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0) if camera_only else np.pi
+        bodies = build(scene, config.scene, (seed, index), reach)
+        marks.append(time.process_time())
+        firings = draw_firings(config.lidar, np.random.default_rng([seed, index, 2]), camera_only)
+        noise = np.random.default_rng([seed, index, 3])
+        hits = cast(bodies, len(scene.targets), scene.ground, firings, int(noise.integers(1 << 62)))
+        marks.append(time.process_time())
+        returns = measure(hits, firings, noise)
+        marks.append(time.process_time())
+        make_labels(scene.targets, hits, returns, scene.calibration, config.scene)
+        if camera_only:
+            in_image(returns.points, scene.calibration)
+        marks.append(time.process_time())
+        if index >= WARM_UP:
+            steps = [*np.diff(marks), marks[-1] - marks[0]]
+            for stage, seconds in zip(STAGES, steps, strict=True):
+                spent[stage].append(1e3 * float(seconds))
+    return spent
+
+
+def _stage_table(view: str, spent: dict[str, list[float]]) -> Table:
+    table = Table(title=f"Milliseconds per frame on one core, {view} view")
+    for column in ("stage", "median", "p5", "p95"):
+        table.add_column(column, justify="right")
+    for stage in STAGES:
+        table.add_row(stage, *(f"{np.percentile(spent[stage], share):.1f}" for share in (50, 5, 95)))
+    return table
+
+
+def _rates(config: SimulationConfig, frames: int, seed: int, workers: int) -> list[float]:
+    """Frames per second of `workers` processes together, of each round."""
+    job = partial(_draw, config, seed)
+    # As in `simulate`: forked threads could hang, and linear algebra must not spread over the cores by itself.
+    before = os.environ.get("OPENBLAS_NUM_THREADS")
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    try:
+        with multiprocessing.get_context("spawn").Pool(workers) as pool:
+            pool.map(job, range(4 * WARM_UP * workers), chunksize=WARM_UP)
+            rates = []
+            for turn in range(ROUNDS):
+                first, count = turn * frames, max(frames // ROUNDS, workers)
+                start = time.perf_counter()
+                pool.map(job, range(first, first + count), chunksize=max(count // (4 * workers), 1))
+                rates.append(count / (time.perf_counter() - start))
+            return rates
+    finally:
+        if before is None:
+            del os.environ["OPENBLAS_NUM_THREADS"]
+        else:
+            os.environ["OPENBLAS_NUM_THREADS"] = before
+
+
+def _draw(config: SimulationConfig, seed: int, index: int) -> int:
+    return len(simulate_frame(seed, index, config).points)
+
+
+if __name__ == "__main__":
+    typer.run(main)
