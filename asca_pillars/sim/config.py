@@ -59,7 +59,7 @@ class SceneConfig:
     # Mean and standard deviation of the slopes under the car, as KITTI's scans have them.
     slope_x: tuple[float, float] = (0.0105, 0.0035)
     slope_y: tuple[float, float] = (-0.009, 0.016)
-    relief_m: tuple[float, float] = (0.1, 2.1)
+    relief_m: tuple[float, float] = (0.1, 2.6)
     bump_m: tuple[float, float] = (0.0, 0.15)  # standard deviation of bumps beyond the pavement
     bank_slope_sigma: float = 0.045  # of the ground beyond the pavement
     embankment_slope: tuple[float, float] = (-0.25, 0.42)
