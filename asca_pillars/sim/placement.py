@@ -182,6 +182,7 @@ class Placer:
         if self._traffic and rng.random() < 0.3:  # a queue
             u, v, heading, length = self._traffic[int(rng.integers(len(self._traffic)))]
             u += ((length + size[0]) / 2 + rng.gamma(2.0, 2.5) + 1.2) * rng.choice([-1.0, 1.0])
+            u = min(max(u, -self.config.reach_m), self.config.reach_m)
         else:
             u = way * self._distance(1.9, 20.0)
             lanes = max(int(half // 3.1), 1)
