@@ -9,49 +9,18 @@ score stand recall of the objects that KITTI counts at moderate and false detect
 bird's-eye view that a class is asked for. `evaluation.verdicts` tells what is counted, false and excused.
 """
 
-from dataclasses import dataclass
+import math
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from asca_pillars.evaluation.kitti import CLASS_NAMES
-from asca_pillars.evaluation.operating_point import wilson_interval
+from asca_pillars.evaluation.operating_point import OperatingPoint, best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth
 from asca_pillars.evaluation.report import markdown_table
-from asca_pillars.evaluation.verdicts import Scene, judge
 
-OVERLAPS = (("Car", 0.5), ("Car", 0.7), ("Pedestrian", 0.25), ("Cyclist", 0.25))  # the first of a class chooses
-SCORES = np.arange(0.10, 0.90, 0.02)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Counts of one class at one score and overlap over some frames."""
-
-    frames: int
-    objects: int
-    found: int
-    true: int
-    false: int
-
-    @property
-    def recall(self) -> float:
-        """Share of the counted objects that were found."""
-        return self.found / max(self.objects, 1)
-
-    @property
-    def f1(self) -> float:
-        """Harmonic mean of precision and recall."""
-        return 2 * self.found / max(self.objects + self.true + self.false, 1)
-
-    @property
-    def row(self) -> tuple[str, ...]:
-        """For a table: found of objects, recall with its 95 % interval, false per frame."""
-        low, high = wilson_interval(self.found, self.objects)
-        per_frame = self.false / self.frames
-        return f"{self.found}/{self.objects}", f"{self.recall:.2f} ({low:.2f}-{high:.2f})", f"{per_frame:.2f}"
+OVERLAPS = ({"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}, {"Car": 0.7})  # the first ones choose the scores
+COLUMNS = ("class", "frames", "score", "BEV IoU", "found", "recall", "95 % interval", "false per frame")
 
 
 def main(
@@ -61,33 +30,34 @@ def main(
     real_out: Annotated[Path, typer.Argument(help="What `asca eval` wrote about it.")],
 ) -> None:
     """Choose a score per class on simulated frames, and print what it gives there and on real frames."""
-    sets = [_read(simulated, simulated_out), _read(real, real_out)]
+    sets = {"simulated": _read(simulated, simulated_out), "real": _read(real, real_out)}
+    chosen = sets["simulated"]
+    best = best_scores(chosen.truth, chosen.detections, tuple(OVERLAPS[0]), min_overlap=OVERLAPS[0], metric="bev")
+    scores = {name: math.floor(100 * score) / 100 for name, score in best.items()}
     rows = []
-    chosen: dict[str, float] = {}
-    for name, overlap in OVERLAPS:
-        if name not in chosen:
-            chosen[name] = max(SCORES, key=lambda score: count(sets[0], name, overlap, score).f1)
-        for title, frames in zip(("simulated", "real"), sets, strict=True):
-            outcome = count(frames, name, overlap, chosen[name])
-            rows.append((name, title, f"{chosen[name]:.2f}", f"{overlap}", *outcome.row))
-    columns = ("class", "frames", "score", "BEV IoU", "found", "recall", "false per frame")
-    print(f"{len(sets[0])} simulated and {len(sets[1])} real frames\n\n{markdown_table(columns, rows, left=2)}")
+    for overlaps in OVERLAPS:
+        names = [name for name in overlaps if name in scores]
+        for title, frames in sets.items():
+            points = operating_points(
+                frames.truth, frames.detections, names, scores=scores, min_overlap=overlaps, metric="bev"
+            )
+            rows += [_row(point, title, len(frames)) for point in points]
+    rows.sort(key=lambda row: (list(OVERLAPS[0]).index(row[0]), row[3]))
+    print(f"{len(sets['simulated'])} simulated and {len(sets['real'])} real frames\n")
+    print(markdown_table(COLUMNS, rows, left=2))
 
 
-def count(frames: ScoredFrames, class_name: str, overlap: float, score: float) -> Outcome:
-    """What becomes of the objects and detections of one class, moderate, bird's-eye view."""
-    overlaps, scores = dict.fromkeys(CLASS_NAMES, overlap), dict.fromkeys(CLASS_NAMES, float(score))
-    scene = Scene.of(frames.truth, frames.detections, CLASS_NAMES, scores, overlaps)
-    verdict = judge(scene, class_name, "moderate", "bev")
-    masks = (verdict.counted, verdict.found, verdict.true, verdict.false)
-    return Outcome(len(frames), *(int(mask.sum()) for mask in masks))
+def _row(point: OperatingPoint, title: str, frames: int) -> tuple[str, ...]:
+    low, high = point.recall_interval
+    found = f"{point.found} of {point.objects}", f"{point.recall:.2f}", f"{low:.2f}-{high:.2f}"
+    false = point.detections - point.true
+    return point.class_name, title, f"{point.score:.2f}", f"{point.min_overlap:g}", *found, f"{false / frames:.2f}"
 
 
 def _read(data: Path, out: Path) -> ScoredFrames:
-    labels = data / "training" / "label_2"
-    predictions = out / "predictions"
-    names = sorted(path.stem for path in predictions.glob("*.txt"))
-    return read_predictions(predictions, read_truth(labels, names), labels)
+    labels, predictions = data / "training" / "label_2", out / "predictions"
+    truth = read_truth(labels, sorted(path.stem for path in predictions.glob("*.txt")))
+    return read_predictions(predictions, truth, labels)
 
 
 if __name__ == "__main__":

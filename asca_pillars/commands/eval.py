@@ -18,7 +18,7 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.kitti import CLASS_NAMES, DIFFICULTIES, evaluate
-from asca_pillars.evaluation.operating_point import operating_points
+from asca_pillars.evaluation.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
 from asca_pillars.evaluation.verdicts import verdicts
@@ -144,7 +144,7 @@ def _report(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None,
     ap = evaluate(truth, found, CLASS_NAMES, bands_m=tuple(BANDS_M), progress=True)
     points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES)
     about = task.about | {"environment": json.loads(describe_environment())}
-    report = EvalReport(task.subject, frames, ap, points, about)
+    report = EvalReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     print_report(report, console)
     content = to_json(report)
     for path in (json_path, out / "report.json"):

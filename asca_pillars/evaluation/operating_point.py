@@ -13,6 +13,8 @@ from itertools import product
 from math import inf, nan, sqrt
 from typing import Any, Literal
 
+import numpy as np
+
 from asca_pillars.evaluation.kitti import DIFFICULTIES
 from asca_pillars.evaluation.objects import FrameObjects
 from asca_pillars.evaluation.pairs import Frames
@@ -101,6 +103,34 @@ def recall_table(
     beside the table which one it was made at.
     """
     return operating_points(truth, detections, class_names, scores=scores, difficulties=DIFFICULTIES)
+
+
+def best_scores(
+    truth: Sequence[FrameObjects],
+    detections: Sequence[FrameObjects],
+    class_names: Sequence[str],
+    *,
+    min_overlap: Mapping[str, float] | None = None,
+    metric: Literal["bev", "3d"] = "3d",
+    difficulty: str = "moderate",
+) -> dict[str, float]:
+    """For every class the score with the highest F1, the harmonic mean of recall and precision.
+
+    A class of which nothing was found is absent. Arguments and errors as for `operating_points`.
+    """
+    # A detection's verdict depends on better ones alone: one pass over all of them serves every score.
+    scene = Scene.of(truth, detections, class_names, -inf, min_overlap)
+    best = {}
+    for name in class_names:
+        verdict = judge(scene, name, difficulty, metric)
+        order = np.argsort(-scene.frames.detections.scores, kind="stable")
+        scores = scene.frames.detections.scores[order]
+        true, false = np.cumsum(verdict.true[order]), np.cumsum(verdict.false[order])
+        f1 = 2 * true / np.maximum(verdict.counted.sum() + true + false, 1)
+        f1[:-1][scores[:-1] == scores[1:]] = 0.0  # equal scores are reported together
+        if f1.max(initial=0.0) > 0:
+            best[name] = float(scores[f1.argmax()])
+    return best
 
 
 def wilson_interval(hits: int, trials: int) -> tuple[float, float]:

@@ -42,43 +42,30 @@ class RecallTally:
 
     Args:
         class_names: names of labels 0, 1, ...
-        max_distance_m: only objects and detections whose centre is nearer (horizontally) are counted.
     """
 
-    def __init__(self, class_names: Sequence[str], max_distance_m: float = np.inf) -> None:
+    def __init__(self, class_names: Sequence[str]) -> None:
         self.class_names = class_names
-        self.max_distance_m = max_distance_m
         self.counts = np.zeros((len(class_names), 3), dtype=np.int64)  # objects, found, false
         self.frames = 0
 
-    def add(
-        self,
-        detections: Detections,
-        boxes: NDArray[np.float32],
-        labels: NDArray[np.int64],
-        excused: NDArray[np.bool_] | None = None,
-    ) -> None:
+    def add(self, detections: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> None:
         """Count one frame.
 
         Args:
             detections: of the frame, at the threshold in question, by descending score.
             boxes: (N, 7) labelled boxes.
             labels: (N,) class index, negative for boxes that excuse a detection of any class but need not be found.
-            excused: which detections are not false though they find nothing, as on KITTI's DontCare areas.
         """
-        if excused is None:
-            excused = np.zeros(len(detections), dtype=bool)
         self.frames += 1
         for index, name in enumerate(self.class_names):
             own = detections.labels == index
             chosen = (labels == index) | (labels < 0)
             self.counts[index] += _count(
                 detections.boxes[own],
-                excused[own],
                 boxes[chosen],
                 labels[chosen] == index,
                 BEV_IOU.get(name, SMALL_BEV_IOU),
-                self.max_distance_m,
             )
 
     def rows(self) -> dict[str, RecallRow]:
@@ -91,11 +78,9 @@ class RecallTally:
 
 def _count(
     found_boxes: NDArray[np.float32],
-    excused: NDArray[np.bool_],
     boxes: NDArray[np.float32],
     wanted: NDArray[np.bool_],
     min_iou: float,
-    max_distance_m: float,
 ) -> tuple[int, int, int]:
     """Objects, found and false detections of one class in one frame; detections by descending score."""
     iou = bev_iou(found_boxes, boxes)
@@ -103,8 +88,4 @@ def _count(
     order = np.lexsort((-iou[rows, columns], rows))
     rows, columns = rows[order], columns[order]
     matched = greedy_matches(rows, columns)
-    near = np.hypot(boxes[:, 0], boxes[:, 1]) <= max_distance_m
-    false = ~excused & (np.hypot(found_boxes[:, 0], found_boxes[:, 1]) <= max_distance_m)
-    false[rows[matched]] = False
-    counted = wanted & near
-    return int(counted.sum()), int(counted[columns[matched]].sum()), int(false.sum())
+    return int(wanted.sum()), int(wanted[columns[matched]].sum()), len(found_boxes) - len(rows[matched])

@@ -34,6 +34,8 @@ class EvalReport:
     frames: ScoredFrames
     ap: KittiEvaluation
     points: Sequence[OperatingPoint]
+    best_scores: dict[str, float]
+    """Of each class that was found at all: the score that weighs misses against false detections best."""
     about: dict[str, Any]
     """Model, command, machine and versions, for the JSON."""
 
@@ -68,7 +70,8 @@ def tables(report: EvalReport) -> list[TextTable]:
 
 
 def notes(report: EvalReport) -> list[str]:
-    """What one must know to read the tables: classes not evaluated, sets too small for their AP, detections excused."""
+    """What one must know to read the tables: classes not evaluated, sets too small for their AP, detections
+    excused, scores to choose."""
     results = report.ap.overall
     lines = []
     for name in results.class_names:
@@ -77,7 +80,11 @@ def notes(report: EvalReport) -> list[str]:
         lines += [
             _cap_note(curve) for curve in _counts_of(results, name) if curve is not None and curve.counted <= SMALL_SET
         ]
-    return lines + [_excuse_note(p) for p in report.points if p.difficulty == "hard" and p.excused > p.detections]
+    lines += [_excuse_note(p) for p in report.points if p.difficulty == "hard" and p.excused > p.detections]
+    if report.best_scores:
+        scores = ", ".join(f"{name} {score:.2f}" for name, score in report.best_scores.items())
+        lines.append(f"Scores with the best F1 on this data, moderate, in 3D: {scores}")
+    return lines
 
 
 def print_report(report: EvalReport, console: Console) -> None:
@@ -135,6 +142,7 @@ def to_json(report: EvalReport) -> dict[str, Any]:
             for (low, high), band in report.ap.bands.items()
         ],
         "operating_points": [_without_nan(asdict(point)) for point in report.points],
+        "best_scores": report.best_scores,
         "notes": notes(report),
         **report.about,
     }

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from asca_pillars.data.labels import KittiObject
 from asca_pillars.evaluation.objects import FrameObjects, frame_objects
-from asca_pillars.evaluation.operating_point import OperatingPoint, operating_points, recall_table, wilson_interval
+from asca_pillars.evaluation.operating_point import (
+    OperatingPoint,
+    best_scores,
+    operating_points,
+    recall_table,
+    wilson_interval,
+)
 from asca_pillars.evaluation.verdicts import verdicts
 from asca_pillars.geometry.overlap import bev_iou, iou_3d
 
@@ -173,6 +179,36 @@ def test_scores_and_overlaps_per_class() -> None:
         operating_points([truth], [found], NAMES, scores=0.3, min_overlap={"Pedestrian": 0.5})
     with pytest.raises(ValueError, match="same frames"):
         operating_points([truth], [frame(name="other")], NAMES, scores=0.3)
+
+
+def test_best_score_weighs_misses_against_false_ones() -> None:
+    truth = [item("Car", 0, 10), item("Car", 9, 10), item("Pedestrian", 3, 10)]
+    found = [item("Car", 0, 10, 0.9), item("Car", -9, 10, 0.6), item("Car", 9, 10, 0.4), item("Car", -9, 20, 0.3)]
+    best = best_scores([frame(*truth)], [frame(*found)], NAMES)
+    assert best == {"Car": 0.4}  # F1 2/3, 1/2, 4/5, 2/3 at the four scores; nobody was found on foot
+    assert best_scores([frame(*truth)], [frame(*found[:2])], NAMES) == {"Car": 0.9}
+    # A false one with the score of a true one comes with it.
+    tied = [found[0], item("Car", 9, 10, 0.6), *(item("Car", -9, 10 * i, 0.6) for i in range(1, 6))]
+    assert best_scores([frame(*truth)], [frame(*tied)], NAMES) == {"Car": 0.9}
+    assert best_scores([frame(*truth)], [frame()], NAMES) == {}
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10_000))
+def test_no_other_score_is_better(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = [frame(*(item("Car", 6.0 * i, 10) for i in range(4)), name=str(k)) for k in range(3)]
+    found = [
+        frame(*(item("Car", 6.0 * rng.integers(8), 10, float(rng.integers(1, 9)) / 10) for _ in range(5)), name=str(k))
+        for k in range(3)
+    ]
+    best = best_scores(truth, found, ["Car"])
+
+    def f1(score: float) -> float:
+        at = operating_points(truth, found, ["Car"], scores=score)[0]
+        return 2 * at.found / (at.objects + at.detections)
+
+    assert f1(best.get("Car", 1.0)) == pytest.approx(max(f1(score / 10) for score in range(1, 10)))
 
 
 def test_recall_table_has_the_three_difficulties() -> None:

@@ -27,10 +27,10 @@ def detections(*found: tuple[int, list[float]]) -> Detections:
 
 
 def count(
-    found: list[tuple[int, list[float]]], wanted: list[tuple[int, list[float]]], max_distance_m: float = math.inf
+    found: list[tuple[int, list[float]]], wanted: list[tuple[int, list[float]]]
 ) -> dict[str, tuple[int, int, int]]:
     """Objects, found and false of each class in one frame."""
-    tally = RecallTally(NAMES, max_distance_m)
+    tally = RecallTally(NAMES)
     labels = np.array([label for label, _ in wanted], np.int64)
     tally.add(detections(*found), np.array([item for _, item in wanted], np.float32).reshape(-1, 7), labels)
     return {name: row[:3] for name, row in tally.rows().items()}
@@ -127,30 +127,9 @@ def test_ignored_boxes_excuse_one_detection_of_any_class_and_need_not_be_found()
     assert count([(CAR, box(10, 2)), (CAR, box(20, 2))], [*ignored, (CAR, box(20, 2))])["Car"] == (1, 1, 0)
 
 
-def test_distance_limits_objects_and_detections_by_their_own_centers() -> None:
-    """5 m and 13 m away: (3, 4) and (5, 12). Each side of the limit is judged as if the other were not there."""
-    near, far = box(3, 4), box(5, 12)
-    both = [(CAR, near), (CAR, far)]
-    assert count(both, both, 13.0)["Car"] == (2, 2, 0)
-    assert count(both, both, 12.9)["Car"] == (1, 1, 0)
-    assert count(both, both, 4.9)["Car"] == (0, 0, 0)
-    assert count(both, [], 12.9)["Car"] == (0, 0, 1)
-    assert count([], both, 12.9)["Car"] == (1, 0, 0)
-    # Across the limit a detection finds the near object, and one of the far object is not false.
-    assert count([(CAR, box(13.5, 0))], [(CAR, box(12.5, 0))], 13.0)["Car"] == (1, 1, 0)
-    assert count([(CAR, box(12.5, 0))], [(CAR, box(13.5, 0))], 13.0)["Car"] == (0, 0, 0)
-
-
 def test_nothing_at_all() -> None:
     assert RecallTally(NAMES).rows() == dict.fromkeys(NAMES, (0, 0, 0, 0))
     assert RecallTally(NAMES).rows()["Car"].false_per_frame == 0
     assert count([], []) == dict.fromkeys(NAMES, (0, 0, 0))
     assert count([(CAR, box(9, 1))], [])["Car"] == (0, 0, 1)
     assert count([], [(CAR, box(9, 1))])["Car"] == (1, 0, 0)
-
-
-def test_an_excused_detection_is_not_false_but_still_finds() -> None:
-    found = detections((CAR, box(10, 2)), (CAR, box(30, 2)), (CAR, box(50, 2)))
-    tally = RecallTally(NAMES)
-    tally.add(found, np.array([box(10, 2)], np.float32), np.array([CAR]), np.array([True, True, False]))
-    assert tally.rows()["Car"][:3] == (1, 1, 1)

@@ -11,7 +11,7 @@ from rich.console import Console
 from asca_pillars.data.kitti import KittiObject
 from asca_pillars.evaluation.kitti import DIFFICULTIES, METRICS, evaluate
 from asca_pillars.evaluation.objects import frame_objects
-from asca_pillars.evaluation.operating_point import operating_points
+from asca_pillars.evaluation.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, notes, print_report, tables, to_json, to_markdown
 
@@ -34,6 +34,7 @@ def report(cars: int = 12, missing: tuple[str, ...] = ()) -> EvalReport:
         frames=ScoredFrames(tuple(truth), tuple(found), missing),
         ap=evaluate(truth, found, CLASSES, bands_m=tuple(BANDS_M)),
         points=operating_points(truth, found, CLASSES, scores=0.5, difficulties=DIFFICULTIES),
+        best_scores=best_scores(truth, found, CLASSES),
         about={"model": {"name": "nobody"}},
     )
 
@@ -76,6 +77,7 @@ def test_small_sets_and_missing_classes_are_named() -> None:
     assert "Cyclist: not evaluated, because nothing was detected as one; the means leave the class out" in lines
     assert not any(line.startswith("Car") for line in notes(report(cars=41)))
     assert any(line.startswith("Car easy: only 40 ") for line in notes(report(cars=40)))
+    assert lines[-1].endswith("in 3D: Car 0.89")  # the last of twelve found, with scores 1.00, 0.99 ...
 
 
 def test_excused_detections_are_named_where_they_are_most() -> None:
