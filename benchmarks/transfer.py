@@ -15,11 +15,14 @@ from typing import Annotated
 
 import typer
 
+from asca_pillars.evaluation.kitti import CLASS_NAMES
 from asca_pillars.evaluation.operating_point import OperatingPoint, best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth
+from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
 from asca_pillars.evaluation.report import markdown_table
 
-OVERLAPS = ({"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}, {"Car": 0.7})  # the first ones choose the scores
+FOUND_IOU = {name: BEV_IOU.get(name, SMALL_BEV_IOU) for name in CLASS_NAMES}
+OVERLAPS = (FOUND_IOU, {"Car": 0.7})  # the first ones choose the scores
 COLUMNS = ("class", "frames", "score", "BEV IoU", "found", "recall", "95 % interval", "false per frame")
 
 
@@ -30,7 +33,7 @@ def main(
     real_out: Annotated[Path, typer.Argument(help="What `asca eval` wrote about it.")],
 ) -> None:
     """Choose a score per class on simulated frames, and print what it gives there and on real frames."""
-    sets = {"simulated": _read(simulated, simulated_out), "real": _read(real, real_out)}
+    sets = {"simulated": read_evaluation(simulated, simulated_out), "real": read_evaluation(real, real_out)}
     chosen = sets["simulated"]
     best = best_scores(chosen.truth, chosen.detections, tuple(OVERLAPS[0]), min_overlap=OVERLAPS[0], metric="bev")
     scores = {name: math.floor(100 * score) / 100 for name, score in best.items()}
@@ -54,7 +57,8 @@ def _row(point: OperatingPoint, title: str, frames: int) -> tuple[str, ...]:
     return point.class_name, title, f"{point.score:.2f}", f"{point.min_overlap:g}", *found, f"{false / frames:.2f}"
 
 
-def _read(data: Path, out: Path) -> ScoredFrames:
+def read_evaluation(data: Path, out: Path) -> ScoredFrames:
+    """Labels of a KITTI-layout folder, and the predictions that `asca eval` wrote for it."""
     labels, predictions = data / "training" / "label_2", out / "predictions"
     truth = read_truth(labels, sorted(path.stem for path in predictions.glob("*.txt")))
     return read_predictions(predictions, truth, labels)

@@ -24,15 +24,15 @@ _LEFT = 1
 _MEASURES = {"ratio": "x {:.2f}", "difference": "{:+.2f}", "distance": "JS {:.3f}"}
 
 
-def print_comparison(comparison: Comparison, console: Console, *, everything: bool = False) -> None:
-    """The rows with a bar, or all rows, and what was left out, on the console."""
+def print_comparison(comparison: Comparison, console: Console) -> None:
+    """The rows with a bar, and what was left out, on the console."""
     console.print(title(comparison), style="bold", highlight=False, soft_wrap=True)
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     for index, column in enumerate(_COLUMNS):
         table.add_column(column, justify="left" if index < _LEFT else "right")
     group = None
     for row in comparison.rows:
-        if row.bar is None and not everything:
+        if row.bar is None:
             continue
         if group not in (None, row.group):
             table.add_section()
