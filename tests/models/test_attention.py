@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.nn import functional
 
 from asca_pillars.models.attention import ChannelAttention, PaperAttention, PointAttention
 
@@ -26,6 +27,34 @@ def test_channel_reading_does_not_depend_on_pillar_number() -> None:
     features = torch.rand(30, CHANNELS)
     doubled = attention(features.repeat(2, 1))
     torch.testing.assert_close(doubled, attention(features).repeat(2, 1))
+
+
+def test_channel_reading_is_cross_covariance_attention() -> None:
+    attention = ChannelAttention(CHANNELS)
+    with torch.no_grad():
+        attention.temperature.fill_(3.0)
+    features = torch.randn(30, CHANNELS)
+    query = functional.normalize(attention.query(features), dim=0)
+    key = functional.normalize(attention.key(features), dim=0)
+    weights = torch.softmax(query.T @ key * attention.temperature, dim=-1)
+    expected = features + attention.restore(attention.value(features) @ weights.T)
+    torch.testing.assert_close(attention(features), expected)
+
+
+def test_channel_reading_keeps_its_precision_in_mixed_precision_training() -> None:
+    attention = ChannelAttention(CHANNELS)
+    features = torch.randn(3000, CHANNELS)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = attention(features)
+    torch.testing.assert_close(mixed, attention(features))
+
+
+def test_channel_reading_of_silent_channels_is_finite() -> None:
+    attention = ChannelAttention(CHANNELS)
+    features = torch.zeros(30, CHANNELS, requires_grad=True)
+    output = attention(features)
+    output.sum().backward()
+    assert output.isfinite().all() and features.grad is not None and features.grad.isfinite().all()
 
 
 def test_channel_reading_mixes_channels() -> None:
