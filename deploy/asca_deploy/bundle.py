@@ -1,7 +1,7 @@
 """A model bundle: the folder that `asca export` writes and the detector runs, and nothing else is needed.
 
     encoder.onnx    points of pillars -> pillar features
-    backbone.onnx   pseudo-image -> head maps
+    backbone.onnx   pseudo-image, channels last -> head maps
     bundle.json     everything that must agree with the graphs, and where they come from
 
 docs/BUNDLE.md describes the files for readers in other languages.
@@ -12,8 +12,9 @@ import json
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from asca_deploy.canvas import CanvasFormat
 from asca_deploy.input_check import ExpectedInput
 from asca_deploy.layout import difference, layout_of
 from asca_pillars.errors import AscaError, BundleError
@@ -21,7 +22,7 @@ from asca_pillars.files import atomic_path
 from asca_pillars.geometry.spec import DetectorSpec
 from asca_pillars.schema import Strict, parse, to_dict
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST = "bundle.json"
 ENCODER = "encoder.onnx"
 BACKBONE = "backbone.onnx"
@@ -53,7 +54,7 @@ class Graphs(Strict):
 
 @dataclass(frozen=True)
 class Parity(Strict):
-    """How far the exported graphs are from the trained model, largest over the compared scans."""
+    """How far the exported float graphs are from the trained model, largest over the compared scans."""
 
     head_maps_max_abs_error: float
     box_max_error_m: float
@@ -61,6 +62,34 @@ class Parity(Strict):
     scans: int
     tolerance: float
     """What `head_maps_max_abs_error` had to stay under."""
+
+
+@dataclass(frozen=True)
+class LayerQuantization(Strict):
+    """One layer of the backbone in the sensitivity sweep."""
+
+    layer: str
+    """Its name in the model, such as `neck.blocks.0.0`."""
+    logit_rms_error: float
+    """Of the class logits of the best anchors, if this layer alone computes in 8 bits."""
+    kept_float: bool
+
+
+@dataclass(frozen=True)
+class Quantization(Strict):
+    """How the 8-bit backbone was made, and how far it is from the float one on scans it was not calibrated on."""
+
+    calibration_scans: int
+    compared_scans: int
+    layers: tuple[LayerQuantization, ...]
+    logit_rms_error: float
+    """Of the class logits of the best anchors, all 8-bit layers together."""
+    boxes: int
+    """Boxes that the float bundle reports on the compared scans."""
+    boxes_matched: int
+    """Those that the 8-bit bundle reports too: same class, BEV IoU of at least 0.5."""
+    boxes_added: int
+    """Boxes that the 8-bit bundle alone reports."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +121,16 @@ class Bundle(Strict):
     """Reading of the correlative point attention in the encoder; the runtime need not know, people do."""
     channels: int
     """C, features of one pillar."""
+    precision: Literal["float32", "int8"]
+    """What backbone.onnx computes in."""
+    canvas: CanvasFormat
+    backbone_gmac: float
+    """Multiply-accumulates of backbone.onnx, 10^9."""
     graphs: Graphs
     parity: Parity | None
-    """None only while the export is still proving it."""
+    """None only while the export is still proving it; of a quantized bundle, the float graphs it was made from."""
+    quantization: Quantization | None
+    """None in float32."""
     expected_input: ExpectedInput
     provenance: Provenance
     license: str

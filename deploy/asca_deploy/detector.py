@@ -25,6 +25,8 @@ STAGES = ("input", "pillarize", "encode", "scatter", "neck+head", "decode")
 
 Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 
+_TENSOR = {"float32": "tensor(float)", "uint8": "tensor(uint8)"}  # onnxruntime's names
+
 _log = logging.getLogger("asca_deploy")
 
 
@@ -84,7 +86,7 @@ class Detector:
         # Both graphs on the same provider: in "auto" the first one found out which starts.
         self.provider = self._backbone.provider
         self._encoder = _open_encoder(self.folder, self.bundle, [self.provider])
-        self._canvas = Canvas(self.bundle.channels, self.spec.grid)
+        self._canvas = Canvas(self.bundle.channels, self.spec.grid, self.bundle.canvas)
         self._warned: set[str] = set()
         self.load_s = time.perf_counter() - start
         self.last_frame: FrameReport | None = None
@@ -129,23 +131,22 @@ class Detector:
         """Finite points (N, 4) -> the features of M points in P pillars. Paper section 3.2."""
         return self.spec.pillarize(points)
 
-    def encode(self, pillars: Pillars) -> NDArray[np.float32]:
-        """Features (M, 9) -> pillar features (P, C). Paper section 3.3."""
+    def encode(self, pillars: Pillars) -> NDArray[Any]:
+        """Features (M, 9) -> pillar features (P, C), in the steps of the canvas. Paper section 3.2."""
         if not len(pillars.cells):
-            return np.empty((0, self.bundle.channels), np.float32)
+            return np.empty((0, self.bundle.channels), self.bundle.canvas.type)
         (features,) = self._encoder.run(
             features=pillars.features, pillar_index=pillars.pillar_index, point_counts=pillars.point_counts
         )
         return features
 
-    def scatter(self, pillar_features: NDArray[np.float32], cells: NDArray[np.int64]) -> NDArray[np.float32]:
-        """(P, C) at P cells -> pseudo-image (1, C, ny, nx), valid until the next scatter."""
+    def scatter(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> NDArray[Any]:
+        """(P, C) at P cells -> pseudo-image (1, ny + 1, nx + 1, C), valid until the next scatter."""
         return self._canvas.scatter(pillar_features, cells)
 
-    def neck_and_head(self, canvas: NDArray[np.float32]) -> Maps:
-        """Pseudo-image (1, C, ny, nx) -> logits and residuals on the head's map. Paper Table 1."""
-        scores, boxes, directions = self._backbone.run(canvas=canvas)
-        return HeadMaps(scores[0], boxes[0], directions[0])
+    def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
+        """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
+        return HeadMaps(*(np.moveaxis(channels_last[0], -1, 0) for channels_last in self._backbone.run(canvas=canvas)))
 
     def decode(self, maps: Maps) -> Detections:
         """Head maps -> boxes above the score threshold that survive the rotated NMS."""
@@ -199,15 +200,15 @@ def _open_encoder(folder: Path, bundle: Bundle, providers: list[str]) -> Graph:
         "pillar_index": Tensor("tensor(int64)", (None,)),
         "point_counts": Tensor("tensor(int64)", (None,)),
     }
-    outputs = {"pillar_features": Tensor("tensor(float)", (None, bundle.channels))}
+    outputs = {"pillar_features": Tensor(_TENSOR[bundle.canvas.type], (None, bundle.channels))}
     return Graph(folder / bundle.graphs.encoder.file, inputs, outputs, providers, threads=1)
 
 
 def _open_backbone(folder: Path, bundle: Bundle, providers: list[str], threads: int) -> Graph:
     grid, anchors = bundle.spec.grid, bundle.spec.anchors.shape[2]
-    inputs = {"canvas": Tensor("tensor(float)", (1, bundle.channels, grid.ny, grid.nx))}
+    inputs = {"canvas": Tensor(_TENSOR[bundle.canvas.type], (1, grid.ny + 1, grid.nx + 1, bundle.channels))}
     outputs = {
-        name: Tensor("tensor(float)", (1, channels * anchors, *grid.head_shape))
+        name: Tensor("tensor(float)", (1, *grid.head_shape, channels * anchors))
         for name, channels in (("scores", 1), ("boxes", 7), ("directions", 2))
     }
     return Graph(folder / bundle.graphs.backbone.file, inputs, outputs, providers, threads)

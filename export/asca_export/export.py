@@ -19,10 +19,12 @@ from asca_deploy.bundle import (
     Provenance,
     write_bundle_manifest,
 )
+from asca_deploy.canvas import CanvasFormat
 from asca_deploy.detector import Detector
 from asca_deploy.input_check import expected_input
 from asca_deploy.layout import layout_of
 from asca_export import graphs
+from asca_export.fast_forms import FastBackbone
 from asca_export.parity import prove_parity
 from asca_pillars.config import Config
 from asca_pillars.environment import git_revision, package_versions
@@ -63,7 +65,7 @@ def export_bundle(
     config, detector, steps = checkpoint
     with atomic_directory(out) as folder:
         graphs.export_encoder(detector, folder / ENCODER)
-        graphs.export_backbone(detector, folder / BACKBONE)
+        graphs.export_backbone(FastBackbone(detector), detector.grid, folder / BACKBONE)
         for name in (ENCODER, BACKBONE):
             _stamp(folder / name, config)
         draft = Bundle(
@@ -71,8 +73,12 @@ def export_bundle(
             spec=config.detector,
             cpa=config.network.cpa,
             channels=config.network.pillar_channels,
+            precision="float32",
+            canvas=CanvasFormat(),
+            backbone_gmac=graphs.multiply_accumulates(folder / BACKBONE) / 1e9,
             graphs=Graphs.of(folder),
             parity=None,
+            quantization=None,
             expected_input=expected_input(scans),
             provenance=Provenance(
                 command=command,

@@ -1,6 +1,7 @@
 """PyTorch modules -> the two ONNX graphs of a bundle. The scatter between them is not exported: it is an assignment."""
 
 import logging
+import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,9 @@ import torch
 from onnxscript import opset20 as op
 from torch import Tensor, nn
 
+from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.geometry.grid import PillarGrid
 from asca_pillars.geometry.pillarize import FEATURES
 from asca_pillars.models.detector import PillarDetector
 
@@ -42,16 +45,35 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
     )
 
 
-def export_backbone(detector: PillarDetector, path: Path) -> None:
-    """Write backbone.onnx: canvas (1, C, ny, nx) -> scores, boxes, directions, as `SSDHead` returns them."""
-    grid, channels = detector.grid, detector.encode.linear.out_features
+def export_backbone(backbone: FastBackbone, grid: PillarGrid, path: Path) -> None:
+    """Write backbone.onnx: canvas (1, ny + 1, nx + 1, C) -> scores, boxes, directions, see `FastBackbone`."""
+    channels = backbone.blocks[0][0].in_channels
     _export(
-        _Backbone(detector),
-        (torch.zeros(1, channels, grid.ny, grid.nx),),
+        backbone,
+        (torch.zeros(1, grid.ny + 1, grid.nx + 1, channels),),
         path,
         input_names=["canvas"],
         output_names=list(HeadMaps._fields),
     )
+
+
+def multiply_accumulates(path: Path) -> int:
+    """What the convolutions and matrix products of a graph with fixed shapes cost."""
+    graph = onnx.shape_inference.infer_shapes(onnx.load(path)).graph
+    shapes = {
+        value.name: [size.dim_value for size in value.type.tensor_type.shape.dim]
+        for value in (*graph.input, *graph.value_info, *graph.output)
+    } | {weights.name: list(weights.dims) for weights in graph.initializer}
+    total = 0
+    for node in graph.node:
+        if node.op_type == "Conv":
+            _, *window = shapes[node.input[1]]  # (outputs, inputs per group, height, width)
+        elif node.op_type == "MatMul":
+            window = shapes[node.input[1]][:1]
+        else:
+            continue
+        total += math.prod(shapes[node.output[0]]) * math.prod(window)
+    return total
 
 
 def _export(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
@@ -89,17 +111,6 @@ class _Encoder(nn.Module):
     def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
         encoded: Tensor = self.encode(features, pillar_index, point_counts)
         return encoded
-
-
-class _Backbone(nn.Module):
-    """Neck and head as one graph."""
-
-    def __init__(self, detector: PillarDetector) -> None:
-        super().__init__()
-        self.neck, self.head = detector.neck, detector.head
-
-    def forward(self, canvas: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return tuple(self.head(self.neck(canvas)))
 
 
 def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:

@@ -51,15 +51,16 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
         batch = batch_pillars([pillars])
         with torch.inference_mode():
             expected_features = detector.encode(batch.features, batch.pillar_index, batch.point_counts)
-            expected_canvas = detector.scatter(expected_features, batch.cells, batch.frame_pillars)
-            expected_maps: Maps = HeadMaps(*(m[0].numpy() for m in detector.head(detector.neck(expected_canvas))))
+            pseudo_image = detector.scatter(expected_features, batch.cells, batch.frame_pillars)
+            expected_maps: Maps = HeadMaps(*(m[0].numpy() for m in detector.head(detector.neck(pseudo_image))))
         features = runtime.encode(pillars)
         canvas = runtime.scatter(features, pillars.cells)
         maps = runtime.neck_and_head(canvas)
         # Features have no unit, and some readings of the attention sum over thousands of pillars: their scale counts.
         allowed = MAP_TOLERANCE * max(1.0, float(expected_features.abs().max()) if len(expected_features) else 0.0)
         _require_close("encode", expected_features.numpy(), features, allowed, number)
-        _require_close("scatter", expected_canvas.numpy(), canvas, allowed, number)
+        expected_canvas = np.pad(pseudo_image.numpy().transpose(0, 2, 3, 1), ((0, 0), (1, 0), (1, 0), (0, 0)))
+        _require_close("scatter", expected_canvas, canvas, allowed, number)
         for name, expected, found in zip(HeadMaps._fields, expected_maps, maps, strict=True):
             error = _require_close(f"head `{name}`", expected, found, MAP_TOLERANCE, number)
             worst_map = max(worst_map, error)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from asca_deploy.bundle import Bundle, Graphs, Provenance, write_bundle_manifest
+from asca_deploy.canvas import CanvasFormat
 from asca_deploy.input_check import ExpectedInput
 from asca_pillars.geometry.grid import PillarGrid
 from asca_pillars.geometry.pillarize import FEATURES, PillarLimits
@@ -57,7 +58,7 @@ def encoder_graph(uses_counts: bool) -> onnx.ModelProto:
 
 
 def backbone_graph() -> onnx.ModelProto:
-    """One strided convolution, then the three heads."""
+    """One strided convolution, then the three heads; maps and canvas channels last."""
     rng = np.random.default_rng(2)
     anchors = SPEC.anchors.shape[2]
     weights = {
@@ -65,7 +66,8 @@ def backbone_graph() -> onnx.ModelProto:
         "neck.bias": np.zeros(16, np.float32),
     }
     nodes = [
-        helper.make_node("Conv", ["canvas", "neck.weight", "neck.bias"], ["neck"], strides=[2, 2], pads=[1, 1, 1, 1]),
+        helper.make_node("Transpose", ["canvas"], ["image"], perm=[0, 3, 1, 2]),
+        helper.make_node("Conv", ["image", "neck.weight", "neck.bias"], ["neck"], strides=[2, 2]),
         helper.make_node("Relu", ["neck"], ["relu"]),
     ]
     outputs = []
@@ -76,9 +78,10 @@ def backbone_graph() -> onnx.ModelProto:
     ):
         weights[f"{name}.weight"] = rng.normal(0, spread, (count, 16, 1, 1)).astype(np.float32)
         weights[f"{name}.bias"] = np.full(count, bias, np.float32)
-        nodes.append(helper.make_node("Conv", ["relu", f"{name}.weight", f"{name}.bias"], [name]))
-        outputs.append(_info(name, [1, count, *SPEC.grid.head_shape]))
-    canvas = _info("canvas", [1, CHANNELS, SPEC.grid.ny, SPEC.grid.nx])
+        nodes.append(helper.make_node("Conv", ["relu", f"{name}.weight", f"{name}.bias"], [f"{name}_first"]))
+        nodes.append(helper.make_node("Transpose", [f"{name}_first"], [name], perm=[0, 2, 3, 1]))
+        outputs.append(_info(name, [1, *SPEC.grid.head_shape, count]))
+    canvas = _info("canvas", [1, SPEC.grid.ny + 1, SPEC.grid.nx + 1, CHANNELS])
     return _model(nodes, [canvas], outputs, weights)
 
 
@@ -102,8 +105,12 @@ def write_bundle(folder: Path, uses_counts: bool = True) -> Path:
         spec=SPEC,
         cpa="none",
         channels=CHANNELS,
+        precision="float32",
+        canvas=CanvasFormat(),
+        backbone_gmac=0.1,
         graphs=Graphs.of(folder),
         parity=None,
+        quantization=None,
         expected_input=EXPECTED_INPUT,
         provenance=provenance,
         license="Apache-2.0",

@@ -58,7 +58,7 @@ def test_layout_of_the_papers_grid(tiny_bundle: Path) -> None:
         {"start_m": 46.08, "pillar_m": 0.08, "pillars": 288},
     ]
     assert layout["y_zones"] == [{"start_m": -39.68, "pillar_m": 0.16, "pillars": 496}]
-    assert layout["canvas_shape"] == [496, 504]
+    assert layout["canvas_shape"] == [497, 505]
     assert layout["head_shape"] == [248, 252]
     assert layout["features"] == list(FEATURES)
 
@@ -125,12 +125,12 @@ def test_no_usable_schema_version(bundle_copy: Path, version: object) -> None:
 
 def test_newer_schema_version_is_said_before_anything_else(bundle_copy: Path) -> None:
     edit(bundle_copy, lambda data: data.update(schema_version=SCHEMA_VERSION + 1, graphs="packed"))
-    assert_refused(bundle_copy, r"schema_version 2 is newer .*pip install --upgrade asca-pillars")
+    assert_refused(bundle_copy, r"schema_version 3 is newer .*pip install --upgrade asca-pillars")
 
 
 def test_older_schema_version(bundle_copy: Path) -> None:
-    edit(bundle_copy, lambda data: data.update(schema_version=0))
-    assert_refused(bundle_copy, "schema_version 0 is no longer read; export the bundle again")
+    edit(bundle_copy, lambda data: data.update(schema_version=1))
+    assert_refused(bundle_copy, "schema_version 1 is no longer read; export the bundle again")
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"bundle"', "null", "\xff"])

@@ -1,29 +1,34 @@
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from asca_deploy.canvas import Canvas
+from asca_deploy.canvas import Canvas, CanvasFormat
 from asca_pillars.geometry.grid import PillarGrid
 
 # 8 + 16 + 32 columns by 16 rows, off centre.
 GRID = PillarGrid(x_range_m=(1.0, 8.68), y_range_m=(-0.64, 1.92))
 CHANNELS = 3
+FORMATS = (CanvasFormat(), CanvasFormat("uint8", (7, 0, 130)))
 
 
-def scatter_by_loop(pillar_features: NDArray[np.float32], cells: NDArray[np.int64]) -> NDArray[np.float32]:
-    image = np.zeros((1, CHANNELS, GRID.ny, GRID.nx), np.float32)
+def scatter_by_loop(pillar_features: NDArray[np.generic], cells: NDArray[np.int64], empty: object) -> object:
+    image = np.empty((1, GRID.ny + 1, GRID.nx + 1, CHANNELS), pillar_features.dtype)
+    image[:] = empty
     for features, cell in zip(pillar_features, cells, strict=True):
-        for channel, value in enumerate(features):
-            image[0, channel, cell // GRID.nx, cell % GRID.nx] = value
+        image[0, 1 + cell // GRID.nx, 1 + cell % GRID.nx] = features
     return image
 
 
-def test_every_frame_equals_a_scatter_onto_zeros() -> None:
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_frame_equals_a_scatter_onto_nothing(form: CanvasFormat) -> None:
     rng = np.random.default_rng(0)
-    canvas = Canvas(CHANNELS, GRID)
+    canvas = Canvas(CHANNELS, GRID, form)
     for count in (40, 7, 0, 1, GRID.nx * GRID.ny, 12):
         cells = np.sort(rng.choice(GRID.nx * GRID.ny, count, replace=False))
-        features = rng.normal(size=(count, CHANNELS)).astype(np.float32)
-        np.testing.assert_array_equal(canvas.scatter(features, cells), scatter_by_loop(features, cells))
+        features = rng.uniform(0, 255, (count, CHANNELS)).astype(form.type)
+        expected = scatter_by_loop(features, cells, form.empty or 0)
+        np.testing.assert_array_equal(canvas.scatter(features, cells), expected)
+        assert canvas.image.dtype == form.type
 
 
 def test_the_image_is_allocated_once() -> None:

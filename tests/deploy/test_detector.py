@@ -27,11 +27,11 @@ def detect_by_hand(bundle: Path, points: Points) -> Detections:
     backbone = onnxruntime.InferenceSession(bundle / "backbone.onnx", providers=["CPUExecutionProvider"])
     feed = {name: getattr(pillars, name) for name in ("features", "pillar_index", "point_counts")}
     (pillar_features,) = encoder.run(["pillar_features"], feed)
-    canvas = np.zeros((1, pillar_features.shape[1], spec.grid.ny, spec.grid.nx), np.float32)
+    canvas = np.zeros((1, spec.grid.ny + 1, spec.grid.nx + 1, pillar_features.shape[1]), np.float32)
     for features, cell in zip(pillar_features, pillars.cells, strict=True):
-        canvas[0, :, cell // spec.grid.nx, cell % spec.grid.nx] = features
-    scores, boxes, directions = backbone.run(["scores", "boxes", "directions"], {"canvas": canvas})
-    return spec.decode(HeadMaps(scores[0], boxes[0], directions[0]))
+        canvas[0, 1 + cell // spec.grid.nx, 1 + cell % spec.grid.nx] = features
+    maps = backbone.run(["scores", "boxes", "directions"], {"canvas": canvas})
+    return spec.decode(HeadMaps(*(channels_last[0].transpose(2, 0, 1) for channels_last in maps)))
 
 
 def test_equals_the_chain_by_hand(tiny_bundle: Path, scans: list[Points]) -> None:

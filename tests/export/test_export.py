@@ -14,6 +14,7 @@ import torch
 from asca_deploy import Detector, load_bundle
 from asca_export import graphs
 from asca_export.export import export_bundle
+from asca_export.fast_forms import FastBackbone
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
 from asca_pillars.config import Config, NetworkConfig
 from asca_pillars.data.kitti import KittiSplit
@@ -107,7 +108,8 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
     with torch.no_grad():
         other.head.boxes.bias.add_(0.01)
     export_backbone = graphs.export_backbone
-    monkeypatch.setattr(graphs, "export_backbone", lambda _, path: export_backbone(other, path))
+    wrong = FastBackbone(other)
+    monkeypatch.setattr(graphs, "export_backbone", lambda _, grid, path: export_backbone(wrong, grid, path))
     with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime part at stage head `boxes`: .* 0\.01"):
         export_bundle(checkpoint, tmp_path / "bundle", SCANS)
     assert {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()} == before

@@ -1,0 +1,115 @@
+"""The trained network in the forms that run fastest; the export proves them to be the same function.
+
+- A batch normalization after a convolution is part of its weights.
+- A transposed convolution whose kernel equals its stride writes every output once: it is a 1x1 convolution to stride^2
+  times the channels and a depth-to-space. Runtimes have fast code for the former of the two, and for the latter too
+  when channels come last: then it moves whole runs of memory.
+- The head's three 1x1 convolutions read the same map: with channels last they are one matrix product, whose results
+  stay in floating point when everything before it is 8-bit.
+- The pseudo-image comes with the first convolution's padding in it, and may come in steps of its own: scale and offset
+  of each channel go into that convolution's weights. Offsets are exact because nothing is padded after them.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from asca_pillars.models.detector import PillarDetector
+from asca_pillars.models.head import SSDHead
+
+# What one step of an 8-bit tensor counts for in the graph: any number would do but one, which OpenVINO leaves out and
+# then takes the tensor for a float.
+STEP_VALUE = 1 / 64
+
+
+class CanvasSteps(NamedTuple):
+    """A pseudo-image's real value is scale * (step - empty), channel by channel."""
+
+    scale: Tensor
+    """(C,) positive."""
+    empty: Tensor
+    """(C,) whole numbers 0..255: the step that stands for zero."""
+
+
+class FastBackbone(nn.Module):
+    """Neck and head of a trained detector as one graph in fast forms.
+
+    Args:
+        detector: in evaluation mode; it stays as it is.
+        steps: of the pseudo-image, which then holds STEP_VALUE times the step; None for real values.
+    """
+
+    def __init__(self, detector: PillarDetector, steps: CanvasSteps | None = None) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(_folded(block) for block in detector.neck.blocks)
+        _take_padded(self.blocks[0][0], steps)
+        self.upsamples = nn.ModuleList(Upsample(deblock) for deblock in detector.neck.deblocks)
+        self.head = _Head(detector.head)
+
+    def forward(self, canvas: Tensor) -> tuple[Tensor, ...]:
+        """(1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A)."""
+        features, maps = canvas.permute(0, 3, 1, 2), []
+        for block, upsample in zip(self.blocks, self.upsamples, strict=True):
+            features = block(features)
+            maps.append(upsample(features))
+        return self.head(torch.cat(maps, dim=-1))
+
+
+class Upsample(nn.Module):
+    """Transposed convolution, normalization, ReLU -> 1x1 convolution, ReLU, depth-to-space: (1, C, H, W) -> NHWC."""
+
+    def __init__(self, deblock: nn.Sequential) -> None:
+        super().__init__()
+        transposed, norm, _ = deblock
+        fused = fuse_conv_bn_eval(transposed, norm, transpose=True)
+        if fused.kernel_size != fused.stride:
+            raise ValueError(f"kernel {fused.kernel_size} and stride {fused.stride} differ: outputs overlap")
+        self.stride, self.channels = fused.stride[0], fused.out_channels
+        self.convolution = nn.Conv2d(fused.in_channels, self.channels * self.stride**2, 1)
+        with torch.no_grad():
+            weight = fused.weight.permute(2, 3, 1, 0)  # (row, column) within the stride, then channel: as written below
+            self.convolution.weight.copy_(weight.reshape(-1, fused.in_channels, 1, 1))
+            self.convolution.bias.copy_(fused.bias.repeat(self.stride**2))
+
+    def forward(self, features: Tensor) -> Tensor:
+        upsampled = torch.relu(self.convolution(features)).permute(0, 2, 3, 1)
+        if self.stride == 1:
+            return upsampled
+        _, height, width, _ = upsampled.shape
+        # A row of the output takes `run` values of one input cell, then those of the next.
+        run = self.stride * self.channels
+        rows = upsampled.reshape(height, width, self.stride, run).permute(0, 2, 1, 3)
+        return rows.reshape(1, height * self.stride, width * self.stride, self.channels)
+
+
+class _Head(nn.Module):
+    """The head's convolutions as one matrix product: (1, H, W, C) -> its maps, channels last."""
+
+    def __init__(self, head: SSDHead) -> None:
+        super().__init__()
+        parts = (head.scores, head.boxes, head.directions)
+        self.weight = nn.Parameter(torch.cat([part.weight[:, :, 0, 0] for part in parts]).T.contiguous())
+        self.bias = nn.Parameter(torch.cat([part.bias for part in parts]))  # type: ignore[list-item]
+        self.channels = [part.out_channels for part in parts]
+
+    def forward(self, features: Tensor) -> tuple[Tensor, ...]:
+        return torch.split(features @ self.weight + self.bias, self.channels, dim=-1)
+
+
+def _folded(block: nn.Sequential) -> nn.Sequential:
+    """Convolution, normalization, ReLU, ... -> convolution, ReLU, ..."""
+    layers: list[nn.Module] = []
+    for convolution, norm in zip(block[0::3], block[1::3], strict=True):
+        layers += [fuse_conv_bn_eval(convolution, norm), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def _take_padded(first: nn.Conv2d, steps: CanvasSteps | None) -> None:
+    """Let the first convolution find its padding, and the steps, in its input."""
+    first.padding = (0, 0)
+    if steps is not None:
+        with torch.no_grad():
+            first.weight.mul_(steps.scale[:, None, None] / STEP_VALUE)
+            first.bias.sub_((first.weight * steps.empty[:, None, None]).sum(dim=(1, 2, 3)) * STEP_VALUE)
