@@ -139,6 +139,7 @@ def test_detect_refuses_what_is_not_there(tmp_path: Path) -> None:
     assert "no such file or folder" in refusal(asca("detect", tmp_path / "none.bin"))
     assert "bundle.json" in refusal(asca("detect", "--bundle", tmp_path, cwd=tmp_path))
     assert "unknown provider 'gpu'" in refusal(asca("detect", "--provider", "gpu", cwd=tmp_path))
+    assert "unknown precision 'half'" in refusal(asca("detect", "--precision", "half", cwd=tmp_path))
     assert "threads" in refusal(asca("detect", "--threads", 0, cwd=tmp_path))
 
 

@@ -50,7 +50,7 @@ class FrameReport:
 
 
 class Detector:
-    """ASCA-PointPillars in ONNX Runtime. One object serves one stream of scans, from one thread at a time.
+    """ASCA-PointPillars without PyTorch. One object serves one stream of scans, from one thread at a time.
 
     Args:
         bundle: folder written by `asca export`; None for the model that comes with the package.

@@ -159,6 +159,12 @@ def test_the_stock_cpu_stays_where_nothing_is_faster() -> None:
     assert Machine(cpu_float32=(FOUND, 0.02)).choose().provider == "cpu"
 
 
+@pytest.mark.parametrize(("seconds", "precision"), [(0.018, "reduced"), (0.019, "float32")])
+def test_reduced_is_taken_only_where_it_pays(seconds: float, precision: str) -> None:
+    machine = Machine(cpu_float32=(FOUND, 0.02), openvino_reduced=(FOUND, seconds), openvino_float32=(FOUND, 0.03))
+    assert machine.choose().precision == precision
+
+
 def test_candidates_come_to_an_end() -> None:
     machine = Machine(cpu_float32=(FOUND, 0.3), openvino_reduced=(FOUND, 0.25), openvino_float32=(FOUND, 0.001))
     choice = machine.choose()
