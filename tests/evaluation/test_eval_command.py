@@ -35,7 +35,7 @@ class BaseInstall(PathFinder):
 
 sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
 from asca_pillars.commands.eval import run
-run(None, None, "val", Path("det"), Path("gt"), Path("out"), None, None, None, 0.05, "cpu", None)
+run(None, None, "val", Path("det"), Path("gt"), Path("out"), None, None, None, 0.05, "cpu", None, None)
 """
 
 
