@@ -16,6 +16,7 @@ def run(
     scans: Path | None,
     bundle: Path | None,
     provider: str,
+    precision: str | None,
     threads: int | None,
     rounds: int,
     report_path: Path | None,
@@ -23,7 +24,7 @@ def run(
     """See `asca bench --help`."""
     console = Console(markup=False)
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]
-    detector = Detector(bundle, provider=provider, threads=threads)
+    detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
     with console.status(f"{rounds} rounds over {len(points)} scan(s)"):
         report = benchmark(detector, points, rounds=rounds)
     console.print(_table(report))
