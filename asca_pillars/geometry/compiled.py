@@ -1,18 +1,27 @@
-"""Whether numba runs the loops of this package, or NumPy."""
+"""Whether numba runs the loops of `pillarize` and `rotated_nms`, or NumPy."""
 
-import importlib
+from collections.abc import Callable
 from functools import cache
-from types import ModuleType
+from typing import Any, NamedTuple
+
+
+class Kernels(NamedTuple):
+    """Compiled forms of the functions of these names (with an underscore) in `pillarize` and `overlap`."""
+
+    sort_points: Callable[..., Any]
+    fill_pillars: Callable[..., Any]
+    suppress: Callable[..., Any]
 
 
 @cache
-def load_kernels() -> ModuleType | None:
-    """`geometry.kernels`, or None where numba is not installed or does not fit the NumPy beside it.
+def load_kernels() -> Kernels | None:
+    """The compiled forms, or None where numba is not installed or does not fit the NumPy beside it.
 
-    The results are the same; without it a full scan costs some milliseconds more. The first call of a process imports
-    numba and takes a few tenths of a second, the very first one on a machine also compiles.
+    Without them the results are the same and a full scan takes some milliseconds more. The first call of a process
+    imports numba and takes a few tenths of a second; the very first one on a machine compiles, two seconds.
     """
     try:
-        return importlib.import_module("asca_pillars.geometry.kernels")
+        from asca_pillars.geometry import kernels_overlap, kernels_pillars
     except ImportError:
         return None
+    return Kernels(kernels_pillars.sort_points, kernels_pillars.fill_pillars, kernels_overlap.suppress)

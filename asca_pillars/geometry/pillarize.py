@@ -90,19 +90,10 @@ def pillarize(
         raise ValueError(f"points must have shape (N, 4), not {points.shape}")
     points = np.require(points, np.float32, ["C", "ALIGNED"])
     kernels = load_kernels()
-    if kernels is None:
-        order, cells, counts = _sort_points(points, grid)
-    else:
-        order, cells, counts = kernels.sort_points(points, *grid.tables)
+    sort, fill = (_sort_points, _fill_pillars) if kernels is None else (kernels.sort_points, kernels.fill_pillars)
+    order, cells, counts = sort(points, grid)
     kept, shuffled = _draw(points, counts, limits, rng)
-    if kernels is None:
-        features, pillar_index, point_counts = _fill_pillars(
-            points, order, cells, counts, kept, shuffled, limits.max_points, grid
-        )
-    else:
-        features, pillar_index, point_counts = kernels.fill_pillars(
-            points, order, cells, counts, kept, shuffled, limits.max_points, grid.column_centres_m, grid.row_centres_m
-        )
+    features, pillar_index, point_counts = fill(points, order, cells, counts, kept, shuffled, limits.max_points, grid)
     return Pillars(
         features=features,
         pillar_index=pillar_index,
