@@ -1,30 +1,50 @@
-"""The loops of `pillarize`, compiled; what they compute is said there, in NumPy."""
+"""The loops of `pillarize`, compiled; what they compute is said there, in NumPy.
+
+Indices are unsigned where it matters: with others, numba looks for negative ones, which count from the end.
+"""
+
+from typing import Any
 
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.geometry.kernels import compiled, given, written
+from asca_pillars.geometry.kernels import compiled, given, inner, written
 
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int64]
-_Shorts = NDArray[np.int32]
+_Counts = NDArray[np.uint32]
 _Bools = NDArray[np.bool_]
 
+_BLOCK = 16  # cells of the grid that are looked at together
 
-def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Shorts, _Integers, _Integers]:
+
+def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, _Integers]:
     """`pillarize._sort_points`, by counting."""
-    room = np.empty((3, len(points)), np.int32)
-    tally = np.zeros(grid.ny * grid.nx, np.int32)
-    pillars = np.empty((2, min(len(points), len(tally))), np.int64)
-    inside, found = _sort_points(points, *grid.tables, room, tally, pillars)
-    return room[2, :inside], pillars[0, :found], pillars[1, :found]
+    size = -(-grid.ny * grid.nx // _BLOCK) * _BLOCK
+    # In one piece: glibc gives several pieces back to the system, and gets them page by page again for the next scan.
+    memory = np.empty(5 * len(points) + size, np.uint32)
+    tally, rows = memory[:size], memory[size:].reshape(5, len(points))
+    order, cells, counts = rows[2:]
+    inside, found = _sort_points(points, *grid.tables, tally, *rows)
+    return order[:inside], cells[:found].astype(np.int64), counts[:found].astype(np.int64)
+
+
+@inner
+def _interval(value: float, edges: _Floats, per_m: float) -> Any:
+    """`grid._interval` of one value."""
+    guess = np.uint64(min(int((value - edges[0]) * per_m), len(edges) - 2))
+    if value < edges[guess]:
+        return guess - np.uint64(1)
+    if value >= edges[guess + np.uint64(1)]:
+        return guess + np.uint64(1)
+    return guess
 
 
 @compiled(
     *(given(types.float32, 2), given(types.float32, 2), given(types.float32), given(types.int64)),
-    *(given(types.float32), written(types.int32, 2), written(types.int32), written(types.int64, 2)),
+    *(given(types.float32), *(written(types.uint32) for _ in range(6))),
 )
 def _sort_points(
     points: _Floats,
@@ -32,11 +52,13 @@ def _sort_points(
     slice_edges_m: _Floats,
     column_of_slice: _Integers,
     row_edges_m: _Floats,
-    room: _Shorts,
-    tally: _Shorts,
-    pillars: _Integers,
+    tally: _Counts,
+    chosen: _Counts,
+    cell_of_chosen: _Counts,
+    order: _Counts,
+    cells: _Counts,
+    counts: _Counts,
 ) -> tuple[int, int]:
-    chosen, cell_of_chosen, order = room[0], room[1], room[2]
     x_low, x_high, y_low, y_high = ranges_m[0, 0], ranges_m[0, 1], ranges_m[1, 0], ranges_m[1, 1]
     z_low, z_high = ranges_m[2, 0], ranges_m[2, 1]
     inside = 0
@@ -46,33 +68,34 @@ def _sort_points(
         # Without branches: which points are inside is hard to predict.
         inside += (x >= x_low) & (x < x_high) & (y >= y_low) & (y < y_high) & (z >= z_low) & (z < z_high)
 
-    last_slice, last_row, columns = len(column_of_slice) - 1, len(row_edges_m) - 2, column_of_slice[-1] + 1
-    slices_per_m = np.float32(last_slice + 1) / (slice_edges_m[-1] - slice_edges_m[0])
-    rows_per_m = np.float32(last_row + 1) / (row_edges_m[-1] - row_edges_m[0])
+    slices_per_m = np.float32(len(slice_edges_m) - 1) / (slice_edges_m[-1] - slice_edges_m[0])
+    rows_per_m = np.float32(len(row_edges_m) - 1) / (row_edges_m[-1] - row_edges_m[0])
+    columns = np.uint64(column_of_slice[-1] + 1)
     found = 0
+    tally[:] = 0
     for k in range(inside):
         x, y = points[chosen[k], 0], points[chosen[k], 1]
-        part = min(int((x - slice_edges_m[0]) * slices_per_m), last_slice)
-        row = min(int((y - row_edges_m[0]) * rows_per_m), last_row)
-        # The products round; the borders decide.
-        part -= x < slice_edges_m[part]
-        part += x >= slice_edges_m[part + 1]
-        row -= y < row_edges_m[row]
-        row += y >= row_edges_m[row + 1]
-        cell = row * columns + column_of_slice[part]
+        column = np.uint64(column_of_slice[_interval(x, slice_edges_m, slices_per_m)])
+        cell = _interval(y, row_edges_m, rows_per_m) * columns + column
         cell_of_chosen[k] = cell
         found += tally[cell] == 0
         tally[cell] += 1
 
     pillar = position = 0
-    for cell in range(len(tally)):
-        count = tally[cell]
-        if count:
-            pillars[0, pillar] = cell
-            pillars[1, pillar] = count
-            pillar += 1
-            tally[cell] = position  # from here on: where the cell's next point goes
-            position += count
+    for block in range(0, len(tally), _BLOCK):
+        occupied = 0
+        for cell in range(block, block + _BLOCK):
+            occupied |= tally[cell]
+        if not occupied:  # as most of them are, and looking at a block at once costs little
+            continue
+        for cell in range(block, block + _BLOCK):
+            count = tally[cell]
+            if count:
+                cells[pillar] = cell
+                counts[pillar] = count
+                pillar += 1
+                tally[cell] = position  # from here on: where the cell's next point goes
+                position += count
     for k in range(inside):
         cell = cell_of_chosen[k]
         order[tally[cell]] = chosen[k]
@@ -82,7 +105,7 @@ def _sort_points(
 
 def fill_pillars(
     points: _Floats,
-    order: _Shorts,
+    order: _Counts,
     cells: _Integers,
     counts: _Integers,
     kept: _Bools,
@@ -130,13 +153,13 @@ def _keep_first(
 
 
 @compiled(
-    *(given(types.float32, 2), given(types.int32), given(types.int64), given(types.int64)),
+    *(given(types.float32, 2), given(types.uint32), given(types.int64), given(types.int64)),
     *(given(types.boolean), given(types.boolean), given(types.float32), given(types.float32)),
     *(written(types.float32, 2), written(types.int64)),
 )
 def _fill_pillars(
     points: _Floats,
-    order: _Shorts,
+    order: _Counts,
     cells: _Integers,
     counts: _Integers,
     kept: _Bools,
