@@ -92,7 +92,7 @@ def report(stages: dict[str, Callable[[], Any]], rounds: int) -> None:
             for form in (0, 1)
         ]
         rows.append((name, *cells, f"{ratios[index]:.1f}"))
-    print(markdown_table(("stage", "compiled", "NumPy", "ratio"), rows, left=1), end="\n\n")
+    print(markdown_table(("stage", "compiled", "NumPy", "ratio"), rows, left=1))
 
 
 def measure_ms(stage: Callable[[], Any]) -> float:
