@@ -77,41 +77,47 @@ def decode(
             f"head maps of {len(classes)} classes on anchors {anchors.shape} must have shapes {expected}, "
             f"not {tuple(m.shape for m in maps)}"
         )
-    names = tuple(spec.name for spec in classes)
-    found = [_decode_class(maps, anchors, label, spec, post) for label, spec in enumerate(classes)]
-    boxes = np.concatenate([boxes for boxes, _ in found])
-    logits = np.concatenate([logits for _, logits in found])
-    labels = np.repeat(np.arange(len(classes), dtype=np.int64), [len(logits) for _, logits in found])
-    best = np.argsort(-logits, kind="stable")[: post.max_detections]
-    return Detections(boxes[best], _sigmoid(logits[best]), labels[best], names)
-
-
-def _decode_class(
-    maps: HeadMaps[NDArray[np.float32]],
-    anchors: NDArray[np.float32],
-    label: int,
-    spec: ClassSpec,
-    post: PostProcess,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(n, 7) boxes and (n,) logits of one class after suppression, best first."""
-    height, width, count, _ = anchors.shape
-    yaws = len(ANCHOR_YAWS_RAD)
-    first = label * yaws
-    # Logits are compared rather than scores: the sigmoid is monotonic, and few anchors ever need it.
-    logits = maps.scores[first : first + yaws].reshape(-1)
-    survivors = np.flatnonzero(logits >= _logit(spec.score_threshold))
-    survivors = survivors[np.argsort(-logits[survivors], kind="stable")[: post.candidates]]
-
-    yaw, cell = np.divmod(survivors, height * width)
-    anchor = first + yaw
+    anchor, cell = _candidates(maps.scores, classes, post.candidates)
+    logits = maps.scores.reshape(count, -1)[anchor, cell]
     residuals = maps.boxes.reshape(count, 7, -1)[anchor, :, cell]
     direction = maps.directions.reshape(count, 2, -1)[anchor, :, cell].argmax(axis=-1)
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
         boxes = decode_boxes(residuals, direction, anchors.reshape(-1, count, 7)[cell, anchor])
     usable = np.isfinite(boxes).all(axis=1)
-    boxes, logits = boxes[usable], logits[survivors[usable]]
-    kept = rotated_nms(boxes, logits, post.nms_iou)
-    return boxes[kept], logits[kept]
+    boxes, logits, labels = boxes[usable], logits[usable], anchor[usable] // len(ANCHOR_YAWS_RAD)
+
+    kept = []
+    for label in range(len(classes)):
+        own = np.flatnonzero(labels == label)
+        kept.append(own[rotated_nms(boxes[own], logits[own], post.nms_iou, post.max_detections)])
+    survivors = np.concatenate(kept)
+    best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
+    return Detections(boxes[best], _sigmoid(logits[best]), labels[best], tuple(spec.name for spec in classes))
+
+
+def _candidates(
+    scores: NDArray[np.float32], classes: tuple[ClassSpec, ...], limit: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Anchor (n,) and cell (n,) of the best anchors of each class, class by class, best first.
+
+    Of equal scores the one that stands earlier in the map (A, H, W) goes first.
+    """
+    count = len(scores)
+    # The backbone's maps lie in memory with the channels last: no copy, and one look at every logit. Logits are
+    # compared rather than scores: the sigmoid is monotonic, and few anchors ever need it.
+    logits = scores.reshape(count, -1).T.reshape(-1)
+    floors = [_logit(spec.score_threshold) for spec in classes]
+    above = np.flatnonzero(logits >= min(floors))
+    logits = logits[above]
+    cell, anchor = np.divmod(above, count)
+    chosen = []
+    for label, floor in enumerate(floors):
+        own = np.flatnonzero((anchor // len(ANCHOR_YAWS_RAD) == label) & (logits >= floor))
+        if len(own) > limit:
+            own = own[logits[own] >= np.partition(logits[own], -limit)[-limit]]
+        chosen.append(own[np.lexsort((cell[own], anchor[own], -logits[own]))[:limit]])
+    best = np.concatenate(chosen)
+    return anchor[best], cell[best]
 
 
 def _logit(probability: float) -> float:

@@ -14,7 +14,7 @@ Columns run along x and rows along y; a pillar's flat index is row * nx + column
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,22 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.fitting import HEAD_STRIDE, MAX_ZONES, NECK_STRIDE, fits, x_advice, y_advice
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
+
+
+class GridTables(NamedTuple):
+    """What turns a point into a cell: the x range in slices of the finest depth, whose borders include every column's.
+
+    Borders are float32, as the points are.
+    """
+
+    ranges_m: NDArray[np.float32]
+    """(3, 2) lower and upper end along x, y, z."""
+    slice_edges_m: NDArray[np.float32]
+    """(S + 1,) evenly spaced along x."""
+    column_of_slice: NDArray[np.int64]
+    """(S,)"""
+    row_edges_m: NDArray[np.float32]
+    """(ny + 1,) evenly spaced along y."""
 
 
 @dataclass(frozen=True)
@@ -107,19 +123,18 @@ class PillarGrid:
         xyz = points[:, :3].astype(np.float32, copy=False)
         cells = np.full(len(points), -1, np.int64)
         inside = np.ones(len(points), bool)
-        for axis, span in enumerate((self.x_range_m, self.y_range_m, self.z_range_m)):
-            low, high = np.array(span, np.float32)
+        for axis, (low, high) in enumerate(self.tables.ranges_m):
             inside &= (xyz[:, axis] >= low) & (xyz[:, axis] < high)
         chosen = np.flatnonzero(inside)
-        slices = _interval(xyz[chosen, 0], self._slice_edges_m)
-        rows = _interval(xyz[chosen, 1], self._row_edges_m)
-        cells[chosen] = rows * self.nx + self._column_of_slice[slices]
+        slices = _interval(xyz[chosen, 0], self.tables.slice_edges_m)
+        rows = _interval(xyz[chosen, 1], self.tables.row_edges_m)
+        cells[chosen] = rows * self.nx + self.tables.column_of_slice[slices]
         return cells
 
     def cell_centres_m(self, cells: NDArray[np.int64]) -> NDArray[np.float32]:
         """Centres x, y of the pillars with these flat indices: (n,) -> (n, 2) float32, metres."""
         rows, columns = np.divmod(cells, self.nx)
-        return np.stack([self._column_centres_m[columns], self._row_centres_m[rows]], axis=-1)
+        return np.stack([self.column_centres_m[columns], self.row_centres_m[rows]], axis=-1)
 
     def head_centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Metric centres of the head map's cells: x of its columns (W,), y of its rows (H,).
@@ -148,23 +163,23 @@ class PillarGrid:
         return np.concatenate([[0], np.cumsum(np.repeat(slices_per_column, columns))])
 
     @cached_property
-    def _column_of_slice(self) -> NDArray[np.int64]:
-        return np.repeat(np.arange(self.nx, dtype=np.int64), np.diff(self._edge_slices))
+    def tables(self) -> GridTables:
+        """See GridTables."""
+        return GridTables(
+            ranges_m=np.array([self.x_range_m, self.y_range_m, self.z_range_m], np.float32),
+            slice_edges_m=np.linspace(*self.x_range_m, self._slices + 1, dtype=np.float32),
+            column_of_slice=np.repeat(np.arange(self.nx, dtype=np.int64), np.diff(self._edge_slices)),
+            row_edges_m=self.y_edges_m.astype(np.float32),
+        )
 
     @cached_property
-    def _slice_edges_m(self) -> NDArray[np.float32]:
-        return np.linspace(*self.x_range_m, self._slices + 1, dtype=np.float32)
-
-    @cached_property
-    def _row_edges_m(self) -> NDArray[np.float32]:
-        return self.y_edges_m.astype(np.float32)
-
-    @cached_property
-    def _column_centres_m(self) -> NDArray[np.float32]:
+    def column_centres_m(self) -> NDArray[np.float32]:
+        """x of the columns' centres, (nx,)."""
         return ((self.x_edges_m[:-1] + self.x_edges_m[1:]) / 2).astype(np.float32)
 
     @cached_property
-    def _row_centres_m(self) -> NDArray[np.float32]:
+    def row_centres_m(self) -> NDArray[np.float32]:
+        """y of the rows' centres, (ny,)."""
         return ((self.y_edges_m[:-1] + self.y_edges_m[1:]) / 2).astype(np.float32)
 
 

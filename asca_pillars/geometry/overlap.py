@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.compiled import load_kernels
 
 _Boxes = NDArray[np.floating[Any]]
 _Doubles = NDArray[np.float64]
@@ -97,8 +98,10 @@ def aligned_bev_iou(a: _Boxes, b: _Boxes) -> NDArray[np.float32]:
     return _over_union(shared, al * aw, bl * bw)
 
 
-def rotated_nms(boxes: _Boxes, scores: NDArray[np.floating[Any]], iou_threshold: float) -> NDArray[np.int64]:
-    """Greedy suppression by `bev_iou`: indices of the kept boxes, by descending score.
+def rotated_nms(
+    boxes: _Boxes, scores: NDArray[np.floating[Any]], iou_threshold: float, limit: int | None = None
+) -> NDArray[np.int64]:
+    """Greedy suppression by `bev_iou`: indices of the kept boxes, by descending score; of the first `limit` of them.
 
     A box is dropped if a kept, better one overlaps it by more than `iou_threshold`. Of equal scores the
     earlier goes first.
@@ -107,9 +110,19 @@ def rotated_nms(boxes: _Boxes, scores: NDArray[np.floating[Any]], iou_threshold:
         boxes: (N, 7), LiDAR frame; N may be 0.
         scores: (N,), any monotonic measure.
     """
-    waiting = np.argsort(-scores, kind="stable")
+    order = np.argsort(-scores, kind="stable")
+    kernels = load_kernels()
+    suppress = _suppress if kernels is None else kernels.suppress
+    return order[
+        suppress(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)
+    ]
+
+
+def _suppress(boxes: _Doubles, iou_threshold: float, limit: int) -> NDArray[np.int64]:
+    """`rotated_nms` of boxes that come best first."""
+    waiting = np.arange(len(boxes))
     kept = [waiting[:0]]
-    while len(waiting):
+    while len(waiting) and sum(map(len, kept)) < limit:
         block, waiting = waiting[:_NMS_BLOCK], waiting[_NMS_BLOCK:]
         clashes = bev_iou(boxes[block], boxes[block]) > iou_threshold
         alive = np.ones(len(block), bool)
@@ -119,7 +132,7 @@ def rotated_nms(boxes: _Boxes, scores: NDArray[np.floating[Any]], iou_threshold:
         kept.append(block[alive])
         clashes = bev_iou(boxes[block[alive]], boxes[waiting]) > iou_threshold
         waiting = waiting[~clashes.any(axis=0)]
-    return np.concatenate(kept)
+    return np.concatenate(kept)[:limit]
 
 
 def _near_pairs(a: _Doubles, b: _Doubles) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

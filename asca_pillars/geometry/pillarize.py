@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.compiled import load_kernels
 from asca_pillars.geometry.grid import PillarGrid
 
 FEATURES = ("x", "y", "z", "reflectance", "x_mean", "y_mean", "z_mean", "x_center", "y_center")
@@ -87,38 +88,50 @@ def pillarize(
     """
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4), not {points.shape}")
-    points = np.ascontiguousarray(points, np.float32)
-    cells = grid.cells(points)
-    order = np.flatnonzero(cells >= 0)
-    order = order[_stable_argsort(cells[order])]
-    cell_of_point = cells[order]
-    inside = len(order)
-    starts = np.flatnonzero(np.diff(cell_of_point, prepend=-1))
-    counts = np.diff(starts, append=inside)
-    found = len(starts)
-
-    if found > limits.max_pillars or counts.max(initial=0) > limits.max_points:
-        if rng is None:
-            rng = np.random.default_rng(zlib.crc32(points.data))
-        keep = _draw(counts, limits, rng)
-        order, cell_of_point = order[keep], cell_of_point[keep]
-        starts = np.flatnonzero(np.diff(cell_of_point, prepend=-1))
-        counts = np.diff(starts, append=len(order))
-
-    cells = cell_of_point[starts]
+    points = np.require(points, np.float32, ["C", "ALIGNED"])
+    kernels = load_kernels()
+    sort, fill = (_sort_points, _fill_pillars) if kernels is None else (kernels.sort_points, kernels.fill_pillars)
+    order, cells, counts = sort(points, grid)
+    kept, shuffled = _draw(points, counts, limits, rng)
+    features, pillar_index, point_counts = fill(points, order, cells, counts, kept, shuffled, limits.max_points, grid)
     return Pillars(
-        features=_features(points.take(order, axis=0), counts, grid.cell_centres_m(cells)),
-        pillar_index=np.repeat(np.arange(len(cells), dtype=np.int64), counts),
-        point_counts=counts,
-        cells=cells,
+        features=features,
+        pillar_index=pillar_index,
+        point_counts=point_counts,
+        cells=cells[kept],
         stats=PillarCounts(
             points=len(points),
-            points_outside=len(points) - inside,
-            points_over_limit=inside - len(order),
-            pillars=len(cells),
-            pillars_over_limit=found - len(cells),
+            points_outside=len(points) - len(order),
+            points_over_limit=len(order) - len(features),
+            pillars=len(point_counts),
+            pillars_over_limit=len(cells) - len(point_counts),
         ),
     )
+
+
+def _draw(
+    points: NDArray[np.float32], counts: NDArray[np.int64], limits: PillarLimits, rng: np.random.Generator | None
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Which pillars stay, (Q,) bool, and in which order the points of the crowded ones among them are taken, (K,)."""
+    kept = np.ones(len(counts), bool)
+    if len(counts) <= limits.max_pillars and counts.max(initial=0) <= limits.max_points:
+        return kept, np.empty(0, np.int64)
+    if rng is None:
+        rng = np.random.default_rng(zlib.crc32(points.data))
+    kept[rng.permutation(len(counts))[limits.max_pillars :]] = False
+    crowded = kept & (counts > limits.max_points)
+    return kept, rng.permutation(counts[crowded].sum())
+
+
+def _sort_points(
+    points: NDArray[np.float32], grid: PillarGrid
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the points inside, sorted by cell; the occupied cells, ascending; how many points each holds."""
+    cell_of_point = grid.cells(points)
+    order = np.flatnonzero(cell_of_point >= 0)
+    order = order[_stable_argsort(cell_of_point[order])]
+    starts = np.flatnonzero(np.diff(cell_of_point[order], prepend=-1))
+    return order, cell_of_point[order[starts]], np.diff(starts, append=len(order))
 
 
 def _stable_argsort(keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -134,21 +147,34 @@ def _stable_argsort(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return order
 
 
-def _draw(counts: NDArray[np.int64], limits: PillarLimits, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of the sorted points to keep, given the points per pillar: (M,) bool."""
-    kept_pillars = np.ones(len(counts), bool)
-    kept_pillars[rng.permutation(len(counts))[limits.max_pillars :]] = False
-    keep = np.repeat(kept_pillars, counts)
+def _fill_pillars(
+    points: NDArray[np.float32],
+    order: NDArray[np.int64],
+    cells: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    kept: NDArray[np.bool_],
+    shuffled: NDArray[np.int64],
+    max_points: int,
+    grid: PillarGrid,
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
+    """Features (M, 9), pillar index (M,) and points per pillar (P,) of what is kept.
 
-    # The points of crowded pillars, shuffled and then sorted by pillar: in each pillar the first ones stay.
-    crowded = kept_pillars & (counts > limits.max_points)
-    shuffled = rng.permutation(np.flatnonzero(np.repeat(crowded, counts)))
-    pillar_index = np.repeat(np.arange(len(counts)), counts)
-    shuffled = shuffled[_stable_argsort(pillar_index[shuffled])]
-    first = np.cumsum(counts[crowded]) - counts[crowded]
-    rank = np.arange(len(shuffled)) - np.repeat(first, counts[crowded])
-    keep[shuffled[rank >= limits.max_points]] = False
-    return keep
+    Args:
+        order: the points inside, sorted by pillar; `cells` (Q,) and `counts` (Q,) describe the pillars.
+        kept: (Q,) which pillars stay.
+        shuffled: 0..K-1 in any order, one for each point of the crowded pillars that stay: of these points, taken in
+            this order, the first `max_points` of each pillar stay.
+    """
+    pillar_of_point = np.repeat(np.arange(len(cells)), counts)
+    stays = kept[pillar_of_point]
+    crowd = np.flatnonzero(stays & (counts > max_points)[pillar_of_point])[shuffled]
+    crowd = crowd[_stable_argsort(pillar_of_point[crowd])]
+    first = np.searchsorted(pillar_of_point[crowd], pillar_of_point[crowd])
+    stays[crowd[np.arange(len(crowd)) - first >= max_points]] = False
+
+    point_counts = np.minimum(counts[kept], max_points)
+    features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centres_m(cells[kept]))
+    return features, np.repeat(np.arange(len(point_counts)), point_counts), point_counts
 
 
 def _features(

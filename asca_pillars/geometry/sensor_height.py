@@ -18,6 +18,6 @@ def ground_z_m(points: NDArray[np.float32]) -> float | None:
     """
     x, y = points[:, 0], points[:, 1]
     squared_range = x * x + y * y
-    ring = (squared_range > RING_M[0] ** 2) & (squared_range < RING_M[1] ** 2)
-    near_z = points[ring, 2]
+    ring = np.flatnonzero((squared_range > RING_M[0] ** 2) & (squared_range < RING_M[1] ** 2))
+    near_z = points[:, 2].take(ring)
     return float(np.percentile(near_z, PERCENTILE)) if len(near_z) >= MIN_POINTS else None

@@ -18,6 +18,7 @@ from asca_deploy.input_check import check_input
 from asca_deploy.ort_session import OrtSession, check_onnxruntime
 from asca_pillars.data.scans import read_scan
 from asca_pillars.errors import ConfigError, ScanError
+from asca_pillars.geometry.compiled import load_kernels
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.pillarize import FEATURES, PillarCounts, Pillars
@@ -78,6 +79,7 @@ class Detector:
         score_threshold: float | None = None,
     ) -> None:
         start = time.perf_counter()
+        load_kernels()  # here rather than in the first scan
         self.folder = default_bundle_path() if bundle is None else Path(bundle)
         self.threads = default_threads() if threads is None else threads
         if self.threads < 1:

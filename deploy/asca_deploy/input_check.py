@@ -15,7 +15,7 @@ from asca_pillars.geometry.sensor_height import TOLERANCE_M, ground_z_m
 from asca_pillars.schema import Strict
 
 OUTSIDE_SHARE = 0.95
-SAMPLE_POINTS = 16_384  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
+SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ def check_input(points: NDArray[np.float32], counts: PillarCounts, expected: Exp
     if len(points) < fewest / 10:
         text = f"{len(points)} points, the training scans had {fewest} to {most}"
         return [InputWarning("points", text)]  # too few to say anything else
-    sample = points[:: max(1, len(points) // SAMPLE_POINTS)]
+    # Column by column in memory, which is how it is read: NumPy is slow along rows of four.
+    sample = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLE_POINTS)].T).T
     warnings = [_reflectance_warning(sample[:, 3], expected), _height_warning(sample, expected)]
     if counts.points_outside > OUTSIDE_SHARE * counts.points:
         share = 100 * counts.points_outside / counts.points

@@ -78,12 +78,19 @@ def decode_twin(maps: HeadMaps, post: PostProcess) -> list[tuple[float, int, np.
     st.sampled_from([0.01, 0.3]),
     st.sampled_from([20, 1000]),
     st.sampled_from([5, 100]),
+    st.booleans(),
+    st.booleans(),
 )
-@example(0, -4.0, 0.3, 20, 100)  # more anchors than candidates
+@example(0, -4.0, 0.3, 20, 100, False, False)  # more anchors than candidates
+@example(1, -4.0, 0.3, 20, 100, True, True)  # and equal ones among the last to get in
 def test_equals_a_plain_loop(
-    seed: int, mean_logit: float, nms_iou: float, candidates: int, max_detections: int
+    seed: int, mean_logit: float, nms_iou: float, candidates: int, max_detections: int, ties: bool, channels_last: bool
 ) -> None:
     maps, post = noisy_maps(seed, mean_logit), PostProcess(nms_iou, candidates, max_detections)
+    if ties:
+        maps = maps._replace(scores=np.round(maps.scores))
+    if channels_last:  # as the backbone leaves them
+        maps = HeadMaps(*(np.moveaxis(np.moveaxis(m, 0, -1).copy(), -1, 0) for m in maps))
     detections = decode(maps, ANCHORS, CLASSES, post)
     expected = decode_twin(maps, post)
     assert detections.labels.tolist() == [label for _, label, _ in expected]

@@ -1,0 +1,116 @@
+"""What the detector does outside its two graphs: how long it takes compiled by numba, and in NumPy.
+
+    python -m benchmarks.host_path [SCANS]...
+
+Rounds alternate between the two forms, so that a busy machine slows both; medians with the middle half of the rounds,
+milliseconds. Memory is as after a frame of the network: other data has pushed the scan out of the caches.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+from unittest.mock import patch
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from asca_deploy import Bundle, default_bundle_path, load_bundle, sample_scan_path
+from asca_deploy.detector import _finite_points
+from asca_deploy.input_check import check_input
+from asca_pillars.data.scans import read_scan
+from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.geometry.overlap import rotated_nms
+from asca_pillars.machine import cpu_model
+
+CAMERA_VIEW = 0.84, 0.25  # |y| / x and |z| / x: about what KITTI's camera 2 sees
+DISTURBANCE = np.zeros(4 << 20, np.float32)  # 16 MB
+CANDIDATES = (100, 1000)
+
+
+def main(
+    scans: Annotated[list[Path] | None, typer.Argument(help="KITTI .bin files; default: the one that ships.")] = None,
+    rounds: Annotated[int, typer.Option(help="Rounds of each form.")] = 51,
+) -> None:
+    """Print a table for each scan, as it is and as the camera sees it, and one for suppression."""
+    bundle = load_bundle(default_bundle_path())
+    print(f"{cpu_model()}, bundle {bundle.name}, {rounds} rounds\n")
+    for path in scans or [sample_scan_path()]:
+        points = read_scan(path).points
+        in_view = (np.abs(points[:, 1:3]) <= points[:, :1] * np.float32(CAMERA_VIEW)).all(axis=1)
+        for view, part in (("full", points), ("camera view", points[in_view])):
+            print(f"{path.name}, {view}: {len(part)} points")
+            report(host_path(part, bundle), rounds)
+    print("rotated NMS, 60 m by 60 m at nms_iou 0.01")
+    report({f"{count} candidates": suppression(count) for count in CANDIDATES}, rounds)
+
+
+def host_path(points: NDArray[np.float32], bundle: Bundle) -> dict[str, Callable[[], Any]]:
+    """What one frame asks for, stage by stage; the head's maps are noise in which 60 anchors find something."""
+    spec, rng = bundle.spec, np.random.default_rng(0)
+    height, width, count, _ = spec.anchors.shape
+    scores = rng.normal(-8, 1, (height, width, count)).astype(np.float32)
+    scores.reshape(-1)[rng.choice(scores.size, 60, replace=False)] = 1.0
+    boxes = rng.normal(0, 0.2, (height, width, 7 * count)).astype(np.float32)
+    directions = rng.normal(0, 1, (height, width, 2 * count)).astype(np.float32)
+    maps = HeadMaps(*(np.moveaxis(m, -1, 0) for m in (scores, boxes, directions)))
+    counts = spec.pillarize(points).stats
+    return {
+        "input": lambda: (_finite_points(points), check_input(points, counts, bundle.expected_input)),
+        "pillarize": lambda: spec.pillarize(points),
+        "decode": lambda: spec.decode(maps),
+    }
+
+
+def suppression(count: int) -> Callable[[], Any]:
+    """Suppression of boxes as large as cars in all directions."""
+    rng = np.random.default_rng(count)
+    low, high = [0, -30, -1, 3.5, 1.5, 1.4, -np.pi], [60, 30, -0.5, 4.5, 2.0, 1.8, np.pi]
+    boxes, scores = rng.uniform(low, high, (count, 7)).astype(np.float32), rng.random(count).astype(np.float32)
+    return lambda: rotated_nms(boxes, scores, 0.01)
+
+
+def report(stages: dict[str, Callable[[], Any]], rounds: int) -> None:
+    """Time the stages in both forms and print them."""
+    times_ms = np.empty((rounds + 1, 2, len(stages)))  # the first round is not counted
+    for one_round in times_ms:
+        for form, one_form in zip((nullcontext, in_numpy), one_round, strict=True):
+            with form():
+                for index, stage in enumerate(stages.values()):
+                    one_form[index] = measure_ms(stage)
+    if len(stages) > 2:
+        times_ms = np.concatenate([times_ms, times_ms.sum(axis=2, keepdims=True)], axis=2)
+    quarter, median, three_quarters = np.quantile(times_ms[1:], [0.25, 0.5, 0.75], axis=0)
+    ratios = np.median(times_ms[1:, 1] / times_ms[1:, 0], axis=0)
+    rows = []
+    for index, name in enumerate([*stages, "all"][: times_ms.shape[2]]):
+        cells = [
+            f"{median[form, index]:.2f} ({quarter[form, index]:.2f}-{three_quarters[form, index]:.2f})"
+            for form in (0, 1)
+        ]
+        rows.append((name, *cells, f"{ratios[index]:.1f}"))
+    print(markdown_table(("stage", "compiled", "NumPy", "ratio"), rows, left=1))
+
+
+def measure_ms(stage: Callable[[], Any]) -> float:
+    """Wall time of one call."""
+    np.add(DISTURBANCE, 1, out=DISTURBANCE)
+    start = time.perf_counter()
+    stage()
+    return (time.perf_counter() - start) * 1e3
+
+
+@contextmanager
+def in_numpy() -> Iterator[None]:
+    """As without numba."""
+    modules = ("pillarize", "overlap")
+    first, second = (patch(f"asca_pillars.geometry.{name}.load_kernels", lambda: None) for name in modules)
+    with first, second:
+        yield
+
+
+if __name__ == "__main__":
+    typer.run(main)
