@@ -71,7 +71,7 @@ class LayerQuantization(Strict):
     layer: str
     """Its name in the model, such as `neck.blocks.0.0`."""
     logit_rms_error: float
-    """Of the class logits of the best anchors, if this layer alone computes in 8 bits."""
+    """Of the class logits of the best anchors, if this layer alone stays in floating point."""
     kept_float: bool
 
 

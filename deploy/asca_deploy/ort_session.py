@@ -15,6 +15,8 @@ from asca_pillars.errors import BundleError, ProviderError
 
 OLDEST = (1, 25)
 
+# It turns layers that an 8-bit bundle keeps in floating point into 8-bit ones of its own making.
+_DISABLED_OPTIMIZERS = ["WeightBiasQuantization"]
 _ERRORS_ONLY = 3  # onnxruntime's severities: 0 verbose, 1 info, 2 warning, 3 error
 _TYPES = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(int64)": "int64"}
 
@@ -121,7 +123,11 @@ def _open(path: Path, name: str, precision: str, threads: int) -> onnxruntime.In
         providers.append((ORT_PROVIDERS["cpu"].ort_name, {}))
     try:
         session = onnxruntime.InferenceSession(
-            str(path), _session_options(threads), providers=providers, enable_fallback=0
+            str(path),
+            _session_options(threads),
+            providers=providers,
+            enable_fallback=0,
+            disabled_optimizers=_DISABLED_OPTIMIZERS,
         )
     except Exception as error:  # onnxruntime's exceptions share no other base
         reason = (str(error).splitlines() or [type(error).__name__])[0]

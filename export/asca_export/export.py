@@ -2,12 +2,10 @@
 
 import dataclasses
 import datetime
-import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import (
@@ -25,8 +23,8 @@ from asca_deploy.input_check import expected_input
 from asca_deploy.layout import layout_of
 from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
+from asca_export.int8 import quantize_bundle
 from asca_export.parity import prove_parity
-from asca_pillars.config import Config
 from asca_pillars.environment import git_revision, package_versions
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
@@ -45,9 +43,12 @@ def export_bundle(
     *,
     trained_on: str = "not stated",
     command: str = "not stated",
+    calibration: Sequence[NDArray[np.float32]] | None = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
     """Write the two graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
 
+    With `calibration` the proven float graphs then become 8-bit ones, and the bundle says how far those are from them.
     Nothing appears at `out` unless the proof holds; a bundle that stood there stays until then.
 
     Args:
@@ -56,6 +57,8 @@ def export_bundle(
         scans: at least MIN_SCANS scans (N, 4) like those trained on; the runtime later warns of scans unlike them.
         trained_on: what the weights have seen, in words, for the manifest.
         command: the command that trained them.
+        calibration: scans, others than `scans`, that set the ranges of an 8-bit bundle.
+        say: told what is being done.
 
     Raises:
         ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
@@ -63,11 +66,20 @@ def export_bundle(
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector, steps = checkpoint
+    say("Exporting and proving parity")
     with atomic_directory(out) as folder:
         graphs.export_encoder(detector, folder / ENCODER)
         graphs.export_backbone(FastBackbone(detector), detector.grid, folder / BACKBONE)
+        essentials = {
+            "schema_version": SCHEMA_VERSION,
+            "name": config.name,
+            "cpa": config.network.cpa,
+            "license": LICENSE,
+            "spec": to_dict(config.detector),
+            "layout": layout_of(config.detector),
+        }
         for name in (ENCODER, BACKBONE):
-            _stamp(folder / name, config)
+            graphs.stamp(folder / name, essentials)
         draft = Bundle(
             name=config.name,
             spec=config.detector,
@@ -95,19 +107,6 @@ def export_bundle(
         write_bundle_manifest(folder, draft)
         bundle = dataclasses.replace(draft, parity=prove_parity(detector, Detector(folder), scans))
         write_bundle_manifest(folder, bundle)
+        if calibration is not None:
+            bundle = quantize_bundle(folder, bundle, detector, calibration, scans, say)
     return bundle
-
-
-def _stamp(path: Path, config: Config) -> None:
-    """Repeat the manifest's essentials in the graph's own metadata, for whoever meets the file alone."""
-    essentials = {
-        "schema_version": SCHEMA_VERSION,
-        "name": config.name,
-        "cpa": config.network.cpa,
-        "license": LICENSE,
-        "spec": to_dict(config.detector),
-        "layout": layout_of(config.detector),
-    }
-    model = onnx.load(path)
-    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in essentials.items()})
-    onnx.save(model, path)

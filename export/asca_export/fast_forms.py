@@ -33,6 +33,14 @@ class CanvasSteps(NamedTuple):
     """(C,) whole numbers 0..255: the step that stands for zero."""
 
 
+class Stage(NamedTuple):
+    """One block of the neck and what brings its map back to the head's resolution, by the names of their modules."""
+
+    convolutions: dict[str, nn.Conv2d]
+    upsample_name: str
+    upsample: "Upsample"
+
+
 class FastBackbone(nn.Module):
     """Neck and head of a trained detector as one graph in fast forms.
 
@@ -44,9 +52,18 @@ class FastBackbone(nn.Module):
     def __init__(self, detector: PillarDetector, steps: CanvasSteps | None = None) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(_folded(block) for block in detector.neck.blocks)
-        _take_padded(self.blocks[0][0], steps)
         self.upsamples = nn.ModuleList(Upsample(deblock) for deblock in detector.neck.deblocks)
         self.head = _Head(detector.head)
+        _take_padded(next(iter(self.stages()[0].convolutions.values())), steps)
+
+    def stages(self) -> list[Stage]:
+        """The blocks, from the finest map to the coarsest."""
+        stages = []
+        for i, (block, upsample) in enumerate(zip(self.blocks, self.upsamples, strict=True)):
+            assert isinstance(block, nn.Sequential) and isinstance(upsample, Upsample)
+            convolutions = {f"blocks.{i}.{j}": layer for j, layer in enumerate(block) if isinstance(layer, nn.Conv2d)}
+            stages.append(Stage(convolutions, f"upsamples.{i}.convolution", upsample))
+        return stages
 
     def forward(self, canvas: Tensor) -> tuple[Tensor, ...]:
         """(1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A)."""
@@ -60,14 +77,17 @@ class FastBackbone(nn.Module):
 class Upsample(nn.Module):
     """Transposed convolution, normalization, ReLU -> 1x1 convolution, ReLU, depth-to-space: (1, C, H, W) -> NHWC."""
 
-    def __init__(self, deblock: nn.Sequential) -> None:
+    def __init__(self, deblock: nn.Module) -> None:
         super().__init__()
-        transposed, norm, _ = deblock
+        transposed, norm, _ = deblock.children()
+        assert isinstance(transposed, nn.ConvTranspose2d) and isinstance(norm, nn.BatchNorm2d)
         fused = fuse_conv_bn_eval(transposed, norm, transpose=True)
+        assert fused.bias is not None
         if fused.kernel_size != fused.stride:
             raise ValueError(f"kernel {fused.kernel_size} and stride {fused.stride} differ: outputs overlap")
         self.stride, self.channels = fused.stride[0], fused.out_channels
         self.convolution = nn.Conv2d(fused.in_channels, self.channels * self.stride**2, 1)
+        assert self.convolution.bias is not None
         with torch.no_grad():
             weight = fused.weight.permute(2, 3, 1, 0)  # (row, column) within the stride, then channel: as written below
             self.convolution.weight.copy_(weight.reshape(-1, fused.in_channels, 1, 1))
@@ -91,17 +111,18 @@ class _Head(nn.Module):
         super().__init__()
         parts = (head.scores, head.boxes, head.directions)
         self.weight = nn.Parameter(torch.cat([part.weight[:, :, 0, 0] for part in parts]).T.contiguous())
-        self.bias = nn.Parameter(torch.cat([part.bias for part in parts]))  # type: ignore[list-item]
+        self.bias = nn.Parameter(torch.cat([part.bias for part in parts if part.bias is not None]))
         self.channels = [part.out_channels for part in parts]
 
     def forward(self, features: Tensor) -> tuple[Tensor, ...]:
         return torch.split(features @ self.weight + self.bias, self.channels, dim=-1)
 
 
-def _folded(block: nn.Sequential) -> nn.Sequential:
+def _folded(block: nn.Module) -> nn.Sequential:
     """Convolution, normalization, ReLU, ... -> convolution, ReLU, ..."""
-    layers: list[nn.Module] = []
-    for convolution, norm in zip(block[0::3], block[1::3], strict=True):
+    children, layers = list(block.children()), []
+    for convolution, norm in zip(children[0::3], children[1::3], strict=True):
+        assert isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
         layers += [fuse_conv_bn_eval(convolution, norm), nn.ReLU()]
     return nn.Sequential(*layers)
 
@@ -110,6 +131,7 @@ def _take_padded(first: nn.Conv2d, steps: CanvasSteps | None) -> None:
     """Let the first convolution find its padding, and the steps, in its input."""
     first.padding = (0, 0)
     if steps is not None:
+        assert first.bias is not None
         with torch.no_grad():
             first.weight.mul_(steps.scale[:, None, None] / STEP_VALUE)
             first.bias.sub_((first.weight * steps.empty[:, None, None]).sum(dim=(1, 2, 3)) * STEP_VALUE)

@@ -1,9 +1,10 @@
 """PyTorch modules -> the two ONNX graphs of a bundle. The scatter between them is not exported: it is an assignment."""
 
+import json
 import logging
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
 
 def export_backbone(backbone: FastBackbone, grid: PillarGrid, path: Path) -> None:
     """Write backbone.onnx: canvas (1, ny + 1, nx + 1, C) -> scores, boxes, directions, see `FastBackbone`."""
-    channels = backbone.blocks[0][0].in_channels
+    channels = next(iter(backbone.stages()[0].convolutions.values())).in_channels
     _export(
         backbone,
         (torch.zeros(1, grid.ny + 1, grid.nx + 1, channels),),
@@ -74,6 +75,20 @@ def multiply_accumulates(path: Path) -> int:
             continue
         total += math.prod(shapes[node.output[0]]) * math.prod(window)
     return total
+
+
+def stamp(path: Path, properties: Mapping[str, Any]) -> None:
+    """Write properties into the metadata of a graph, each as JSON, for whoever meets the file alone."""
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in properties.items()})
+    onnx.save(model, path)
+
+
+def copy_properties(source: Path, target: Path) -> None:
+    """Give `target` the metadata of `source`."""
+    model = onnx.load(target)
+    model.metadata_props.extend(onnx.load(source).metadata_props)
+    onnx.save(model, target)
 
 
 def _export(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:

@@ -1,0 +1,192 @@
+"""The backbone in 8 bits: every activation in steps of its own channel, every weight rounded with the others in view.
+
+Most of a pseudo-image is empty, and there a trained network gives the same small values everywhere. If those are
+rounded, one and the same error stands all over the map and grows from layer to layer; nothing else costs as much
+precision. So
+
+- a channel's step is its largest value on the calibration scans / 255, then stretched until its value in empty space is
+  a whole number of steps. Steps of single channels are free: between a ReLU and the next layer a positive factor moves
+  into the weights on both sides, exactly;
+- weights are rounded one after the other, and those not yet rounded make up for what it changed on the calibration
+  scans (GPTQ, arXiv 2210.17323); the bias makes up for what remains in empty space.
+
+Weights are signed 7-bit per output channel. Seven, because CPUs without VNNI add pairs of products u8 x s8 in 16 bits:
+2 x 255 x 64 fits, 2 x 255 x 127 does not, and they would saturate without a word.
+"""
+
+from collections.abc import Collection, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone
+
+HEAD = "head"
+STEPS = 255
+WEIGHT_STEPS = 64
+EMPTY_SIZE = 256  # pillars to a side; the deepest convolution of the paper's neck sees 99 of them
+PLACES = 2000  # of each scan and layer, whose inputs weights are rounded for
+_DAMPING = 0.01  # of the moments' mean diagonal, so that inputs that hardly ever move do not blow up
+_SHRINK = 0.95  # a range may lose this much of its end where that spares it coarser steps
+_TINY = 1e-6
+
+
+def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
+    """Steps of a canvas that holds the features of all these scans, (P, C) each, and zero exactly."""
+    lows, highs = zip(*((features.min(axis=0), features.max(axis=0)) for features in pillar_features), strict=True)
+    low, high = np.minimum(np.min(lows, axis=0), 0.0), np.maximum(np.max(highs, axis=0), 0.0)
+    scale = np.maximum((high - low) / STEPS, _TINY).astype(np.float32)
+    empty = np.clip(np.round(-low / scale), 0, STEPS).astype(np.float32)
+    return CanvasSteps(torch.from_numpy(scale), torch.from_numpy(empty))
+
+
+def layer_names(backbone: FastBackbone) -> list[str]:
+    """The layers that can compute in 8 bits, by the names of their modules."""
+    return [name for name, layer in backbone.named_modules() if isinstance(layer, nn.Conv2d)] + [HEAD]
+
+
+@torch.no_grad()
+def scale_to_steps(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]], steps: CanvasSteps) -> None:
+    """Change the weights so that activations count steps, 0 to 255 times STEP_VALUE; the results stay the same.
+
+    Args:
+        backbone: made with `steps`; changed in place.
+        canvases: (1, ny + 1, nx + 1, C) of the calibration scans.
+    """
+    highest: dict[str, Tensor] = {}
+    for canvas in canvases:
+        for name, pass_ in _passes(backbone, torch.from_numpy(canvas) * STEP_VALUE):
+            high = pass_.output.amax(dim=(0, 2, 3))
+            highest[name] = torch.maximum(highest[name], high) if name in highest else high
+    empty = {name: _center(pass_.output) for name, pass_ in _passes(backbone, _empty_canvas(steps))}
+    stages = backbone.stages()
+    for i, (convolutions, upsample_name, upsample) in enumerate(stages):
+        names = list(convolutions)
+        after_block = [
+            upsample.convolution,
+            *(next(iter(stage.convolutions.values())) for stage in stages[i + 1 : i + 2]),
+        ]
+        for j, name in enumerate(names):
+            step = highest[name].clamp_min(_TINY) / STEPS
+            whole = torch.floor(empty[name] / step / _SHRINK)
+            step = torch.where(whole > 0, empty[name] / whole.clamp_min(1), step)
+            _count(convolutions[name], step)
+            for reader in [convolutions[names[j + 1]]] if j + 1 < len(names) else after_block:
+                reader.weight.mul_(step[:, None, None] / STEP_VALUE)
+        # The outputs for the places of one cell become neighbors in one channel.
+        channels = upsample.channels
+        step = highest[upsample_name].reshape(-1, channels).amax(dim=0).clamp_min(_TINY) / STEPS
+        _count(upsample.convolution, step.repeat(upsample.stride**2))
+        backbone.head.weight[i * channels : (i + 1) * channels].mul_(step[:, None] / STEP_VALUE)
+
+
+class Moments(NamedTuple):
+    """What the layers of a backbone read."""
+
+    empty: dict[str, Tensor]
+    """(inputs,) in empty space, by layer."""
+    squares: dict[str, Tensor]
+    """(inputs * window, same): mean product of the differences from empty space, by layer."""
+
+
+@torch.no_grad()
+def input_moments(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]], steps: CanvasSteps) -> Moments:
+    """Moments of what every layer reads on the calibration scans.
+
+    Args:
+        backbone: scaled to steps.
+        canvases: (1, ny + 1, nx + 1, C) each.
+    """
+    empty = {name: _center(pass_.input) for name, pass_ in _passes(backbone, _empty_canvas(steps))}
+    generator = torch.Generator().manual_seed(0)
+    squares: dict[str, Tensor] = {}
+    for number, canvas in enumerate(canvases, start=1):
+        for name, pass_ in _passes(backbone, torch.from_numpy(canvas) * STEP_VALUE):
+            moved = pass_.input - empty[name][:, None, None]
+            size, stride, padding = pass_.window
+            windows = F.unfold(moved, size, stride=stride, padding=padding)[0]  # (inputs * window, places)
+            alive = windows.abs().amax(dim=0).nonzero()[:, 0]
+            chosen = windows[:, alive[torch.randperm(len(alive), generator=generator)[:PLACES]]]
+            mean = chosen @ chosen.T / max(chosen.shape[1], 1)
+            squares[name] = mean if number == 1 else squares[name] + (mean - squares[name]) / number
+    return Moments(empty, squares)
+
+
+@torch.no_grad()
+def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Moments) -> None:
+    """Round the weights of `layers` to what 8-bit arithmetic will use.
+
+    Args:
+        backbone: scaled to steps; changed in place.
+        layers: some of `layer_names`.
+        moments: of this backbone.
+    """
+    for name, empty in moments.empty.items():
+        layer = backbone.get_submodule(name)
+        parameter, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
+        weight = parameter.T if name == HEAD else parameter.flatten(1)  # (outputs, inputs * window)
+        rounded = _round_together(weight, moments.squares[name]) if name in layers else weight
+        read = (empty / STEP_VALUE).round() * STEP_VALUE
+        sums, rounded_sums = (each.unflatten(1, (len(empty), -1)).sum(dim=2) for each in (weight, rounded))
+        bias.add_(sums @ empty - rounded_sums @ read)
+        parameter.copy_(rounded.T if name == HEAD else rounded.reshape(parameter.shape))
+
+
+def _round_together(weight: Tensor, squares: Tensor) -> Tensor:
+    """(outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output, so that the outputs change little."""
+    unit = weight.abs().amax(dim=1).clamp_min(_TINY) / WEIGHT_STEPS
+    damping = _DAMPING * squares.diagonal().mean().clamp_min(_TINY)
+    inverse = torch.linalg.inv(squares.double() + damping * torch.eye(len(squares)))
+    factor = torch.linalg.cholesky(inverse, upper=True).float()
+    left, rounded = weight.clone(), torch.empty_like(weight)
+    for k in range(weight.shape[1]):
+        rounded[:, k] = (left[:, k] / unit).round().clamp(-WEIGHT_STEPS, WEIGHT_STEPS) * unit
+        lost = (left[:, k] - rounded[:, k]) / factor[k, k]
+        left[:, k:] -= lost[:, None] * factor[k, k:]
+    return rounded
+
+
+class _Pass(NamedTuple):
+    """One layer at work on one scan."""
+
+    input: Tensor
+    """(1, inputs, H, W)"""
+    output: Tensor
+    """(1, outputs, H, W) after the ReLU; of the head, its input."""
+    window: tuple[int, int, int]
+    """Kernel size, stride and padding."""
+
+
+def _passes(backbone: FastBackbone, canvas: Tensor) -> Iterator[tuple[str, _Pass]]:
+    features, maps = canvas.permute(0, 3, 1, 2), []
+    for convolutions, upsample_name, upsample in backbone.stages():
+        for name, convolution in convolutions.items():
+            output = torch.relu(convolution(features))
+            window = (convolution.kernel_size[0], convolution.stride[0], int(convolution.padding[0]))
+            yield name, _Pass(features, output, window)
+            features = output
+        yield upsample_name, _Pass(features, torch.relu(upsample.convolution(features)), (1, 1, 0))
+        maps.append(upsample(features))
+    joined = torch.cat(maps, dim=-1).permute(0, 3, 1, 2)
+    yield HEAD, _Pass(joined, joined, (1, 1, 0))
+
+
+def _empty_canvas(steps: CanvasSteps) -> Tensor:
+    return (steps.empty * STEP_VALUE).expand(1, EMPTY_SIZE + 1, EMPTY_SIZE + 1, -1)
+
+
+def _center(values: Tensor) -> Tensor:
+    """(C,) of (1, C, H, W), far from any border; of upsampled maps the mean over the places of one cell."""
+    _, _, height, width = values.shape
+    return values[0, :, height // 2 :, width // 2 :][:, :4, :4].mean(dim=(1, 2))
+
+
+def _count(layer: nn.Conv2d, step: Tensor) -> None:
+    """Let the outputs count steps."""
+    assert layer.bias is not None
+    layer.weight.mul_(STEP_VALUE / step[:, None, None, None])
+    layer.bias.mul_(STEP_VALUE / step)
