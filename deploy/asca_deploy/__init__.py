@@ -1,7 +1,8 @@
 """The detector on the vehicle: ONNX Runtime and NumPy, never PyTorch."""
 
 from asca_deploy.bundle import Bundle, default_bundle_path, load_bundle, sample_scan_path
-from asca_deploy.detector import Detector, FrameReport
+from asca_deploy.detector import Detector
+from asca_deploy.frame import FrameReport
 from asca_pillars.geometry.detections import Detections
 
 __all__ = [

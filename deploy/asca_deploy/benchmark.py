@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.detector import Detector, FrameReport
+from asca_deploy.detector import Detector
+from asca_deploy.frame import FrameReport
 from asca_pillars.environment import package_versions
 from asca_pillars.machine import cpu_model
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.benchmark import benchmark
-from asca_deploy.detector import STAGES
+from asca_deploy.frame import STAGES
 
 
 def test_report(tiny_bundle: Path, scans: list[NDArray[np.float32]]) -> None:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector, load_bundle
-from asca_deploy.detector import STAGES
+from asca_deploy.frame import STAGES
 from asca_pillars.errors import BundleError, ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
 
