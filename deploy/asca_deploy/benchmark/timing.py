@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
 from asca_deploy.frame import FrameReport
@@ -28,7 +28,7 @@ class Percentiles:
     min: float
 
     @classmethod
-    def of(cls, times_ms: ArrayLike) -> "Percentiles":
+    def of(cls, times_ms: list[float] | NDArray[np.float64]) -> "Percentiles":
         """Of times in any shape."""
         return cls(*(float(np.percentile(times_ms, q)) for q in (50, 95, 0)))
 
@@ -42,7 +42,7 @@ class Spread:
     high: float
 
     @classmethod
-    def of(cls, ratios: ArrayLike) -> "Spread":
+    def of(cls, ratios: list[float] | NDArray[np.float64]) -> "Spread":
         """Of one ratio per round."""
         return cls(*(float(np.percentile(ratios, q)) for q in (50, 25, 75)))
 
