@@ -55,7 +55,7 @@ def roofline_line(found: Roofline) -> str:
 
 def comparison_table(found: Comparison) -> Table:
     """Contestants and how many times as fast as the first they are."""
-    table = _table(f"{found.rounds} rounds in turn", "bundle", "p50 ms", "p95 ms", "FPS", "times as fast")
+    table = _table(f"{found.rounds} rounds in turn", "", "p50 ms", "p95 ms", "FPS", "times as fast")
     for one in found.contestants:
         table.add_row(one.name, *_speed(one))
     return table
