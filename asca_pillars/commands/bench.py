@@ -24,6 +24,7 @@ from asca_deploy.benchmark import (
     measure_scaling,
     measure_throughput,
 )
+from asca_deploy.benchmark.matrix import ON_THE_CPU
 from asca_pillars.commands import bench_tables as show
 from asca_pillars.data.scans import find_scans, read_scan
 from asca_pillars.errors import ConfigError, ScanError
@@ -81,10 +82,14 @@ def _measure(
         return track(range(count), what, console=console, transient=True)
 
     report = benchmark(detector, scans, rounds, track=bar)
-    found = measure_roofline(detector.bundle, report.stages_ms["neck+head"].p50, detector.threads)
-    result = report.to_dict() | {"roofline": asdict(found)}
+    result = report.to_dict()
+    lines = show.summary_lines(report)
+    if detector.provider in ON_THE_CPU:
+        found = measure_roofline(detector.bundle, report.stages_ms["neck+head"].p50, detector.threads)
+        result["roofline"] = asdict(found)
+        lines.append(show.roofline_line(found))
     console.print(show.stages_table(report))
-    for line in (*show.summary_lines(report), show.roofline_line(found), show.machine_line(report)):
+    for line in (*lines, show.machine_line(report)):
         console.print(line, soft_wrap=True)
     if parts.stream:
         streamed = measure_throughput(detector, scans, rounds, bar)
