@@ -21,6 +21,13 @@ Bundle = Annotated[
     typer.Option("--bundle", "-b", help="Model bundle (folder). Default: the one that comes with asca."),
 ]
 ProviderName = Annotated[str, typer.Option(help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")]
+Precision = Annotated[
+    str | None,
+    typer.Option(
+        help="float32, or reduced: bfloat16, TF32 or float16 where the provider has it. "
+        "Default: float32; with --provider auto either."
+    ),
+]
 Threads = Annotated[int | None, typer.Option(help="CPU threads. Default: the physical cores granted to the process.")]
 
 
@@ -61,6 +68,7 @@ def detect(
         typer.Option(help="Report detections from this score on. Default: the bundle's, per class."),
     ] = None,
     provider: ProviderName = "cpu",
+    precision: Precision = None,
     threads: Threads = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write a bird's-eye picture and the boxes of each scan.
@@ -70,7 +78,7 @@ def detect(
     """
     from asca_pillars.commands.detect import run
 
-    run(scans, out, bundle, score, provider, threads)
+    run(scans, out, bundle, score, provider, precision, threads)
 
 
 @app.command()
@@ -78,6 +86,7 @@ def bench(
     scans: Annotated[Path | None, typer.Argument(help="A scan or a folder of them. Default: the sample.")] = None,
     bundle: Bundle = None,
     provider: ProviderName = "cpu",
+    precision: Precision = None,
     threads: Threads = None,
     rounds: Annotated[int, typer.Option(min=1, help="Timed passes over the scans, for each table.")] = 30,
     compare: Annotated[
@@ -115,7 +124,7 @@ def bench(
     """
     from asca_pillars.commands.bench import Parts, run
 
-    run(scans, bundle, provider, threads, rounds, Parts(compare or (), matrix, scaling, stream, cold), json)
+    run(scans, bundle, provider, precision, threads, rounds, Parts(compare or (), matrix, scaling, stream, cold), json)
 
 
 @app.command()
@@ -262,6 +271,7 @@ def evaluate(
         typer.Option(min=0, max=1, help="Lowest score that a model is run with: AP needs the weak detections too."),
     ] = 0.05,
     provider: ProviderName = "cpu",
+    precision: Precision = None,
     threads: Threads = None,
 ) -> None:
     """Score a model, or finished predictions, by KITTI's protocol: AP and AOS, by distance, recall and precision.
@@ -270,7 +280,7 @@ def evaluate(
     """
     from asca_pillars.commands.eval import run
 
-    run(model, data, split, predictions, labels, out, json, gallery, score, min_score, provider, threads)
+    run(model, data, split, predictions, labels, out, json, gallery, score, min_score, provider, precision, threads)
 
 
 @app.command()

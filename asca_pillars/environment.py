@@ -15,6 +15,7 @@ PACKAGES = (
     "onnx",
     "onnxruntime",
     "onnxscript",
+    "openvino",
     "opencv-python-headless",
     "torch",
     "lightning",

@@ -21,6 +21,10 @@ class BundleError(AscaError):
     """A model bundle that is missing, damaged or made for another version."""
 
 
+class ProviderError(AscaError):
+    """Hardware or a runtime library that was asked for and is not there, or does not start."""
+
+
 class ExportError(AscaError):
     """An export whose graphs do not reproduce the trained model."""
 

@@ -26,7 +26,6 @@ from torch import nn
 
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import compare
-from asca_deploy.benchmark.matrix import open_detector
 from asca_export.export import MIN_SCANS, export_bundle
 from asca_pillars.commands.bench_tables import comparison_table
 from asca_pillars.config import load_config
@@ -69,7 +68,7 @@ def main(
             bundle = Path(folder) / "bundle"
             with console.status("Exporting, which compares the boxes too"):
                 export_bundle(model, bundle, [points[number % len(points)] for number in range(MIN_SCANS)])
-        runtime = open_detector(bundle, provider, precision, threads)
+        runtime = Detector(bundle, provider=provider, precision=precision, threads=threads)
         forms = _forms(model)
         for name, form in forms.items():
             difference, spread = map_difference(runtime, form, points)

@@ -20,9 +20,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asca_deploy import Detector, sample_scan_path
-from asca_deploy.benchmark.matrix import open_detector
 from asca_deploy.benchmark.memory import peak_memory_mib, resident_mib
-from asca_deploy.bundle import default_bundle_path
 from asca_pillars.data.scans import read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.files import atomic_path
@@ -42,7 +40,7 @@ def main(
     """Run, sample the resident memory along the way, print start, middle, end and slope."""
     console = Console(markup=False, highlight=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # crops are unlike any training scan
-    detector = open_detector(default_bundle_path() if bundle is None else bundle, provider, precision, threads)
+    detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
     samples = [(done, _resident()) for done in _run(detector, scans, console)]
     counts, resident = np.array(samples).T
     warm = counts >= WARM_SHARE * scans

@@ -28,7 +28,8 @@ from importlib.machinery import PathFinder
 class BaseInstall(PathFinder):
     @classmethod
     def find_spec(cls, name, *rest):
-        heavy = ("torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy", "matplotlib")
+        heavy = {"torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy"}
+        heavy |= {"matplotlib", "openvino"}
         if name.split(".")[0] in heavy:
             return None
         return super().find_spec(name, *rest)
@@ -115,6 +116,8 @@ def test_doctor_names_the_missing_extras() -> None:
     assert result.returncode == 0, result.stderr
     assert "provider cpu: ok" in result.stdout
     assert "pip install 'asca-pillars[train]'" in result.stdout and "pip install 'asca-pillars[sim]'" in result.stdout
+    assert "provider openvino is not installed: `pip install 'asca-pillars[openvino]'`" in result.stdout
+    assert "auto takes cpu float32" in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -136,6 +139,7 @@ def test_detect_refuses_what_is_not_there(tmp_path: Path) -> None:
     assert "no such file or folder" in refusal(asca("detect", tmp_path / "none.bin"))
     assert "bundle.json" in refusal(asca("detect", "--bundle", tmp_path, cwd=tmp_path))
     assert "unknown provider 'gpu'" in refusal(asca("detect", "--provider", "gpu", cwd=tmp_path))
+    assert "unknown precision 'half'" in refusal(asca("detect", "--precision", "half", cwd=tmp_path))
     assert "threads" in refusal(asca("detect", "--threads", 0, cwd=tmp_path))
 
 

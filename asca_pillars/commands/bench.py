@@ -47,6 +47,7 @@ def run(
     scans: Path | None,
     bundle: Path | None,
     provider: str,
+    precision: str | None,
     threads: int | None,
     rounds: int,
     parts: Parts,
@@ -61,7 +62,7 @@ def run(
     if parts.scaling and not len(points[0]):
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
     others = _named([bundle, *parts.compare])
-    detector = Detector(_folder(bundle), provider=provider, threads=threads)
+    detector = Detector(_folder(bundle), provider=provider, precision=precision, threads=threads)
     result = _measure(detector, points, rounds, parts, others, console)
     if report_path is not None:
         with atomic_path(report_path) as temporary:
@@ -111,7 +112,7 @@ def _measure(
         for line in show.matrix_reasons(ways):
             console.print(line, soft_wrap=True)
     if parts.cold:
-        cold = cold_start(detector.folder, scans[0], detector.provider, detector.threads, track=bar)
+        cold = cold_start(detector, scans[0], track=bar)
         result["cold"] = asdict(cold)
         console.print(show.cold_line(cold), soft_wrap=True)
     return result
@@ -119,7 +120,7 @@ def _measure(
 
 def _like(detector: Detector, folder: Path) -> Detector:
     """Another bundle, run the same way."""
-    return Detector(folder, provider=detector.provider, threads=detector.threads)
+    return Detector(folder, provider=detector.provider, precision=detector.precision, threads=detector.threads)
 
 
 def _named(bundles: Sequence[Path | None]) -> dict[str, Path]:

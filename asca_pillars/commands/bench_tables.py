@@ -41,7 +41,7 @@ def summary_lines(report: BenchmarkReport) -> list[str]:
 def machine_line(report: BenchmarkReport) -> str:
     """What the figures belong to."""
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    return f"{report.cpu}, {report.threads} threads, {report.provider}; {versions}"
+    return f"{report.cpu}, {report.threads} threads, {report.provider} {report.precision}; {versions}"
 
 
 def roofline_line(found: Roofline) -> str:

@@ -14,6 +14,7 @@ from rich.progress import track
 from rich.table import Table
 
 from asca_deploy import Detections, Detector, FrameReport, sample_scan_path
+from asca_deploy.auto import summary
 from asca_pillars.data.kitti import Calibration, objects_from_boxes, read_calibration, write_labels
 from asca_pillars.data.scans import find_scans, read_scan
 from asca_pillars.files import atomic_path
@@ -28,13 +29,16 @@ def run(
     bundle: Path | None,
     score: float | None,
     provider: str,
+    precision: str | None,
     threads: int | None,
 ) -> None:
     """See `asca detect --help`."""
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     paths = find_scans(sample_scan_path() if scans is None else scans)
-    detector = Detector(bundle, provider=provider, threads=threads, score_threshold=score)
+    detector = Detector(bundle, provider=provider, precision=precision, threads=threads, score_threshold=score)
+    if detector.candidates:
+        console.print(summary(detector.provider, detector.precision, detector.candidates), soft_wrap=True)
     reports: list[FrameReport] = []
     results: list[tuple[Path, Detections]] = []
     for path in track(paths, "Detecting", console=console, disable=len(paths) == 1):
@@ -133,7 +137,7 @@ def _timing(reports: list[FrameReport], detector: Detector) -> str:
     stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
     return (
         f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan (median of {len(reports)} warm frames, "
-        f"{detector.provider}, {detector.threads} threads): {stages} ms"
+        f"{detector.provider} {detector.precision}, {detector.threads} threads): {stages} ms"
     )
 
 

@@ -55,6 +55,7 @@ def run(
     score: float | None,
     min_score: float,
     provider: str,
+    precision: str | None,
     threads: int | None,
 ) -> None:
     """See `asca eval --help`."""
@@ -71,7 +72,7 @@ def run(
         task = Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid(), scores, about)
     else:
         assert split is not None, "checked with the arguments"
-        opened = open_model(model, min_score, provider, threads)
+        opened = open_model(model, min_score, provider, precision, threads)
         scores = _fixed_scores(opened, score, min_score)
         task = _run_model(opened, split, labels, scores, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)

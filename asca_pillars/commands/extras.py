@@ -7,6 +7,7 @@ from asca_pillars.errors import AscaError
 EXTRAS = {
     "train": ("torch", "lightning", "onnx", "onnxscript", "sklearn", "tensorboard"),
     "sim": ("numba",),
+    "openvino": ("openvino",),
     "eval": ("matplotlib",),
 }
 

@@ -36,20 +36,22 @@ class Model:
     unlike: list[str] = field(default_factory=list)
 
 
-def open_model(path: Path | None, min_score: float, provider: str, threads: int | None) -> Model:
+def open_model(path: Path | None, min_score: float, provider: str, precision: str | None, threads: int | None) -> Model:
     """Open a bundle's folder or a checkpoint file; None for the bundle that ships.
 
     Raises:
         AscaError: missing, damaged, or not to be run as asked; one line.
     """
     if path is not None and (path.is_file() or path.suffix == ".ckpt"):
-        return _open_checkpoint(path, min_score, provider, threads)
-    return _open_bundle(path, min_score, provider, threads)
+        return _open_checkpoint(path, min_score, provider, precision, threads)
+    return _open_bundle(path, min_score, provider, precision, threads)
 
 
-def _open_bundle(path: Path | None, min_score: float, provider: str, threads: int | None) -> Model:
+def _open_bundle(
+    path: Path | None, min_score: float, provider: str, precision: str | None, threads: int | None
+) -> Model:
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are collected below
-    detector = Detector(path, provider=provider, threads=threads, score_threshold=min_score)
+    detector = Detector(path, provider=provider, precision=precision, threads=threads, score_threshold=min_score)
     bundle = detector.bundle
     unlike: list[str] = []
 
@@ -65,6 +67,7 @@ def _open_bundle(path: Path | None, min_score: float, provider: str, threads: in
         "sha256": {"encoder": bundle.graphs.encoder.sha256, "backbone": bundle.graphs.backbone.sha256},
         "trained_on": bundle.provenance.trained_on,
         "provider": detector.provider,
+        "precision": detector.precision,
         "threads": detector.threads,
         "min_score": min_score,
     }
@@ -72,7 +75,7 @@ def _open_bundle(path: Path | None, min_score: float, provider: str, threads: in
     return Model(bundle.name, detect, bundle.spec, camera_view=True, about=about, unlike=unlike)
 
 
-def _open_checkpoint(path: Path, min_score: float, provider: str, threads: int | None) -> Model:
+def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str | None, threads: int | None) -> Model:
     require("train")
     import torch
 
@@ -83,6 +86,8 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, threads: int |
         raise ConfigError(f"threads {threads} must be at least 1")
     if provider not in ("cpu", "cuda", "auto"):
         raise ConfigError(f"provider {provider} does not run checkpoints: choose cpu, cuda or auto, or give a bundle")
+    if precision not in (None, "float32"):
+        raise ConfigError(f"precision {precision} does not go with checkpoints: they run in float32; give a bundle")
     if provider == "cuda" and not torch.cuda.is_available():
         raise ConfigError("provider cuda: PyTorch finds no CUDA device here; choose cpu")
     device = "cpu" if provider == "cpu" or not torch.cuda.is_available() else "cuda"

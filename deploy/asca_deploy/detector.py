@@ -9,13 +9,15 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import Bundle, default_bundle_path, load_bundle
+from asca_deploy import auto, providers
+from asca_deploy.bundle import Bundle, default_bundle_path, load_bundle, sample_scan_path
 from asca_deploy.canvas import Canvas
 from asca_deploy.frame import FrameReport, Stopwatch
 from asca_deploy.graph import Graph, Tensor
 from asca_deploy.input_check import check_input
-from asca_deploy.providers import select_providers
+from asca_deploy.ort_session import OrtSession, check_onnxruntime
 from asca_deploy.stream import overlapped
+from asca_pillars.data.scans import read_scan
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
@@ -38,18 +40,21 @@ class _Frame(NamedTuple):
 
 
 class Detector:
-    """ASCA-PointPillars in ONNX Runtime. One object serves one stream of scans, from one thread at a time.
+    """ASCA-PointPillars without PyTorch. One object serves one stream of scans, from one thread at a time.
 
     Args:
         bundle: folder written by `asca export`; None for the model that comes with the package.
-        provider: "cpu", "cuda", "tensorrt", "openvino", "coreml", or "auto" for the fastest one at hand that
-            computes in float32. `self.provider` says which runs.
+        provider: of the backbone: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one at hand that
+            finds in the sample scan what "cpu" finds. `self.provider` and `self.precision` say what runs,
+            `self.candidates` how each one did. The encoder always runs on onnxruntime's CPU provider.
+        precision: "float32", in which the bundle was proven, or "reduced" where the provider has something faster
+            (`asca_deploy.providers`); None for float32, with "auto" for either.
         threads: of the CPU; None for the physical cores granted to the process.
         score_threshold: overrides that of every class; None keeps the bundle's.
 
     Raises:
         BundleError: the bundle is missing, damaged or made for another version.
-        ProviderError: the provider is not installed or does not start.
+        ProviderError: the provider is not installed, does not start or lacks the precision; onnxruntime is too old.
         ConfigError: `threads` or `score_threshold` is out of range.
     """
 
@@ -58,6 +63,7 @@ class Detector:
         bundle: str | Path | None = None,
         *,
         provider: str = "cpu",
+        precision: str | None = None,
         threads: int | None = None,
         score_threshold: float | None = None,
     ) -> None:
@@ -66,15 +72,15 @@ class Detector:
         self.threads = default_threads() if threads is None else threads
         if self.threads < 1:
             raise ConfigError(f"threads {self.threads} must be at least 1")
-        providers = select_providers(provider)
+        check_onnxruntime()
+        providers.require(provider, precision or "float32")
         self.bundle = load_bundle(self.folder)
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
-        self._backbone = _open_backbone(self.folder, self.bundle, providers, self.threads)
-        # Both graphs on the same provider: in "auto" the first one found out which starts.
-        self.provider = self._backbone.provider
-        self._encoder = _open_encoder(self.folder, self.bundle, [self.provider])
+        self._encoder = _open_encoder(self.folder, self.bundle)
         self._canvas = self._new_canvas()
+        choice = self._choose(provider, precision)
+        self._backbone, self.provider, self.precision, self.candidates = choice
         self._warned: set[str] = set()
         self.load_s = time.perf_counter() - start
         self.last_frame: FrameReport | None = None
@@ -144,8 +150,7 @@ class Detector:
 
     def neck_and_head(self, canvas: NDArray[np.float32]) -> Maps:
         """Pseudo-image (1, C, ny, nx) -> logits and residuals on the head's map. Paper Table 1."""
-        scores, boxes, directions = self._backbone.run(canvas=canvas)
-        return HeadMaps(scores[0], boxes[0], directions[0])
+        return _head_maps(self._backbone, canvas)
 
     def decode(self, maps: Maps) -> Detections:
         """Head maps -> boxes above the score threshold that survive the rotated NMS."""
@@ -181,6 +186,22 @@ class Detector:
         self.last_frame = FrameReport(watch.times_ms, watch.waiting_ms, frame.counts, frame.non_finite, frame.warnings)
         return detections
 
+    def _choose(self, provider: str, precision: str | None) -> auto.Choice[Graph]:
+        def open_network(name: str, digits: str) -> Graph:
+            return _open_backbone(self.folder, self.bundle, name, digits, self.threads)
+
+        if provider != providers.AUTO:
+            digits = precision or "float32"
+            return auto.Choice(open_network(provider, digits), provider, digits, ())
+        spec = self.bundle.spec
+        pillars = spec.pillarize(read_scan(sample_scan_path()).points)
+        canvas = self.scatter(self.encode(pillars), pillars.cells)
+        choice = auto.choose(
+            providers.at_hand(), open_network, lambda graph: spec.decode(_head_maps(graph, canvas)), spec, precision
+        )
+        _log.info(auto.summary(*choice[1:]))
+        return choice
+
     def _compare_with_training(self, scan: NDArray[np.float32], counts: PillarCounts) -> tuple[str, ...]:
         warnings = check_input(scan, counts, self.bundle.expected_input)
         for warning in warnings:
@@ -207,24 +228,31 @@ def _finite_points(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:
     return scan[usable], int(len(scan) - usable.sum())
 
 
-def _open_encoder(folder: Path, bundle: Bundle, providers: list[str]) -> Graph:
+def _head_maps(backbone: Graph, canvas: NDArray[np.float32]) -> Maps:
+    scores, boxes, directions = backbone.run(canvas=canvas)
+    return HeadMaps(scores[0], boxes[0], directions[0])
+
+
+def _open_encoder(folder: Path, bundle: Bundle) -> Graph:
     # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
     # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is
     # the fastest form all the same, ten times faster than ScatterElements.
+    path = folder / bundle.graphs.encoder.file
     inputs = {
-        "features": Tensor("tensor(float)", (None, len(FEATURES))),
-        "pillar_index": Tensor("tensor(int64)", (None,)),
-        "point_counts": Tensor("tensor(int64)", (None,)),
+        "features": Tensor("float32", (None, len(FEATURES))),
+        "pillar_index": Tensor("int64", (None,)),
+        "point_counts": Tensor("int64", (None,)),
     }
-    outputs = {"pillar_features": Tensor("tensor(float)", (None, bundle.channels))}
-    return Graph(folder / bundle.graphs.encoder.file, inputs, outputs, providers, threads=1)
+    outputs = {"pillar_features": Tensor("float32", (None, bundle.channels))}
+    return Graph(path, OrtSession(path, "cpu", "float32", threads=1), inputs, outputs)
 
 
-def _open_backbone(folder: Path, bundle: Bundle, providers: list[str], threads: int) -> Graph:
+def _open_backbone(folder: Path, bundle: Bundle, provider: str, precision: str, threads: int) -> Graph:
     grid, anchors = bundle.spec.grid, bundle.spec.anchors.shape[2]
-    inputs = {"canvas": Tensor("tensor(float)", (1, bundle.channels, grid.ny, grid.nx))}
+    path = folder / bundle.graphs.backbone.file
+    inputs = {"canvas": Tensor("float32", (1, bundle.channels, grid.ny, grid.nx))}
     outputs = {
-        name: Tensor("tensor(float)", (1, channels * anchors, *grid.head_shape))
+        name: Tensor("float32", (1, channels * anchors, *grid.head_shape))
         for name, channels in (("scores", 1), ("boxes", 7), ("directions", 2))
     }
-    return Graph(folder / bundle.graphs.backbone.file, inputs, outputs, providers, threads)
+    return Graph(path, providers.open_session(path, provider, precision, threads), inputs, outputs)

@@ -1,57 +1,58 @@
-"""One ONNX graph of a bundle, checked against what the bundle says of it."""
+"""One ONNX graph of a bundle, checked against what the bundle says of it, on whichever backend runs it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.providers import open_session
 from asca_pillars.errors import BundleError
 
 
 class Tensor(NamedTuple):
-    """An input or output as the bundle expects it; None stands for a size that varies from scan to scan."""
+    """An input or output: NumPy's name of its type, and its shape; None where a size varies from scan to scan."""
 
     type: str
     shape: tuple[int | None, ...]
 
 
+class Session(Protocol):
+    """A graph that a backend has opened."""
+
+    @property
+    def inputs(self) -> Mapping[str, Tensor]:
+        """What the graph declares; an exporter drops inputs that the network does not use."""
+
+    @property
+    def outputs(self) -> Mapping[str, Tensor]:
+        """What the graph returns."""
+
+    def run(self, inputs: Mapping[str, NDArray[Any]], outputs: Sequence[str]) -> list[NDArray[Any]]:
+        """The named outputs, in that order; the arrays are the caller's to keep. Several threads may call it."""
+
+
 class Graph:
-    """A session of onnxruntime with known inputs and outputs.
+    """A session with known inputs and outputs.
 
     Raises:
-        ProviderError: none of the providers starts.
-        BundleError: the graph cannot be run, or its inputs and outputs are not the expected ones.
+        BundleError: the graph's inputs and outputs are not the expected ones.
     """
 
     def __init__(
-        self,
-        path: Path,
-        inputs: Mapping[str, Tensor],
-        outputs: Mapping[str, Tensor],
-        providers: Sequence[str],
-        threads: int,
+        self, path: Path, session: Session, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
     ) -> None:
-        self._session, self.provider = open_session(path, providers, threads)
-        self._outputs = list(outputs)
-        found = {node.name: Tensor(node.type, tuple(node.shape)) for node in self._session.get_inputs()}
-        # A graph need not declare every input: the exporter drops those that the network does not use.
-        self._inputs = list(found)
-        _compare(path, "input", found, inputs)
-        found = {node.name: Tensor(node.type, tuple(node.shape)) for node in self._session.get_outputs()}
+        self._session = session
+        self._inputs, self._outputs = list(session.inputs), list(outputs)
+        _compare(path, "input", session.inputs, inputs)
+        found = session.outputs
         for name in outputs:
             if name not in found:
                 raise BundleError(f"{path} has no output `{name}`, only {', '.join(found)}; export the bundle again")
         _compare(path, "output", {name: found[name] for name in outputs}, outputs)
 
-    def run(self, **inputs: NDArray[np.generic]) -> list[NDArray[np.float32]]:
-        """Outputs in the order in which they were expected."""
-        result: list[NDArray[np.float32]] = self._session.run(
-            self._outputs, {name: inputs[name] for name in self._inputs}
-        )
-        return result
+    def run(self, **inputs: NDArray[Any]) -> list[NDArray[Any]]:
+        """Outputs in the order in which they were expected; the arrays are the caller's to keep."""
+        return self._session.run({name: inputs[name] for name in self._inputs}, self._outputs)
 
 
 def _compare(path: Path, kind: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
@@ -63,7 +64,7 @@ def _compare(path: Path, kind: str, found: Mapping[str, Tensor], expected: Mappi
             )
         want = expected[name]
         fits = len(tensor.shape) == len(want.shape) and all(
-            size is None or not isinstance(actual, int) or actual == size
+            size is None or actual is None or actual == size
             for actual, size in zip(tensor.shape, want.shape, strict=True)
         )
         if not fits or tensor.type != want.type:

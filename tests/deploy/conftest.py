@@ -1,5 +1,6 @@
 """A tiny bundle made without PyTorch: two small graphs with random weights behind a real bundle.json."""
 
+import importlib.util
 import shutil
 from pathlib import Path
 
@@ -14,6 +15,10 @@ from asca_deploy.input_check import ExpectedInput
 from asca_pillars.geometry.grid import PillarGrid
 from asca_pillars.geometry.pillarize import FEATURES, PillarLimits
 from asca_pillars.geometry.spec import DetectorSpec
+
+needs_openvino = pytest.mark.skipif(
+    importlib.util.find_spec("openvino") is None, reason="needs pip install 'asca-pillars[openvino]'"
+)
 
 CHANNELS = 8
 # 8 + 16 + 32 columns of 0.32, 0.16 and 0.08 m by 24 rows: rectangular, off centre, with a positive minimum.

@@ -9,9 +9,7 @@ from asca_deploy import Detections, Detector
 from asca_deploy.benchmark import alternate, compare, measure_matrix
 from asca_deploy.benchmark.boxes import box_difference
 from asca_deploy.benchmark.comparison import FRAMES_PER_TURN
-from asca_deploy.benchmark.matrix import open_detector
 from asca_deploy.providers import PROVIDERS
-from asca_pillars.errors import AscaError
 from asca_pillars.machine import default_threads
 
 Points = NDArray[np.float32]
@@ -89,8 +87,3 @@ def test_a_bundle_that_cannot_be_opened_is_a_row(tiny_bundle: Path, tmp_path: Pa
     rows = measure_matrix({"tiny": tiny_bundle, "broken": broken}, [scan], rounds=1)
     (reason,) = {row.reason for row in rows if row.way[:3] == ("broken", "cpu", "float32")}
     assert reason is not None and "backbone.onnx" in reason
-
-
-def test_a_provider_that_is_not_there_says_why(tiny_bundle: Path) -> None:
-    with pytest.raises(AscaError, match="unknown provider"):
-        open_detector(tiny_bundle, "abacus", "float32", None)

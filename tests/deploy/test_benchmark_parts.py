@@ -83,15 +83,17 @@ def test_roofline(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_new_process_finds_boxes_and_says_what_it_took(tiny_bundle: Path, scan: Points) -> None:
-    found = cold_start(tiny_bundle, scan, threads=1, repeats=1)
+    found = cold_start(Detector(tiny_bundle, threads=1), scan, repeats=1)
     assert found.first_boxes_s >= found.import_s + found.load_s + found.first_scan_s
     assert min(found.import_s, found.load_s, found.first_scan_s) > 0
     assert found.detect_peak_memory_mib is None or 20 < found.detect_peak_memory_mib < 1e5
 
 
-def test_a_new_process_that_fails_says_why(tmp_path: Path, scan: Points) -> None:
+def test_a_new_process_that_fails_says_why(bundle_copy: Path, scan: Points) -> None:
+    detector = Detector(bundle_copy)
+    (bundle_copy / "bundle.json").unlink()
     with pytest.raises(AscaError, match="no model bundle"):
-        cold_start(tmp_path, scan, repeats=1)
+        cold_start(detector, scan, repeats=1)
 
 
 def test_memory_now_and_at_most() -> None:

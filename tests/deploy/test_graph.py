@@ -2,12 +2,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
+from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.bundle import Graphs, load_bundle, write_bundle_manifest
 from asca_pillars.errors import BundleError
+from tests.deploy.conftest import needs_openvino
+
+by_provider = pytest.mark.parametrize("provider", ["cpu", pytest.param("openvino", marks=needs_openvino)])
 
 
 def respoil(bundle: Path, graph: str, spoil: Callable[[onnx.ModelProto], None]) -> Path:
@@ -28,26 +33,34 @@ def rename(model: onnx.ModelProto, old: str, new: str) -> None:
             names[:] = [new if name == old else name for name in names]
 
 
-def test_unknown_input(bundle_copy: Path) -> None:
+@by_provider
+def test_unknown_input(bundle_copy: Path, provider: str) -> None:
+    respoil(bundle_copy, "backbone.onnx", lambda model: rename(model, "canvas", "image"))
+    with pytest.raises(BundleError, match=r"backbone\.onnx has an unknown input `image`, the runtime knows canvas"):
+        Detector(bundle_copy, provider=provider)
     respoil(bundle_copy, "encoder.onnx", lambda model: rename(model, "pillar_index", "pillar_of_point"))
     with pytest.raises(BundleError, match=r"encoder\.onnx has an unknown input `pillar_of_point`"):
-        Detector(bundle_copy)
+        Detector(bundle_copy, provider=provider)
 
 
-def test_missing_output(bundle_copy: Path) -> None:
+@by_provider
+def test_missing_output(bundle_copy: Path, provider: str) -> None:
     respoil(bundle_copy, "backbone.onnx", lambda model: rename(model, "directions", "yaw_bins"))
     with pytest.raises(BundleError, match=r"backbone\.onnx has no output `directions`, only .*yaw_bins"):
-        Detector(bundle_copy)
+        Detector(bundle_copy, provider=provider)
 
 
-def test_outputs_are_found_by_name_not_by_order(bundle_copy: Path, tiny_bundle: Path, scan: object) -> None:
+@by_provider
+def test_outputs_are_found_by_name_not_by_order(
+    bundle_copy: Path, tiny_bundle: Path, scan: NDArray[np.float32], provider: str
+) -> None:
     def turn_round(model: onnx.ModelProto) -> None:
         outputs = list(model.graph.output)[::-1]
         del model.graph.output[:]
         model.graph.output.extend(outputs)
 
     respoil(bundle_copy, "backbone.onnx", turn_round)
-    turned, straight = Detector(bundle_copy)(scan), Detector(tiny_bundle)(scan)  # type: ignore[arg-type]
+    turned, straight = Detector(bundle_copy, provider=provider)(scan), Detector(tiny_bundle, provider=provider)(scan)
     assert len(straight) > 3
     assert (turned.boxes == straight.boxes).all()
 
@@ -71,11 +84,12 @@ def test_graphs_of_another_model(bundle_copy: Path, field: str, value: float, me
     assert "\n" not in str(caught.value)
 
 
-def test_fewer_classes_than_the_head(bundle_copy: Path) -> None:
+@by_provider
+def test_fewer_classes_than_the_head(bundle_copy: Path, provider: str) -> None:
     good = load_bundle(bundle_copy)
     write_bundle_manifest(bundle_copy, replace(good, spec=replace(good.spec, classes=good.spec.classes[:1])))
     with pytest.raises(BundleError, match=r"output `scores` is .*\(1, 6, 12, 28\).*needs .*\(1, 2, 12, 28\)"):
-        Detector(bundle_copy)
+        Detector(bundle_copy, provider=provider)
 
 
 def test_opset_from_the_future(bundle_copy: Path) -> None:

@@ -35,7 +35,7 @@ class BaseInstall(PathFinder):
 
 sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
 from asca_pillars.commands.eval import run
-run(None, None, "val", Path("det"), Path("gt"), Path("out"), None, None, None, 0.05, "cpu", None)
+run(None, None, "val", Path("det"), Path("gt"), Path("out"), None, None, None, 0.05, "cpu", None, None)
 """
 
 
@@ -60,10 +60,12 @@ def evaluate(
     score: float | None = None,
     min_score: float = 0.05,
     provider: str = "cpu",
+    precision: str | None = None,
     threads: int | None = 1,
 ) -> dict:
     """Run the command; what it wrote as report.json."""
-    run(model, data, "val", predictions, labels, out, json_path, gallery, score, min_score, provider, threads)
+    where = provider, precision, threads
+    run(model, data, "val", predictions, labels, out, json_path, gallery, score, min_score, *where)
     return json.loads((out / "report.json").read_text())
 
 
@@ -172,6 +174,9 @@ def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
     ]
     assert "choose cpu, cuda or auto" in refusal(
         tmp_path / "other", model=tmp_path / "last.ckpt", data=root, provider="x"
+    )
+    assert "precision reduced does not go with checkpoints" in refusal(
+        tmp_path / "other", model=tmp_path / "last.ckpt", data=root, precision="reduced"
     )
     assert "no such checkpoint" in refusal(tmp_path / "other", model=tmp_path / "none.ckpt", data=root)
     assert (

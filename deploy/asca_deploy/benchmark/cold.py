@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.benchmark.timing import Track, silently
+from asca_deploy.detector import Detector
 from asca_pillars.errors import AscaError
 
 _FIRST_BOXES = """
@@ -56,19 +57,18 @@ class ColdStart:
 
 
 def cold_start(
-    bundle: Path,
+    detector: Detector,
     scan: NDArray[np.float32],
-    provider: str = "cpu",
-    threads: int | None = None,
     repeats: int = 5,
     track: Track = silently,
 ) -> ColdStart:
-    """Start new processes that detect in `scan` (N, 4).
+    """Start new processes that do with `scan` (N, 4) what `detector` would.
 
     Raises:
         AscaError: a process failed; says how.
     """
-    options = {"provider": provider} | ({} if threads is None else {"threads": threads})
+    bundle = detector.folder
+    options = {"provider": detector.provider, "precision": detector.precision, "threads": detector.threads}
     arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.npy"

@@ -12,11 +12,10 @@ from asca_deploy.benchmark.boxes import BoxDifference, box_difference
 from asca_deploy.benchmark.comparison import Contestant, compare
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
-from asca_deploy.providers import PROVIDERS
+from asca_deploy.providers import PRECISIONS, PROVIDERS
 from asca_pillars.errors import AscaError
 from asca_pillars.machine import default_threads
 
-PRECISIONS = ("float32", "reduced")
 ON_THE_CPU = ("cpu", "openvino")  # the number of threads matters to these
 
 
@@ -90,20 +89,8 @@ def _same_but_threads(way: Way, failed: Way) -> bool:
 def _open(folder: Path, way: Way, scan: NDArray[np.float32]) -> Detector | str:
     """The detector, after its first scan, or why there is none."""
     try:
-        detector = open_detector(folder, way.provider, way.precision, way.threads)
+        detector = Detector(folder, provider=way.provider, precision=way.precision, threads=way.threads)
         detector(scan)
     except AscaError as error:
         return str(error)
     return detector
-
-
-def open_detector(folder: Path, provider: str, precision: str, threads: int | None) -> Detector:
-    """The one place that knows how a detector is asked for a precision.
-
-    Raises:
-        AscaError: it cannot run here.
-    """
-    # MERGE: return Detector(folder, provider=provider, precision=precision, threads=threads)
-    if precision != "float32":
-        raise AscaError("Detector has no precision yet")
-    return Detector(folder, provider=provider, threads=threads)

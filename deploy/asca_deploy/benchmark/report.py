@@ -41,6 +41,8 @@ class BenchmarkReport:
     """Pillars of each scan after the limits."""
     detections: tuple[int, ...]
     provider: str
+    precision: str
+    """float32 or reduced, see `asca_deploy.providers`."""
     threads: int
     cpu: str
     peak_memory_mib: float | None
@@ -96,6 +98,7 @@ def benchmark(
         pillars=tuple(frame.counts.pillars for frame in passes[0]),
         detections=tuple(len(detector(scan)) for scan in scans),
         provider=detector.provider,
+        precision=detector.precision,
         threads=detector.threads,
         cpu=cpu_model(),
         peak_memory_mib=peak_memory_mib(),
