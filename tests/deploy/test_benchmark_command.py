@@ -1,5 +1,7 @@
 import json
+import logging
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,13 @@ Points = NDArray[np.float32]
 
 
 @pytest.fixture(autouse=True)
-def _fast_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def _fast_machine_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
     monkeypatch.setenv("COLUMNS", "120")
+    logger = logging.getLogger("asca_deploy")
+    level = logger.level
+    yield
+    logger.setLevel(level)  # the command silences it for the rest of its process
 
 
 def test_all_parts_are_printed_and_written(tiny_bundle: Path, bundle_copy: Path, scan: Points, tmp_path: Path) -> None:
