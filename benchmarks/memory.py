@@ -9,7 +9,7 @@ them go through single calls and half through streams that are opened and closed
 import json
 import logging
 from collections.abc import Iterator
-from itertools import islice
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,6 +26,7 @@ from asca_pillars.errors import AscaError
 from asca_pillars.files import atomic_path
 
 CHUNK = 50  # scans of one stream, then as many single calls
+CROPS = 199  # sizes that come again and again, or allocators would go on finding new ones; prime to CHUNK
 WARM_SHARE = 0.2  # the allocator and the graphs find their sizes first
 
 
@@ -70,10 +71,9 @@ def _run(detector: Detector, count: int, console: Console) -> Iterator[int]:
 
 
 def crops(points: NDArray[np.float32]) -> Iterator[NDArray[Any]]:
-    """Without end: squares of random place and size out of a scan (N, 4), from none of its points to most of them."""
+    """Without end: CROPS squares of random place and size out of a scan (N, 4), from few points to most, repeated."""
     rng = np.random.default_rng(0)
-    while True:
-        x, y, half = rng.uniform(0, 60), rng.uniform(-30, 30), rng.uniform(1, 25)
+    for x, y, half in cycle(rng.uniform((0, -30, 1), (60, 30, 25), (CROPS, 3)).tolist()):
         yield points[(np.abs(points[:, 0] - x) < half) & (np.abs(points[:, 1] - y) < half)]
 
 
