@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from asca_deploy import Detector, default_bundle_path, sample_scan_path
+from asca_deploy import Detector, default_bundle_path, load_bundle, sample_scan_path
 from asca_deploy.benchmark import (
     benchmark,
     cold_start,
@@ -61,9 +61,11 @@ def run(
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]
     if parts.scaling and not len(points[0]):
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
-    others = _named([bundle, *parts.compare])
+    bundles = _named([bundle, *parts.compare])
+    for folder in bundles.values():
+        load_bundle(folder)  # a damaged one is said now and not after minutes
     detector = Detector(_folder(bundle), provider=provider, precision=precision, threads=threads)
-    result = _measure(detector, points, rounds, parts, others, console)
+    result = _measure(detector, points, rounds, parts, bundles, console)
     if report_path is not None:
         with atomic_path(report_path) as temporary:
             temporary.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

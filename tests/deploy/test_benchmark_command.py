@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from asca_pillars.cli import app
 from asca_pillars.data.scans import write_scan
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import BundleError, ConfigError
 
 Points = NDArray[np.float32]
 
@@ -48,6 +48,16 @@ def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path) -> None:
     with pytest.raises(ConfigError, match="compared with itself"):
         CliRunner().invoke(
             app, ["bench", "-b", str(tiny_bundle), "--compare", str(tiny_bundle)], catch_exceptions=False
+        )
+
+
+def test_a_bundle_to_compare_with_is_looked_at_first(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asca_pillars.commands.bench.benchmark", lambda *_, **__: pytest.fail("too late"))
+    with pytest.raises(BundleError, match="no model bundle"):
+        CliRunner().invoke(
+            app, ["bench", "-b", str(tiny_bundle), "--compare", str(tmp_path / "none")], catch_exceptions=False
         )
 
 
