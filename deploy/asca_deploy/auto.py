@@ -144,7 +144,8 @@ def _try(
             return _Trial(Candidate(*name, None, differs), None)
         return _Trial(Candidate(*name, _median_ms(detect, network, clock), AGREES), network)
     except Exception as error:  # of onnxruntime or OpenVINO, which share no base; it only says that this one is out
-        return _Trial(Candidate(*name, None, f"does not run: {str(error).splitlines()[0]}"), None)
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        return _Trial(Candidate(*name, None, f"does not run: {reason}"), None)
 
 
 def _left_out(provider: str, elapsed_s: float) -> str | None:

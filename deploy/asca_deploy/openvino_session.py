@@ -66,7 +66,7 @@ class OpenVinoSession:
             core = _core()
             model = core.compile_model(core.read_model(path), _DEVICE, _properties(precision, threads))
         except RuntimeError as error:  # the only one OpenVINO knows; its last line says the most
-            reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
             raise BundleError(
                 f"OpenVINO {self._openvino.__version__.split('-')[0]} cannot run {path}: {reason}; "
                 f"upgrade with `pip install --upgrade openvino`, or choose provider cpu"

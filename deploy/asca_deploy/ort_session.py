@@ -124,7 +124,7 @@ def _open(path: Path, name: str, precision: str, threads: int) -> onnxruntime.In
             str(path), _session_options(threads), providers=providers, enable_fallback=0
         )
     except Exception as error:  # onnxruntime's exceptions share no other base
-        reason = str(error).splitlines()[0]
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         if name != "cpu":
             raise ProviderError(f"provider {name} cannot run {path}: {reason}; {chain[0].remedy}") from error
         raise BundleError(

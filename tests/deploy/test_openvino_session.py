@@ -58,7 +58,7 @@ def test_reduced_finds_the_same_boxes() -> None:
     for ours, theirs in zip(found, expected, strict=True):
         error, largest = np.abs(ours - theirs), np.abs(theirs).max()
         assert error.max() > 1e-3, "computed in float32 all the same"
-        # Where there is no point the errors of many layers add up instead of cancelling; no box comes from there.
+        # OpenVINO rounds the biases too, and where there is no point their errors add up; no box comes from there.
         assert np.median(error) < 0.02 * largest and error.max() < 0.25 * largest
 
 
