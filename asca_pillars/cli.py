@@ -18,7 +18,11 @@ app = typer.Typer(
 
 Bundle = Annotated[
     Path | None,
-    typer.Option("--bundle", "-b", help="Model bundle (folder). Default: the one that comes with asca."),
+    typer.Option(
+        "--bundle",
+        "-b",
+        help="Model bundle: a folder, or asca_small_sim or asca_small_sim_int8, which come with asca. Default: int8.",
+    ),
 ]
 ProviderName = Annotated[str, typer.Option(help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")]
 Precision = Annotated[
@@ -88,13 +92,43 @@ def bench(
     provider: ProviderName = "cpu",
     precision: Precision = None,
     threads: Threads = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Timed passes over the scans.")] = 30,
-    json: Annotated[Path | None, typer.Option("--json", help="Also write the report to this file.")] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Timed passes over the scans, for each table.")] = 30,
+    compare: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Another bundle, run in turn with the first on the same scans: how many times as fast it is, with "
+            "quartiles over the rounds. Such ratios hold on a busy machine, times do not. Repeatable."
+        ),
+    ] = None,
+    matrix: Annotated[
+        bool,
+        typer.Option(
+            "--matrix",
+            help="Every provider, precision and number of threads in turn (of the --compare bundles too): speed, and "
+            "how far the boxes are from float32 on the stock CPU provider. What cannot run says why.",
+        ),
+    ] = False,
+    scaling: Annotated[
+        bool, typer.Option("--scaling", help="Each stage at 1,000 to 1,000,000 points, made from the first scan.")
+    ] = False,
+    stream: Annotated[
+        bool,
+        typer.Option("--stream", help="Scans per second and latency of detector.stream(scans) beside single calls."),
+    ] = False,
+    cold: Annotated[
+        bool,
+        typer.Option("--cold", help="New processes: seconds to the first boxes, and the peak memory of asca detect."),
+    ] = False,
+    json: Annotated[Path | None, typer.Option("--json", help="Also write everything measured to this file.")] = None,
 ) -> None:
-    """Time every stage from points to boxes: p50, p95, FPS, cold start, memory, and the machine it ran on."""
-    from asca_pillars.commands.bench import run
+    """Time every stage from points to boxes: p50, p95, FPS, cold start, memory, and the machine it ran on.
 
-    run(scans, bundle, provider, precision, threads, rounds, json)
+    Two lines say where to look for more speed: what is spent outside the two graphs, and the roofline, the share of the
+    machine's measured matrix multiplications per second that the backbone gets out of it.
+    """
+    from asca_pillars.commands.bench import Parts, run
+
+    run(scans, bundle, provider, precision, threads, rounds, Parts(compare or (), matrix, scaling, stream, cold), json)
 
 
 @app.command()

@@ -92,7 +92,7 @@ def _variants(text: str) -> list[Variant]:
 def _speeds(todo: Sequence[Run], data: Path, console: Console) -> dict[str, Speed]:
     """Export one checkpoint of every variant and time them in alternation on the same scans."""
     from asca_deploy import Detector
-    from asca_deploy.benchmark import compare
+    from asca_deploy.benchmark import alternate
     from asca_export.export import MIN_SCANS, export_bundle
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.checkpoint import load_checkpoint
@@ -109,7 +109,8 @@ def _speeds(todo: Sequence[Run], data: Path, console: Console) -> dict[str, Spee
             detectors[name] = Detector(Path(folder) / name)
             parameters[name] = sum(part.numel() for part in checkpoint.detector.parameters())
         with console.status(f"Timing {len(detectors)} detectors in alternation"):
-            times = compare(detectors, scans, TIMED_ROUNDS)
+            frames = alternate(detectors, scans, TIMED_ROUNDS)
+    times = {name: np.median(own, axis=1) for name, own in frames.items()}
     reference = times[next(name for name in VARIANTS if name in times)]
     return {
         name: Speed(

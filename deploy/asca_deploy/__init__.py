@@ -1,7 +1,15 @@
 """The detector on the vehicle: ONNX Runtime and NumPy, never PyTorch."""
 
-from asca_deploy.bundle import Bundle, default_bundle_path, load_bundle, sample_scan_path
-from asca_deploy.detector import Detector, FrameReport
+from asca_deploy.bundle import (
+    Bundle,
+    default_bundle_path,
+    find_bundle,
+    load_bundle,
+    sample_scan_path,
+    shipped_bundles,
+)
+from asca_deploy.detector import Detector
+from asca_deploy.frame import FrameReport
 from asca_pillars.geometry.detections import Detections
 
 __all__ = [
@@ -10,6 +18,8 @@ __all__ = [
     "Detector",
     "FrameReport",
     "default_bundle_path",
+    "find_bundle",
     "load_bundle",
     "sample_scan_path",
+    "shipped_bundles",
 ]

@@ -2,20 +2,21 @@
 
 import logging
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Generator, Iterable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
-from asca_deploy.bundle import Bundle, default_bundle_path, load_bundle, sample_scan_path
+from asca_deploy.bundle import Bundle, find_bundle, load_bundle, sample_scan_path
 from asca_deploy.canvas import Canvas
+from asca_deploy.frame import FrameReport, Stopwatch
 from asca_deploy.graph import Graph, Tensor
 from asca_deploy.input_check import check_input
 from asca_deploy.ort_session import OrtSession, check_onnxruntime
+from asca_deploy.stream import overlapped
 from asca_pillars.data.scans import read_scan
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.geometry.compiled import load_kernels
@@ -24,37 +25,27 @@ from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.pillarize import FEATURES, PillarCounts, Pillars
 from asca_pillars.machine import default_threads
 
-STAGES = ("input", "pillarize", "encode", "scatter", "neck+head", "decode")
-
 Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 
 _log = logging.getLogger("asca_deploy")
 
 
-@dataclass(frozen=True)
-class FrameReport:
-    """What happened to one scan on its way to the boxes."""
+class _Frame(NamedTuple):
+    """A scan between its points and its boxes."""
 
-    times_ms: dict[str, float]
-    """Wall time of each of STAGES; "input" is the check and conversion of the points."""
+    watch: Stopwatch
+    image: NDArray[Any]
     counts: PillarCounts
-    """What the grid and the limits made of the finite points."""
-    non_finite_points: int
-    """Points dropped because a value was NaN or infinite."""
+    non_finite: int
     warnings: tuple[str, ...]
-    """How the scan differs from those the model was trained on; empty if it does not."""
-
-    @property
-    def total_ms(self) -> float:
-        """From the points to the detections."""
-        return sum(self.times_ms.values())
 
 
 class Detector:
     """ASCA-PointPillars without PyTorch. One object serves one stream of scans, from one thread at a time.
 
     Args:
-        bundle: folder written by `asca export`; None for the model that comes with the package.
+        bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the 8-bit one
+            that ships.
         provider: of the backbone: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one at hand that
             finds in the sample scan what "cpu" finds. `self.provider` and `self.precision` say what runs,
             `self.candidates` how each one did. The encoder always runs on onnxruntime's CPU provider.
@@ -80,7 +71,7 @@ class Detector:
     ) -> None:
         start = time.perf_counter()
         load_kernels()  # here rather than in the first scan
-        self.folder = default_bundle_path() if bundle is None else Path(bundle)
+        self.folder = find_bundle(bundle)
         self.threads = default_threads() if threads is None else threads
         if self.threads < 1:
             raise ConfigError(f"threads {self.threads} must be at least 1")
@@ -90,7 +81,7 @@ class Detector:
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
         self._encoder = _open_encoder(self.folder, self.bundle)
-        self._canvas = Canvas(self.bundle.channels, self.spec.grid, self.bundle.canvas)
+        self._canvas = self._new_canvas()
         choice = self._choose(provider, precision)
         self._backbone, self.provider, self.precision, self.candidates = choice
         self._warned: set[str] = set()
@@ -111,27 +102,37 @@ class Detector:
         Raises:
             ScanError: `points` has another shape or is not numeric.
         """
-        watch = _Stopwatch()
-        scan, non_finite = _finite_points(points)
-        watch.lap("input")
-        pillars = self.pillarize(scan)
-        watch.lap("pillarize")
-        pillar_features = self.encode(pillars)
-        watch.lap("encode")
-        canvas = self.scatter(pillar_features, pillars.cells)
-        watch.lap("scatter")
-        maps = self.neck_and_head(canvas)
-        watch.lap("neck+head")
-        detections = self.decode(maps)
-        watch.lap("decode")
-        warnings = self._compare_with_training(scan, pillars.stats)
-        watch.lap("input")
-        self.last_frame = FrameReport(watch.times_ms, pillars.stats, non_finite, warnings)
-        return detections
+        frame = self._prepare(points, self._canvas)
+        return self._finish(frame, self._infer(frame))
 
-    def stream(self, scans: Iterable[NDArray[Any]]) -> Iterator[Detections]:
-        """Detections of scan after scan, in order; `last_frame` is that of the scan just yielded."""
-        return map(self, scans)
+    def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[Detections, None, None]:
+        """Detections of scan after scan, in order, the same as one by one and more of them per second.
+
+        While the network works on one scan, the next is read and prepared and the one before is decoded, in threads
+        that live as long as the iterator; see `asca_deploy.stream`. `last_frame` is that of the scan just yielded.
+
+        Args:
+            scans: each as for a call; read in another thread, at most one ahead of the one asked for.
+
+        Raises:
+            ScanError: a scan cannot be used; the scans before it have been yielded. Errors of `scans` itself come in
+                the same way. Either ends the stream and leaves the detector usable.
+        """
+        canvases = self._new_canvas(), self._new_canvas()  # not the detector's own: it may be called meanwhile
+
+        def prepare(points: NDArray[Any], slot: int) -> _Frame:
+            return self._prepare(points, canvases[slot])
+
+        def infer(frame: _Frame) -> tuple[_Frame, Maps]:
+            frame.watch.waited()
+            return frame, self._infer(frame)
+
+        def finish(found: tuple[_Frame, Maps]) -> Detections:
+            frame, maps = found
+            frame.watch.waited()
+            return self._finish(frame, maps)
+
+        return overlapped(scans, prepare, infer, finish)
 
     def pillarize(self, points: NDArray[np.float32]) -> Pillars:
         """Finite points (N, 4) -> the features of M points in P pillars. Paper section 3.2."""
@@ -158,6 +159,36 @@ class Detector:
         """Head maps -> boxes above the score threshold that survive the rotated NMS."""
         return self.spec.decode(maps)
 
+    def _new_canvas(self) -> Canvas:
+        return Canvas(self.bundle.channels, self.spec.grid, self.bundle.canvas)
+
+    def _prepare(self, points: NDArray[Any], canvas: Canvas) -> _Frame:
+        """All that comes before the network; the result is valid until the next one on the same canvas."""
+        watch = Stopwatch()
+        scan, non_finite = _finite_points(points)
+        watch.lap("input")
+        pillars = self.pillarize(scan)
+        watch.lap("pillarize")
+        pillar_features = self.encode(pillars)
+        watch.lap("encode")
+        image = canvas.scatter(pillar_features, pillars.cells)
+        watch.lap("scatter")
+        warnings = self._compare_with_training(scan, pillars.stats)
+        watch.lap("input")
+        return _Frame(watch, image, pillars.stats, non_finite, warnings)
+
+    def _infer(self, frame: _Frame) -> Maps:
+        maps = self.neck_and_head(frame.image)
+        frame.watch.lap("neck+head")
+        return maps
+
+    def _finish(self, frame: _Frame, maps: Maps) -> Detections:
+        detections = self.decode(maps)
+        watch = frame.watch
+        watch.lap("decode")
+        self.last_frame = FrameReport(watch.times_ms, watch.waiting_ms, frame.counts, frame.non_finite, frame.warnings)
+        return detections
+
     def _choose(self, provider: str, precision: str | None) -> auto.Choice[Graph]:
         def open_network(name: str, digits: str) -> Graph:
             return _open_backbone(self.folder, self.bundle, name, digits, self.threads)
@@ -181,19 +212,6 @@ class Detector:
                 self._warned.add(warning.about)
                 _log.warning("%s (said once)", warning.text)
         return tuple(warning.text for warning in warnings)
-
-
-class _Stopwatch:
-    """Splits the time since its making into named laps without gaps."""
-
-    def __init__(self) -> None:
-        self.times_ms = dict.fromkeys(STAGES, 0.0)
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.times_ms[stage] += (now - self._last) * 1e3
-        self._last = now
 
 
 def _finite_points(points: NDArray[Any]) -> tuple[NDArray[np.float32], int]:

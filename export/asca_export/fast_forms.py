@@ -115,7 +115,9 @@ class _Head(nn.Module):
         self.channels = [part.out_channels for part in parts]
 
     def forward(self, features: Tensor) -> tuple[Tensor, ...]:
-        return torch.split(features @ self.weight + self.bias, self.channels, dim=-1)
+        # Adding the biases behind the split keeps onnxruntime from joining product and sum into a float-only operator.
+        maps = torch.split(features @ self.weight, self.channels, dim=-1)
+        return tuple(part + bias for part, bias in zip(maps, self.bias.split(self.channels), strict=True))
 
 
 def _folded(block: nn.Module) -> nn.Sequential:

@@ -4,7 +4,8 @@ import json
 import logging
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -92,28 +93,34 @@ def copy_properties(source: Path, target: Path) -> None:
 
 
 def _export(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)  # it reports every torchvision operator that is not installed
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of torch about torch
-            program = torch.onnx.export(
-                module.eval(),
-                tuple(example),
-                dynamo=True,
-                opset_version=OPSET,
-                custom_translation_table={torch.ops.asca.pillar_max.default: _scatter_max},
-                verbose=False,
-                **names,
-            )
-    finally:
-        logger.setLevel(level)
+    with errors_only("torch.onnx"), errors_only("onnxscript"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch about torch
+        program = torch.onnx.export(
+            module.eval(),
+            tuple(example),
+            dynamo=True,
+            opset_version=OPSET,
+            custom_translation_table={torch.ops.asca.pillar_max.default: _scatter_max},
+            verbose=False,
+            **names,
+        )
     assert program is not None
     model = program.model_proto
     _forget_origin(model.graph)
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path)
+
+
+@contextmanager
+def errors_only(name: str) -> Iterator[None]:
+    """Without what a library's logger reports of every operator that it leaves as it is."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 class _Encoder(nn.Module):

@@ -1,8 +1,6 @@
 """8-bit graphs in ONNX's QDQ form, written by onnxruntime.quantization."""
 
-import logging
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +11,7 @@ from onnxruntime.quantization.calibrate import TensorsData
 from onnxruntime.quantization.qdq_quantizer import QDQQuantizer
 from torch import Tensor
 
+from asca_export import graphs
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
 from asca_export.quantize import STEPS
 
@@ -62,7 +61,7 @@ def quantize_backbone(template: Path, out: Path, layers: Collection[str], parame
     floats = [node.name for node in graph.node if _layer(node) not in layers and node.op_type in ("Conv", "MatMul")]
     steps = (np.array(0, np.float32), np.array(STEPS * STEP_VALUE, np.float32))
     ranges = {value.name: steps for value in (*graph.input, *graph.value_info, *graph.output)}
-    with _quiet():
+    with graphs.errors_only(""):  # it gives advice on the root logger
         quantizer = QDQQuantizer(
             model,
             per_channel=True,
@@ -100,15 +99,3 @@ def _feed_uint8(graph: onnx.GraphProto) -> None:
     graph.node.insert(0, helper.make_node("DequantizeLinear", [canvas.name, *constants], ["float_canvas"]))
     canvas.type.tensor_type.elem_type = TensorProto.UINT8
     del graph.value_info[:]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the advice that the quantizer logs on the root logger."""
-    logger = logging.getLogger()
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

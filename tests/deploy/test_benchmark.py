@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.benchmark import benchmark
-from asca_deploy.detector import STAGES
+from asca_deploy.frame import STAGES
 
 
 def test_report(tiny_bundle: Path, scans: list[NDArray[np.float32]]) -> None:
@@ -18,6 +18,8 @@ def test_report(tiny_bundle: Path, scans: list[NDArray[np.float32]]) -> None:
         assert 0 < times.min <= times.p50 <= times.p95
     assert report.fps == pytest.approx(1000 / report.total_ms.p50)
     assert report.total_ms.min >= sum(times.min for times in report.stages_ms.values())
+    assert report.outside_ms.p50 < report.total_ms.p50 - report.stages_ms["neck+head"].min
+    assert 0 < report.outside_share < 1
     assert report.cold_ms is not None
     assert report.cold_ms > 0
     assert report.points == tuple(len(scan) for scan in scans)

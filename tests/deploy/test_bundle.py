@@ -14,8 +14,10 @@ from asca_deploy.bundle import (
     Parity,
     bundle_to_json,
     default_bundle_path,
+    find_bundle,
     load_bundle,
     sample_scan_path,
+    shipped_bundles,
     write_bundle_manifest,
 )
 from asca_pillars.errors import BundleError
@@ -166,6 +168,16 @@ def test_no_bundle_there(tmp_path: Path) -> None:
     assert_refused(checkpoint, "is no model bundle")
 
 
+def test_a_bundle_is_found_by_folder_and_by_shipped_name(tiny_bundle: Path) -> None:
+    assert find_bundle(tiny_bundle) == tiny_bundle
+    assert find_bundle("asca_small_sim") == shipped_bundles()["asca_small_sim"]
+    assert find_bundle(None) == default_bundle_path()
+    with pytest.raises(
+        BundleError, match=r"asca_smal: no such folder, and no bundle .* asca_small_sim, asca_small_sim_int8"
+    ):
+        find_bundle("asca_smal")
+
+
 def test_a_manifest_is_not_written_for_graphs_that_are_not_there(bundle_copy: Path, tmp_path: Path) -> None:
     bundle = load_bundle(bundle_copy)
     swapped = replace(bundle, graphs=Graphs(bundle.graphs.encoder, GraphFile("other.onnx", "0" * 64)))
@@ -175,5 +187,9 @@ def test_a_manifest_is_not_written_for_graphs_that_are_not_there(bundle_copy: Pa
 
 
 def test_shipped_files_lie_in_the_package() -> None:
-    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_small_sim")
+    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_small_sim_int8")
+    assert [(name, load_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
+        ("asca_small_sim", "asca_small_sim"),
+        ("asca_small_sim_int8", "asca_small_sim_int8"),
+    ]
     assert sample_scan_path().parts[-3:] == ("asca_deploy", "samples", "street.bin")

@@ -105,9 +105,15 @@ class StubSession:
         self.starts, self.fails, self.opened = starts, fails, list[list[tuple[str, dict[str, str]]]]()
 
     def __call__(
-        self, path: str, options: object, providers: list[tuple[str, dict[str, str]]], enable_fallback: int
+        self,
+        path: str,
+        options: object,
+        providers: list[tuple[str, dict[str, str]]],
+        enable_fallback: int,
+        disabled_optimizers: list[str],
     ) -> "StubSession":
         assert not enable_fallback  # onnxruntime would print and go on with the CPU
+        assert "WeightBiasQuantization" in disabled_optimizers
         self.opened.append(providers)
         if self.fails and providers[0][0] != CPU:
             raise RuntimeError("CUDA failure 100: no CUDA-capable device is detected\nand 20 lines more")

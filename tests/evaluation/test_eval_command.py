@@ -144,7 +144,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
 ) -> None:
     out = tmp_path / "out"
     report = evaluate(data=root, out=out, gallery=1)
-    assert "asca_small_sim on" in report["subject"] and report["frames"] == 2
+    assert "asca_small_sim_int8 on" in report["subject"] and report["frames"] == 2
     assert report["model"]["min_score"] == 0.05 and len(report["model"]["sha256"]["encoder"]) == 64
     own = {spec.name: spec.score_threshold for spec in load_bundle(default_bundle_path()).spec.classes}
     assert {point["class_name"]: point["score"] for point in report["operating_points"]} == own
@@ -154,7 +154,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
     assert lines and all(float(line.split()[15]) >= 0.05 for line in lines)
     assert len(list((out / "gallery").glob("*.png"))) == 1
     # Made-up scenes have a tenth of a scan's points: the bundle says that it has never seen such.
-    assert "2 of 2 scans are unlike those that asca_small_sim was trained on" in capsys.readouterr().out
+    assert "2 of 2 scans are unlike those that asca_small_sim_int8 was trained on" in capsys.readouterr().out
     again = evaluate(predictions=out / "predictions", data=root, out=tmp_path / "again")
     for key in ("results", "bands", "best_scores"):  # text has no thresholds of its own
         assert again[key] == report[key]
@@ -200,7 +200,8 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
     assert refusal(tmp_path, **texts, gallery=3) == "--gallery 3 draws scans: give --data ROOT that has them"
     assert refusal(tmp_path, **texts, score=float("nan")) == "--score nan must be a number"
     assert refusal(tmp_path, data=root, score=0.04) == (
-        "score 0.04 of Car is below --min-score 0.05, the lowest that asca_small_sim is run with; lower --min-score"
+        "score 0.04 of Car is below --min-score 0.05, the lowest that asca_small_sim_int8 is run with; "
+        "lower --min-score"
     )
     assert "bundle.json" in refusal(tmp_path, model=tmp_path, data=root)
     assert "velodyne" in refusal(tmp_path, data=tmp_path)

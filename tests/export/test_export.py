@@ -1,6 +1,5 @@
 """From a checkpoint to a proven bundle: parity for every reading, and refusal when the graphs are not the model."""
 
-import dataclasses
 import json
 import os
 from pathlib import Path
@@ -16,40 +15,20 @@ from asca_export import graphs
 from asca_export.export import export_bundle
 from asca_export.fast_forms import FastBackbone
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
-from asca_pillars.config import Config, NetworkConfig
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans import read_scan
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.spec import DetectorSpec
-from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.detector import build_detector
-from tests.scenes import SPEC, make_scene
+from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.scenes import SPEC
 
 READINGS = ("none", "paper", "channel", "point")
-NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
-SCANS = [make_scene(seed)[0] for seed in range(8)]
-
-
-def _checkpoint(cpa: str, spec: DetectorSpec = SPEC) -> Checkpoint:
-    """Fresh random weights, with statistics and scores that differ from place to place."""
-    torch.manual_seed(1)
-    config = Config(name="tiny", detector=spec, network=dataclasses.replace(NETWORK, cpa=cpa))
-    detector = build_detector(config)
-    with torch.no_grad():
-        for name, buffer in detector.named_buffers():
-            if name.endswith("running_mean"):
-                buffer.normal_(0, 0.1)
-            elif name.endswith("running_var"):
-                buffer.uniform_(0.2, 1.0)
-        for head in (detector.head.scores, detector.head.boxes, detector.head.directions):
-            head.weight.normal_(0, 0.3)
-    return Checkpoint(config, detector.eval(), 0)
 
 
 @pytest.mark.parametrize("cpa", READINGS)
 def test_bundle_is_the_same_detector(tmp_path: Path, cpa: str) -> None:
-    checkpoint = _checkpoint(cpa)
+    checkpoint = tiny_checkpoint(cpa)
     bundle = export_bundle(checkpoint, tmp_path / "bundle", SCANS, trained_on="nothing", command="none")
     assert load_bundle(tmp_path / "bundle") == bundle
     assert bundle.spec == SPEC and bundle.cpa == cpa and bundle.provenance.steps == 0
@@ -61,7 +40,7 @@ def test_bundle_is_the_same_detector(tmp_path: Path, cpa: str) -> None:
 
 def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
     """Features of 1e5 differ by more than 1e-3 from rounding alone, and the network that follows divides it away."""
-    checkpoint = _checkpoint("none")
+    checkpoint = tiny_checkpoint("none")
     encode, first = checkpoint.detector.encode, checkpoint.detector.neck.blocks[0][0]
     with torch.no_grad():
         encode.norm.weight.mul_(1e5)
@@ -72,7 +51,7 @@ def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
 
 
 def test_graphs_carry_the_contract(tmp_path: Path) -> None:
-    export_bundle(_checkpoint("channel"), tmp_path, SCANS)
+    export_bundle(tiny_checkpoint("channel"), tmp_path, SCANS)
     for name in ("encoder.onnx", "backbone.onnx"):
         model = onnx.load(tmp_path / name)
         properties = {item.key: json.loads(item.value) for item in model.metadata_props}
@@ -88,7 +67,7 @@ def test_graphs_carry_the_contract(tmp_path: Path) -> None:
 
 def test_encoder_gives_the_same_features_every_time(tmp_path: Path) -> None:
     """onnxruntime's threads race for the repeated indices of ScatterND: the runtime has to keep them out."""
-    export_bundle(_checkpoint("none"), tmp_path, SCANS)
+    export_bundle(tiny_checkpoint("none"), tmp_path, SCANS)
     detector = Detector(tmp_path, threads=2)
     rng = np.random.default_rng(0)
     points = rng.uniform((5, -6, -2, 0), (25, 7, 0, 1), (12000, 4)).astype(np.float32)
@@ -101,10 +80,10 @@ def test_encoder_gives_the_same_features_every_time(tmp_path: Path) -> None:
 def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    checkpoint = _checkpoint("channel")
+    checkpoint = tiny_checkpoint("channel")
     export_bundle(checkpoint, tmp_path / "bundle", SCANS)
     before = {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()}
-    other = _checkpoint("channel").detector
+    other = tiny_checkpoint("channel").detector
     with torch.no_grad():
         other.head.boxes.bias.add_(0.01)
     export_backbone = graphs.export_backbone
@@ -118,7 +97,7 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
 
 def test_too_few_scans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="7 scans given"):
-        export_bundle(_checkpoint("none"), tmp_path / "bundle", SCANS[:7])
+        export_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS[:7])
 
 
 def _maps(seed: int) -> HeadMaps:
@@ -163,7 +142,7 @@ def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: str) -> No
         pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")
     split = KittiSplit(root)
     scans = [read_scan(split.scan_path(frame_id)).points for frame_id in split.frame_ids]
-    parity = export_bundle(_checkpoint(cpa, DetectorSpec()), tmp_path, scans).parity
+    parity = export_bundle(tiny_checkpoint(cpa, DetectorSpec()), tmp_path, scans).parity
     assert parity is not None and parity.scans == len(scans)
     assert parity.box_max_error_m <= 0.01 and parity.yaw_max_error_rad <= np.deg2rad(0.5)
 

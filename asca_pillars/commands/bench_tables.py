@@ -1,0 +1,126 @@
+"""What `asca bench` prints: a table or a line for each part of a benchmark."""
+
+from collections.abc import Sequence
+
+from rich.table import Table
+
+from asca_deploy.benchmark import (
+    BenchmarkReport,
+    ColdStart,
+    Comparison,
+    Contestant,
+    MatrixRow,
+    Roofline,
+    ScalingRow,
+    Throughput,
+)
+from asca_deploy.benchmark.timing import Spread
+
+
+def stages_table(report: BenchmarkReport) -> Table:
+    """p50, p95 and min of every stage."""
+    points = f"{min(report.points)}" if len(set(report.points)) == 1 else f"{min(report.points)}-{max(report.points)}"
+    title = f"{report.bundle}: {report.frames} warm frames, {report.scans} scan(s) of {points} points"
+    table = _table(title, "stage", "p50 ms", "p95 ms", "min ms")
+    for name, times in [*report.stages_ms.items(), ("total", report.total_ms)]:
+        table.add_row(name, f"{times.p50:.2f}", f"{times.p95:.2f}", f"{times.min:.2f}")
+    return table
+
+
+def summary_lines(report: BenchmarkReport) -> list[str]:
+    """FPS, the share outside the graphs, start and memory."""
+    memory = "" if report.peak_memory_mib is None else f", peak memory {report.peak_memory_mib:.0f} MiB"
+    cold = "" if report.cold_ms is None else f", first scan {report.cold_ms:.0f} ms"
+    return [
+        f"{report.fps:.1f} FPS; loaded in {report.load_s:.2f} s{cold}{memory}",
+        f"outside the graphs: {report.outside_ms.p50:.1f} ms (p95 {report.outside_ms.p95:.1f}), "
+        f"{report.outside_share:.0%}",
+    ]
+
+
+def machine_line(report: BenchmarkReport) -> str:
+    """What the figures belong to."""
+    versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
+    return f"{report.cpu}, {report.threads} threads, {report.provider} {report.precision}; {versions}"
+
+
+def roofline_line(found: Roofline) -> str:
+    """Achieved beside possible."""
+    rates = ", ".join(f"{kind} {rate:.0f}" for kind, rate in found.gemm_gmac_s.items())
+    return (
+        f"roofline: backbone {found.gmac:.1f} GMAC at {found.achieved_gmac_s:.0f} GMAC/s, {found.share:.0%} of this "
+        f"machine's {found.type} matrix product (GMAC/s measured in onnxruntime, {found.threads} threads: {rates})"
+    )
+
+
+def comparison_table(found: Comparison) -> Table:
+    """Contestants and how many times as fast as the first they are."""
+    table = _table(f"{found.rounds} rounds in turn", "", "p50 ms", "p95 ms", "FPS", "times as fast")
+    for one in found.contestants:
+        table.add_row(one.name, *_speed(one))
+    return table
+
+
+def matrix_table(rows: Sequence[MatrixRow]) -> Table:
+    """Every way that runs; see `matrix_reasons` for the others."""
+    title = "Ways to run, in turn; boxes: largest difference from the first row's (boxes without a partner)"
+    columns = ("provider", "precision", "threads", "p50 ms", "FPS", "times as fast", "boxes")
+    table = _table(title, "bundle", *columns, names=3)
+    for row in rows:
+        if row.speed is not None and row.boxes is not None:
+            p50_ms, _, fps, speedup = _speed(row.speed)
+            boxes = f"{100 * row.boxes.center_size_m:.1f} cm ({row.boxes.lone})"
+            table.add_row(*row.way[:3], str(row.way.threads), p50_ms, fps, speedup, boxes)
+    return table
+
+
+def matrix_reasons(rows: Sequence[MatrixRow]) -> list[str]:
+    """One line for each way that cannot run here."""
+    return [f"{row.way.bundle}, {row.way.provider}, {row.way.precision}: {row.reason}" for row in rows if row.reason]
+
+
+def scaling_table(rows: Sequence[ScalingRow]) -> Table:
+    """Stages by number of points."""
+    table = _table("p50 ms by number of points", "points", "pillars", *rows[0].stages_ms, "total", names=0)
+    for row in rows:
+        times = [f"{value:.2f}" for value in (*row.stages_ms.values(), row.total_ms)]
+        table.add_row(f"{row.points:,}", f"{row.pillars:,}", *times)
+    return table
+
+
+def stream_table(found: Throughput) -> Table:
+    """One by one and streamed."""
+    title = f"Stream: {_spread(found.gain)} times the scans per second, {found.rounds} rounds in turn"
+    table = _table(title, "", "scans per second", "latency p50 ms", "p95 ms")
+    for name, fps, latency in (
+        ("one by one", found.single_fps, found.single_latency_ms),
+        ("stream", found.stream_fps, found.stream_latency_ms),
+    ):
+        table.add_row(name, f"{fps:.1f}", f"{latency.p50:.1f}", f"{latency.p95:.1f}")
+    return table
+
+
+def cold_line(found: ColdStart) -> str:
+    """A new process."""
+    memory = found.detect_peak_memory_mib
+    return (
+        f"new process: {found.first_boxes_s:.2f} s to the first boxes (import {found.import_s:.2f}, load "
+        f"{found.load_s:.2f}, first scan {found.first_scan_s:.2f}; median of {found.repeats})"
+        + ("" if memory is None else f"; `asca detect` peaks at {memory:.0f} MiB")
+    )
+
+
+def _table(title: str, *columns: str, names: int = 1) -> Table:
+    """A table whose first columns are words and the others numbers."""
+    table = Table(title=title)
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index < names else "right")
+    return table
+
+
+def _speed(one: Contestant) -> tuple[str, str, str, str]:
+    return f"{one.total_ms.p50:.1f}", f"{one.total_ms.p95:.1f}", f"{one.fps:.1f}", _spread(one.speedup)
+
+
+def _spread(ratio: Spread) -> str:
+    return f"{ratio.median:.2f} ({ratio.low:.2f}-{ratio.high:.2f})"

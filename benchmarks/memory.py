@@ -1,0 +1,88 @@
+"""Does the memory of a detector grow with the number of scans?
+
+    python -m benchmarks.memory --scans 10000
+
+Scans are crops of the sample of many sizes, so that everything whose size depends on the scan keeps changing. Half of
+them go through single calls and half through streams that are opened and closed again.
+"""
+
+import json
+import logging
+from collections.abc import Iterator
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from asca_deploy import Detector, sample_scan_path
+from asca_deploy.benchmark.memory import peak_memory_mib, resident_mib
+from asca_pillars.data.scans import read_scan
+from asca_pillars.errors import AscaError
+from asca_pillars.files import atomic_path
+
+CHUNK = 50  # scans of one stream, then as many single calls
+CROPS = 199  # sizes that come again and again, or allocators would go on finding new ones; prime to CHUNK
+WARM_SHARE = 0.2  # the allocator and the graphs find their sizes first
+
+
+def main(
+    scans: Annotated[int, typer.Option(min=4 * CHUNK, help="Scans to run.")] = 10_000,
+    bundle: Annotated[Path | None, typer.Option(help="Default: the one that ships.")] = None,
+    provider: Annotated[str, typer.Option()] = "cpu",
+    precision: Annotated[str, typer.Option(help="float32 or reduced.")] = "float32",
+    threads: Annotated[int | None, typer.Option()] = None,
+    out: Annotated[Path | None, typer.Option("--json", help="Also write the samples to this file.")] = None,
+) -> None:
+    """Run, sample the resident memory along the way, print start, middle, end and slope."""
+    console = Console(markup=False, highlight=False)
+    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # crops are unlike any training scan
+    detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
+    samples = [(done, _resident()) for done in _run(detector, scans, console)]
+    counts, resident = np.array(samples).T
+    warm = counts >= WARM_SHARE * scans
+    slope = np.polyfit(counts[warm], resident[warm], 1)[0] * 1000
+    start, middle, end = resident[warm][0], resident[warm][warm.sum() // 2], resident[-1]
+    console.print(
+        f"{scans} scans, {provider} {precision}: resident {start:.1f} MiB after {counts[warm][0]:.0f} scans, "
+        f"{middle:.1f} in the middle, {end:.1f} at the end, peak {peak_memory_mib():.1f}; "
+        f"slope {slope:+.3f} MiB per 1,000 scans after the first {WARM_SHARE:.0%}",
+        soft_wrap=True,
+    )
+    if out is not None:
+        with atomic_path(out) as path:
+            path.write_text(json.dumps({"scans": scans, "slope_mib_per_1000": slope, "samples": samples}) + "\n")
+
+
+def _run(detector: Detector, count: int, console: Console) -> Iterator[int]:
+    """Run `count` scans and yield after every CHUNK how many are done."""
+    source = crops(read_scan(sample_scan_path()).points)
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("scans", total=count)
+        for number, done in enumerate(range(0, count, CHUNK)):
+            chunk = islice(source, min(CHUNK, count - done))
+            for _ in detector.stream(chunk) if number % 2 == 0 else map(detector, chunk):
+                progress.advance(task)
+            yield min(done + CHUNK, count)
+
+
+def crops(points: NDArray[np.float32]) -> Iterator[NDArray[Any]]:
+    """Without end: CROPS squares of random place and size out of a scan (N, 4), from few points to most, repeated."""
+    rng = np.random.default_rng(0)
+    for x, y, half in cycle(rng.uniform((0, -30, 1), (60, 30, 25), (CROPS, 3)).tolist()):
+        yield points[(np.abs(points[:, 0] - x) < half) & (np.abs(points[:, 1] - y) < half)]
+
+
+def _resident() -> float:
+    resident = resident_mib()
+    if resident is None:
+        raise AscaError("this system does not say how much memory a process holds; run it on Linux")
+    return resident
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,62 @@
+"""Bundles of a network that nobody has trained, to time it: random weights cost what trained ones do.
+
+    python -m benchmarks.random_weights bundles/                                  # the paper's size, K = 3
+    asca bench scans/ --bundle bundles/int8 --compare bundles/float32
+
+The weights are the same on every run. How good 8 bits are, they cannot say; neither how many boxes there will be.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import nn
+
+from asca_deploy import sample_scan_path
+from asca_export.export import MIN_SCANS, export_bundle
+from asca_pillars.config import load_config
+from asca_pillars.data.scans import read_scan
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.detector import batch_pillars, build_detector
+
+
+def main(
+    out: Annotated[Path, typer.Argument(help="Folder for the bundles float32 and int8.")],
+    config: Annotated[str, typer.Option(help="YAML, or the name of one that ships.")] = "asca_pointpillars_kitti",
+) -> None:
+    """Export both, calibrated on the sample scan."""
+    console = Console(markup=False)
+    points = read_scan(sample_scan_path()).points
+    model, scans = random_weights(config, points), [points] * MIN_SCANS
+    with console.status("Exporting") as status:
+        for name, calibration in (("float32", None), ("int8", scans)):
+            bundle = export_bundle(
+                model,
+                out / name,
+                scans,
+                trained_on="nothing: random weights",
+                calibration=calibration,
+                say=status.update,
+            )
+            console.print(f"{out / name}: {bundle.backbone_gmac:.2f} GMAC, {bundle.precision}")
+
+
+def random_weights(config: str, points: NDArray[np.float32]) -> Checkpoint:
+    """A network with random weights, normalized on a scan (N, 4), so that its maps depend on the points."""
+    torch.manual_seed(0)
+    resolved = load_config(config)
+    network = build_detector(resolved).train()
+    norms = [module for module in network.modules() if isinstance(module, (nn.BatchNorm1d, nn.BatchNorm2d))]
+    for norm in norms:
+        norm.momentum = 1.0  # the running statistics become those of this scan
+    with torch.no_grad():
+        network(batch_pillars([resolved.detector.pillarize(points)]))
+    return Checkpoint(resolved, network.eval(), 0)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,92 @@
+"""Which of several is faster, and by how much: turn by turn, so that a busy machine is busy for all of them alike."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.benchmark.timing import Percentiles, Spread, Track, silently
+
+Run: TypeAlias = Callable[[NDArray[np.float32]], object]
+
+FRAMES_PER_TURN = 3  # at least so many are timed, after one that is not: it finds the caches full of another's weights
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """One of those compared."""
+
+    name: str
+    total_ms: Percentiles
+    """Over all frames of all rounds."""
+    fps: float
+    """1 / p50."""
+    speedup: Spread
+    """How many times as fast as the first one: ratio of the two medians of a round, over the rounds."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Result of `compare`."""
+
+    rounds: int
+    contestants: tuple[Contestant, ...]
+    """As they were given; the first is what the others are measured against."""
+
+
+def compare(
+    runs: Mapping[str, Run], scans: Sequence[NDArray[np.float32]], rounds: int = 10, track: Track = silently
+) -> Comparison:
+    """Time several detectors in alternation; see `alternate`."""
+    times_ms = alternate(runs, scans, rounds, track)
+    medians = {name: np.median(times, axis=1) for name, times in times_ms.items()}
+    first = next(iter(medians.values()))
+    return Comparison(
+        rounds,
+        tuple(
+            Contestant(
+                name,
+                total_ms=Percentiles.of(times),
+                fps=1e3 / float(np.median(times)),
+                speedup=Spread.of(first / medians[name]),
+            )
+            for name, times in times_ms.items()
+        ),
+    )
+
+
+def alternate(
+    runs: Mapping[str, Run], scans: Sequence[NDArray[np.float32]], rounds: int, track: Track = silently
+) -> dict[str, NDArray[np.float64]]:
+    """Wall times of several detectors that take turns, never two at a time.
+
+    Args:
+        runs: by name; called with a scan.
+        scans: (N, 4) each; in every round each detector gets all of them, and again until there are enough for a
+            median. Every other round goes through the detectors backwards.
+
+    Returns:
+        By name (rounds, frames), milliseconds; divide medians over the frames of the same round for ratios that a
+        busy machine does not spoil.
+
+    Raises:
+        ValueError: there is no scan, no round or no detector.
+    """
+    if not scans or not runs or rounds < 1:
+        raise ValueError(f"{len(runs)} detectors, {len(scans)} scans, {rounds} rounds: at least one of each is needed")
+    frames = [*scans] * -(-FRAMES_PER_TURN // len(scans))
+    times_ms = {name: np.empty((rounds, len(frames))) for name in runs}
+    for number in track(rounds, f"{len(runs)} in turn"):
+        for name in list(runs)[:: 1 if number % 2 == 0 else -1]:
+            runs[name](frames[0])
+            times_ms[name][number] = [_time_ms(runs[name], scan) for scan in frames]
+    return times_ms
+
+
+def _time_ms(run: Run, scan: NDArray[np.float32]) -> float:
+    start = perf_counter()
+    run(scan)
+    return (perf_counter() - start) * 1e3

@@ -1,0 +1,96 @@
+"""Every way of running a bundle on this machine, side by side: providers, precisions, threads."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.benchmark.boxes import BoxDifference, box_difference
+from asca_deploy.benchmark.comparison import Contestant, compare
+from asca_deploy.benchmark.timing import Track, silently
+from asca_deploy.detector import Detector
+from asca_deploy.providers import PRECISIONS, PROVIDERS
+from asca_pillars.errors import AscaError
+from asca_pillars.machine import default_threads
+
+ON_THE_CPU = ("cpu", "openvino")  # the number of threads matters to these
+
+
+class Way(NamedTuple):
+    """One way of running a bundle."""
+
+    bundle: str
+    provider: str
+    precision: str
+    threads: int
+
+
+@dataclass(frozen=True)
+class MatrixRow:
+    """One way of running a bundle, how fast it is and how much its boxes differ from the reference's; or why not."""
+
+    way: Way
+    speed: Contestant | None
+    """`speedup` is over the reference: the first bundle on stock onnxruntime's CPU provider, default threads."""
+    boxes: BoxDifference | None
+    """Against the reference's boxes, over all scans."""
+    reason: str | None
+    """Why it cannot run here; None if it can."""
+
+
+def measure_matrix(
+    bundles: Mapping[str, Path],
+    scans: Sequence[NDArray[np.float32]],
+    rounds: int = 10,
+    track: Track = silently,
+) -> tuple[MatrixRow, ...]:
+    """Open every way that there is and time those that run in alternation.
+
+    Args:
+        bundles: folders by name. The first one's default on the CPU is the reference and the first row.
+        scans: (N, 4) each.
+    """
+    opened: dict[Way, Detector | str] = {}
+    ways = [way for bundle in bundles for way in _ways(bundle)]
+    for number in track(len(ways), "opening"):
+        way = ways[number]
+        # A provider that is not there at all is one row, not one for each precision and number of threads.
+        if not any(isinstance(result, str) and _same_but_threads(way, other) for other, result in opened.items()):
+            opened[way] = _open(bundles[way.bundle], way, scans[0])
+    detectors = {str(way): detector for way, detector in opened.items() if isinstance(detector, Detector)}
+    speeds = {speed.name: speed for speed in compare(detectors, scans, rounds, track).contestants}
+    boxes = {name: [detector(scan) for scan in scans] for name, detector in detectors.items()}
+    reference = next(iter(boxes.values()))
+    return tuple(
+        MatrixRow(way, None, None, result)
+        if isinstance(result, str)
+        else MatrixRow(way, speeds[str(way)], box_difference(reference, boxes[str(way)]), None)
+        for way, result in opened.items()
+    )
+
+
+def _ways(bundle: str) -> list[Way]:
+    return [
+        Way(bundle, provider, precision, threads)
+        for provider in sorted(PROVIDERS, key=lambda name: name != "cpu")
+        for precision in PRECISIONS
+        for threads in sorted({default_threads(), 1} if provider in ON_THE_CPU else {default_threads()}, reverse=True)
+    ]
+
+
+def _same_but_threads(way: Way, failed: Way) -> bool:
+    """Would `way` fail for the same reason: another number of threads, or less precision where float32 fails."""
+    return way[:2] == failed[:2] and failed.precision in ("float32", way.precision)
+
+
+def _open(folder: Path, way: Way, scan: NDArray[np.float32]) -> Detector | str:
+    """The detector, after its first scan, or why there is none."""
+    try:
+        detector = Detector(folder, provider=way.provider, precision=way.precision, threads=way.threads)
+        detector(scan)
+    except AscaError as error:
+        return str(error)
+    return detector

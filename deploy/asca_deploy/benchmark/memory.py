@@ -1,0 +1,35 @@
+"""How much memory the process holds."""
+
+import sys
+from pathlib import Path
+
+STATUS = Path("/proc/self/status")
+
+
+def peak_memory_mib() -> float | None:
+    """Largest resident memory of the process so far; None where the system does not say.
+
+    Linux keeps the figure of getrusage across exec, so that a small program started by a large one looks large;
+    its own /proc does not.
+    """
+    if (peak := _status_mib("VmHWM")) is not None:
+        return peak
+    if sys.platform == "win32":
+        return None
+    import resource  # does not exist on Windows
+
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(largest / 2**20 if sys.platform == "darwin" else largest / 2**10)  # bytes there, KiB elsewhere
+
+
+def resident_mib() -> float | None:
+    """Resident memory of the process now; None where the system does not say."""
+    return _status_mib("VmRSS")
+
+
+def _status_mib(key: str) -> float | None:
+    try:
+        lines = STATUS.read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 2**10 for line in lines if line.startswith(f"{key}:")), None)

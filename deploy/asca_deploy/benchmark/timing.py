@@ -1,0 +1,54 @@
+"""What every table of the benchmark is made of: percentiles of frames, spreads of ratios, rounds that show progress."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.detector import Detector
+from asca_deploy.frame import FrameReport
+
+Track: TypeAlias = Callable[[int, str], Iterable[int]]
+"""Numbers 0..count-1 of what is being done, in words; a command line puts a progress bar behind it."""
+
+
+def silently(count: int, what: str) -> Iterable[int]:
+    """The Track that shows nothing."""
+    return range(count)
+
+
+@dataclass(frozen=True)
+class Percentiles:
+    """Wall time over the measured frames, milliseconds."""
+
+    p50: float
+    p95: float
+    min: float
+
+    @classmethod
+    def of(cls, times_ms: list[float] | NDArray[np.float64]) -> "Percentiles":
+        """Of times in any shape."""
+        return cls(*(float(np.percentile(times_ms, q)) for q in (50, 95, 0)))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A ratio that was measured once per round: its median and its quartiles over the rounds."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, ratios: list[float] | NDArray[np.float64]) -> "Spread":
+        """Of one ratio per round."""
+        return cls(*(float(np.percentile(ratios, q)) for q in (50, 25, 75)))
+
+
+def run_frame(detector: Detector, scan: NDArray[Any]) -> FrameReport:
+    """Run one scan and return its report."""
+    detector(scan)
+    assert detector.last_frame is not None
+    return detector.last_frame

@@ -1,0 +1,58 @@
+"""The scripts under benchmarks/ that measure the runtime."""
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.config import CpaReading, NetworkConfig
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.detector import batch_pillars, build_detector
+from benchmarks.memory import crops
+from benchmarks.padded import PaddedDetector
+from tests.scenes import make_scene
+from tests.test_training import CONFIG
+
+
+def network(cpa: CpaReading) -> tuple:
+    """A small network whose normalization has seen a scan, as `benchmarks.eager.random_weights` does it."""
+    torch.manual_seed(1)
+    config = replace(CONFIG, network=replace(CONFIG.network, cpa=cpa))
+    assert isinstance(config.network, NetworkConfig)
+    detector, spec = build_detector(config).train(), config.detector
+    for module in detector.modules():
+        if isinstance(module, (torch.nn.BatchNorm1d, torch.nn.BatchNorm2d)):
+            module.momentum = 1.0
+            torch.nn.init.normal_(module.bias, std=0.5)  # or padding would be neutral without a mask
+    with torch.no_grad():
+        detector(batch_pillars([spec.pillarize(make_scene(0)[0])]))
+    return detector.eval(), spec
+
+
+@pytest.mark.parametrize("cpa", ["channel", "paper", "none"])
+@pytest.mark.parametrize(("all_pillars", "channels_last"), [(True, False), (False, True)])
+def test_padded_pillars_are_the_same_network(cpa: CpaReading, all_pillars: bool, channels_last: bool) -> None:
+    detector, spec = network(cpa)
+    points = make_scene(3)[0]
+    with torch.inference_mode():
+        expected: HeadMaps = detector(batch_pillars([spec.pillarize(points)]))
+    found = PaddedDetector(detector, spec, all_pillars, channels_last).head_maps(points)
+    for ours, theirs in zip(expected, found, strict=True):
+        assert theirs.std() > 1e-4  # the maps say something of the points
+        np.testing.assert_allclose(ours[0].numpy(), theirs.numpy(), atol=1e-4)
+
+
+def test_attention_among_points_is_refused() -> None:
+    detector, spec = network("point")
+    with pytest.raises(ConfigError, match="channel, paper or none"):
+        PaddedDetector(detector, spec)
+
+
+def test_crops_are_of_many_sizes_and_begin_alike() -> None:
+    points = make_scene(0)[0]
+    sizes = [len(crop) for crop in islice(crops(points), 50)]
+    assert len(set(sizes)) > 10 and max(sizes) <= len(points)
+    assert sizes == [len(crop) for crop in islice(crops(points), 50)]

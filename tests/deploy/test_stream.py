@@ -1,0 +1,188 @@
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from asca_deploy import Detections, Detector
+from asca_deploy.stream import overlapped
+from asca_pillars.errors import ScanError
+from tests.deploy.conftest import make_scan
+
+Points = NDArray[np.float32]
+PATIENCE_S = 20  # only a test that fails waits so long
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_is_left() -> Iterator[None]:
+    before = threading.active_count()
+    yield
+    assert threading.active_count() == before
+
+
+def same(a: Detections, b: Detections) -> bool:
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("boxes", "scores", "labels"))
+
+
+def test_the_same_boxes_and_counters_as_one_by_one(tiny_bundle: Path) -> None:
+    scans = [make_scan(seed, count) for seed, count in enumerate((1000, 0, 200, 1, 1000, 900, 30))]
+    detector, alone = Detector(tiny_bundle), Detector(tiny_bundle)
+    streamed = 0
+    for points, detections in zip(scans, detector.stream(iter(scans)), strict=True):
+        assert same(detections, alone(points))
+        assert detector.last_frame is not None and alone.last_frame is not None
+        assert detector.last_frame.counts == alone.last_frame.counts
+        assert detector.last_frame.warnings == alone.last_frame.warnings
+        streamed += len(detections)
+    assert streamed > 10
+
+
+def test_latency_includes_the_waiting(tiny_bundle: Path, scans: list[Points]) -> None:
+    detector = Detector(tiny_bundle)
+    for _ in detector.stream(scans):
+        frame = detector.last_frame
+        assert frame is not None
+        assert all(time_ms > 0 for time_ms in frame.times_ms.values())
+        assert frame.waiting_ms > 0
+        assert frame.total_ms == pytest.approx(sum(frame.times_ms.values()) + frame.waiting_ms)
+    detector(scans[0])
+    assert detector.last_frame is not None and detector.last_frame.waiting_ms == 0
+
+
+def test_no_scans_no_detections(tiny_bundle: Path) -> None:
+    assert list(Detector(tiny_bundle).stream([])) == []
+
+
+def test_never_more_than_one_scan_ahead(tiny_bundle: Path) -> None:
+    read: list[int] = []
+
+    def source() -> Iterator[Points]:
+        for number in range(6):
+            read.append(number)
+            yield make_scan(number)
+
+    results = Detector(tiny_bundle).stream(source())
+    assert read == []
+    for number, _ in enumerate(results):
+        assert len(read) <= number + 2
+    assert read == list(range(6))
+
+
+def test_a_slow_source_does_not_hold_back_what_is_done(tiny_bundle: Path, scan: Points) -> None:
+    arrived = threading.Event()
+
+    def sensor() -> Iterator[Points]:
+        yield scan
+        assert arrived.wait(PATIENCE_S)
+        yield scan
+
+    results = Detector(tiny_bundle).stream(sensor())
+    assert len(next(results)) > 0  # although the next scan is not there yet
+    arrived.set()
+    assert len(list(results)) == 1
+
+
+def test_an_error_of_the_source_comes_in_its_place(tiny_bundle: Path, scan: Points) -> None:
+    def source() -> Iterator[Points]:
+        yield from (scan, scan)
+        raise OSError("unplugged")
+
+    detector = Detector(tiny_bundle)
+    results = detector.stream(source())
+    expected = detector(scan)
+    assert same(next(results), expected) and same(next(results), expected)
+    with pytest.raises(OSError, match="unplugged"):
+        next(results)
+    assert list(results) == []
+    assert same(detector(scan), expected)
+
+
+def test_a_scan_of_the_wrong_shape_comes_in_its_place(tiny_bundle: Path, scan: Points) -> None:
+    detector = Detector(tiny_bundle)
+    results = detector.stream([scan, scan[:, :3], scan])
+    assert len(next(results)) > 0
+    with pytest.raises(ScanError, match="not \\(N, 4\\)"):
+        next(results)
+    assert len(list(detector.stream([scan, scan]))) == 2
+
+
+@pytest.mark.parametrize("stage", ["neck_and_head", "decode"])
+def test_a_stage_that_fails_ends_the_stream_there(
+    tiny_bundle: Path, scan: Points, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    detector = Detector(tiny_bundle)
+    works: Callable[..., object] = getattr(detector, stage)
+    calls: list[int] = []
+
+    def fails_the_second_time(argument: object) -> object:
+        calls.append(1)
+        if len(calls) == 2:
+            raise RuntimeError("broken")
+        return works(argument)
+
+    monkeypatch.setattr(detector, stage, fails_the_second_time)
+    results = detector.stream([scan] * 4)
+    next(results)
+    with pytest.raises(RuntimeError, match="broken"):
+        next(results)
+    monkeypatch.undo()
+    assert len(detector(scan)) > 0
+
+
+def test_closing_early_ends_the_threads_and_spoils_nothing(tiny_bundle: Path, scans: list[Points]) -> None:
+    detector = Detector(tiny_bundle)
+    expected = detector(scans[0])
+    results = detector.stream(scans * 20)
+    next(results)
+    assert threading.active_count() > 1
+    results.close()
+    assert list(results) == []
+    assert same(detector(scans[0]), expected)
+
+
+def test_a_call_between_two_scans_of_a_stream_disturbs_neither(tiny_bundle: Path, scans: list[Points]) -> None:
+    detector, alone = Detector(tiny_bundle), Detector(tiny_bundle)
+    other = make_scan(7)
+    for points, detections in zip(scans, detector.stream(scans), strict=True):
+        assert same(detections, alone(points))
+        assert same(detector(other), alone(other))
+
+
+def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    detector, scans = Detector(tiny_bundle), [make_scan(seed, 50 + 20 * seed) for seed in range(5)]
+    canvases: list[object] = []
+    images = set()
+    new_canvas, neck_and_head = detector._new_canvas, detector.neck_and_head
+    monkeypatch.setattr(detector, "_new_canvas", lambda: canvases.append(None) or new_canvas())
+    monkeypatch.setattr(detector, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image))
+    most_threads = 0
+    for _ in detector.stream(scans[number % 5] for number in range(300)):
+        most_threads = max(most_threads, threading.active_count())
+    assert len(canvases) == len(images) == 2
+    assert most_threads <= threading.active_count() + 2
+
+
+def test_stop_iteration_out_of_a_stage_is_an_error_and_no_end() -> None:
+    def prepare(scan: int, slot: int) -> int:
+        raise StopIteration
+
+    with pytest.raises(RuntimeError):
+        list(overlapped([1, 2], prepare, infer=abs, finish=abs))
+
+
+def test_slots_alternate_and_are_free_when_they_are_used_again() -> None:
+    busy: dict[int, int] = {}
+
+    def prepare(scan: int, slot: int) -> tuple[int, int]:
+        assert slot not in busy
+        busy[slot] = scan
+        return scan, slot
+
+    def infer(ready: tuple[int, int]) -> int:
+        scan, slot = ready
+        assert busy.pop(slot) == scan
+        return scan
+
+    assert list(overlapped(range(200), prepare, infer, finish=lambda scan: scan)) == list(range(200))

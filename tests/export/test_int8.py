@@ -1,0 +1,109 @@
+"""An 8-bit bundle, from the checkpoint to boxes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import numpy_helper
+
+from asca_deploy import Bundle, Detector, load_bundle
+from asca_export import int8
+from asca_export.export import export_bundle
+from asca_pillars.errors import ExportError
+from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.scenes import make_scene
+
+CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
+
+
+def export_int8(folder: Path) -> Bundle:
+    checkpoint = tiny_checkpoint("channel")
+    spec = checkpoint.config.detector.with_score_threshold(0.02)  # random weights are never sure of anything
+    checkpoint = checkpoint._replace(config=replace(checkpoint.config, detector=spec))
+    return export_bundle(checkpoint, folder, SCANS, calibration=CALIBRATION)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("bundles") / "int8"
+    export_int8(made)
+    return made
+
+
+def test_the_bundle_says_what_it_is(folder: Path) -> None:
+    bundle = load_bundle(folder)
+    assert (bundle.name, bundle.precision, bundle.canvas.type) == ("tiny_int8", "int8", "uint8")
+    assert len(bundle.canvas.empty) == bundle.channels
+    assert any(bundle.canvas.empty), "attention makes features negative, so zero is not the lowest step"
+    report = bundle.quantization
+    assert report is not None and bundle.parity is not None
+    assert (report.calibration_scans, report.compared_scans) == (8, 8)
+    assert len(report.layers) == 6 + 3 + 1 and not any(layer.kept_float for layer in report.layers)
+    assert 0 < report.logit_rms_error <= int8.MAX_LOGIT_ERROR
+    assert report.boxes > 20 and report.boxes_matched > 0.9 * report.boxes
+    properties = [item.key for item in onnx.load(folder / "backbone.onnx").metadata_props]
+    assert {"spec", "layout", "license"} <= set(properties)
+
+
+def test_weights_are_7_bits_and_multiplications_8(folder: Path) -> None:
+    graph = onnx.load(folder / "backbone.onnx").graph
+    tensors = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    weights = {name: tensor for name, tensor in tensors.items() if tensor.dtype == np.int8 and tensor.ndim > 1}
+    assert len(weights) == 10
+    for name, weight in weights.items():
+        assert 60 < np.abs(weight.astype(int)).max() <= 64, name
+    assert not [name for name, tensor in tensors.items() if tensor.dtype == np.float32 and tensor.ndim > 1]
+
+
+def test_onnxruntime_computes_what_the_graph_says(folder: Path) -> None:
+    """Its 8-bit kernels against its float ones on the dequantized graph: saturation would differ by a lot."""
+    detector = Detector(folder)
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    plain = onnxruntime.InferenceSession(folder / "backbone.onnx", options, providers=["CPUExecutionProvider"])
+    for points in SCANS[:3]:
+        pillars = detector.pillarize(points)
+        canvas = detector.scatter(detector.encode(pillars), pillars.cells)
+        fast = detector.neck_and_head(canvas)
+        for name, maps in zip(("scores", "boxes", "directions"), fast, strict=True):
+            (expected,) = plain.run([name], {"canvas": canvas})
+            error = np.abs(np.moveaxis(expected[0], -1, 0) - maps)
+            # A tie between two steps may fall either way, and then a few values differ by what a step is worth.
+            assert np.sqrt(np.square(error).mean()) < 0.01 * expected.std(), name
+
+
+def test_an_empty_scan_and_a_frame_that_inherits_nothing(folder: Path) -> None:
+    detector = Detector(folder)
+    first = detector(SCANS[0])
+    detector(SCANS[1])
+    detector(np.empty((0, 4), np.float32))
+    again = detector(SCANS[0])
+    assert np.array_equal(first.boxes, again.boxes) and len(first) > 2
+
+
+def test_layers_that_hurt_stay_in_floating_point(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = load_bundle(folder).quantization
+    assert whole is not None
+    monkeypatch.setattr(int8, "MAX_LOGIT_ERROR", 0.8 * whole.logit_rms_error)
+    bundle = export_int8(tmp_path / "bundle")
+    report = bundle.quantization
+    assert report is not None and report.logit_rms_error <= 0.8 * whole.logit_rms_error
+    kept = [layer for layer in report.layers if layer.kept_float]
+    assert kept and max(layer.logit_rms_error for layer in kept) <= min(
+        layer.logit_rms_error for layer in report.layers if not layer.kept_float
+    )
+    # The runtime must not turn them into 8-bit ones behind our back.
+    detector = Detector(tmp_path / "bundle")
+    assert len(detector(SCANS[0])) > 2
+
+
+def test_scans_that_cannot_calibrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ExportError, match="7 scans given to calibrate on"):
+        export_bundle(tiny_checkpoint("none"), tmp_path / "a", SCANS, calibration=CALIBRATION[:7])
+    monkeypatch.setattr(int8, "MAX_LOGIT_ERROR", 0.0)
+    with pytest.raises(ExportError, match="an 8-bit canvas alone moves the class logits"):
+        export_bundle(tiny_checkpoint("none"), tmp_path / "b", SCANS, calibration=CALIBRATION)
+    assert not list(tmp_path.iterdir())

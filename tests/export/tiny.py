@@ -1,0 +1,30 @@
+"""A checkpoint small enough to be exported again and again, and scans for it."""
+
+import dataclasses
+
+import torch
+
+from asca_pillars.config import Config, NetworkConfig
+from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.detector import build_detector
+from tests.scenes import SPEC, make_scene
+
+NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
+SCANS = [make_scene(seed)[0] for seed in range(8)]
+
+
+def tiny_checkpoint(cpa: str, spec: DetectorSpec = SPEC) -> Checkpoint:
+    """Fresh random weights, with statistics and scores that differ from place to place."""
+    torch.manual_seed(1)
+    config = Config(name="tiny", detector=spec, network=dataclasses.replace(NETWORK, cpa=cpa))
+    detector = build_detector(config)
+    with torch.no_grad():
+        for name, buffer in detector.named_buffers():
+            if name.endswith("running_mean"):
+                buffer.normal_(0, 0.1)
+            elif name.endswith("running_var"):
+                buffer.uniform_(0.2, 1.0)
+        for head in (detector.head.scores, detector.head.boxes, detector.head.directions):
+            head.weight.normal_(0, 0.3)
+    return Checkpoint(config, detector.eval(), 0)
