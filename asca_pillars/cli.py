@@ -305,7 +305,9 @@ def export(
     ] = False,
     calibrate: Annotated[
         Path | None,
-        typer.Option(help="Scans that set the 8-bit ranges; 32 of them, evenly spaced. Default: simulated ones."),
+        typer.Option(
+            help="Folder of scans like those trained on, to calibrate with; 96, evenly spaced. Default: simulated ones."
+        ),
     ] = None,
 ) -> None:
     """Export to ONNX and prove on scans that the bundle is the same detector; fails if it is not.

@@ -206,6 +206,11 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     before = {spec.name: spec.score_threshold for spec in CONFIG.detector.classes}
     after = {spec["name"]: spec["score_threshold"] for spec in manifest["spec"]["classes"]}
     assert after == before | {"Pedestrian": 0.21}
+    assert "add --int8" in refusal(full(*export, "--calibrate", scans))
+    quantized = full(*export, "--int8", "--calibrate", scans)
+    assert quantized.returncode == 0, quantized.stderr
+    assert "calibrated on 8 scans" in quantized.stdout and "logit error" in quantized.stdout.lower()
+    assert json.loads((bundle / "bundle.json").read_text())["precision"] == "int8"
     detected = asca("detect", scans, "--bundle", bundle, "--out", tmp_path / "out")
     assert detected.returncode == 0, detected.stderr
     assert len(list((tmp_path / "out").glob("*.json"))) == 8

@@ -3,11 +3,12 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 from asca_deploy.bundle import Quantization
@@ -16,7 +17,9 @@ from asca_pillars.data.scans import find_scans, read_scan
 from asca_pillars.errors import ConfigError
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
-CALIBRATION_SCANS, CALIBRATION_SEED = 32, 2**31 + 1
+CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
+
+View = Literal["camera", "full"]
 
 
 def run(
@@ -40,7 +43,9 @@ def run(
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
     points = _scans(scans, console, PARITY_SCANS, PARITY_SEED)
-    calibration = _scans(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED) if int8 else None
+    # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
+    view: View = "camera" if loaded.config.data.camera_view else "full"
+    calibration = _scans(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
     environment = _environment(checkpoint)
     with console.status("Exporting") as status:
         bundle = export_bundle(
@@ -85,17 +90,20 @@ def _score(text: str) -> tuple[str, float]:
         raise ConfigError(f"--score {text}: write a class and its score, such as Car=0.35") from None
 
 
-def _scans(folder: Path | None, console: Console, most: int, seed: int) -> list[NDArray[np.float32]]:
+def _scans(
+    folder: Path | None, console: Console, most: int, seed: int, view: View = "full"
+) -> list[NDArray[np.float32]]:
     """Scans of a folder, evenly spaced if there are more than `most`; without a folder simulated ones."""
     if folder is not None:
         paths = find_scans(folder)
         chosen = paths if len(paths) <= most else [paths[i * len(paths) // most] for i in range(most)]
         return [read_scan(path).points for path in chosen]
     require("sim")
-    from asca_pillars.sim.simulate import simulate_frame
+    from asca_pillars.sim.simulate import SimulationConfig, simulate_frame
 
-    with console.status(f"Simulating {most} scans"):
-        return [simulate_frame(seed, index).points for index in range(most)]
+    config = SimulationConfig(field_of_view=view)
+    frames = track(range(most), f"Simulating {most} scans", console=console, transient=True)
+    return [simulate_frame(seed, index, config).points for index in frames]
 
 
 def _environment(checkpoint: Path) -> dict[str, Any]:

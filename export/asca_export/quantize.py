@@ -29,8 +29,8 @@ HEAD = "head"
 STEPS = 255
 WEIGHT_STEPS = 64
 EMPTY_SIZE = 256  # pillars to a side; the deepest convolution of the paper's neck sees 99 of them
-PLACES = 2000  # of each scan and layer, whose inputs weights are rounded for
-_DAMPING = 0.01  # of the moments' mean diagonal, so that inputs that hardly ever move do not blow up
+PLACES = 8000  # of each scan and layer, whose inputs weights are rounded for
+_DAMPING = 0.001  # of the moments' mean diagonal, so that inputs that hardly ever move do not blow up
 _SHRINK = 0.95  # a range may lose this much of its end where that spares it coarser steps
 _TINY = 1e-6
 

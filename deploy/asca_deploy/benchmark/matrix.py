@@ -57,7 +57,7 @@ def measure_matrix(
     ways = [way for bundle in bundles for way in _ways(bundle)]
     for number in track(len(ways), "opening"):
         way = ways[number]
-        # A provider that is not there at all is one row, not one for each precision and number of threads.
+        # What does not run with so many threads does not with others, and is one row.
         if not any(isinstance(result, str) and _same_but_threads(way, other) for other, result in opened.items()):
             opened[way] = _open(bundles[way.bundle], way, scans[0])
     detectors = {str(way): detector for way, detector in opened.items() if isinstance(detector, Detector)}
@@ -82,8 +82,8 @@ def _ways(bundle: str) -> list[Way]:
 
 
 def _same_but_threads(way: Way, failed: Way) -> bool:
-    """Would `way` fail for the same reason: another number of threads, or less precision where float32 fails."""
-    return way[:2] == failed[:2] and failed.precision in ("float32", way.precision)
+    """Would `way` fail for the same reason; with TensorRT float32 may fail where fewer digits run."""
+    return way[:3] == failed[:3]
 
 
 def _open(folder: Path, way: Way, scan: NDArray[np.float32]) -> Detector | str:
