@@ -69,6 +69,9 @@ def main(
             with console.status("Exporting, which compares the boxes too"):
                 export_bundle(model, bundle, proof, calibration=proof if int8 else None)
         runtime = Detector(bundle, provider=provider, precision=precision, threads=threads)
+        if (report := runtime.bundle.quantization) is not None:
+            kept = sum(layer.kept_float for layer in report.layers)
+            console.print(f"{len(report.layers) - kept} of {len(report.layers)} layers in 8 bits")
         forms = _forms(model)
         for name, form in forms.items():
             difference, spread = map_difference(runtime, form, points)

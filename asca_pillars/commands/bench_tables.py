@@ -75,8 +75,8 @@ def matrix_table(rows: Sequence[MatrixRow]) -> Table:
 
 
 def matrix_reasons(rows: Sequence[MatrixRow]) -> list[str]:
-    """One line for each way that cannot run here."""
-    return [f"{row.way.bundle}, {row.way.provider}, {row.way.precision}: {row.reason}" for row in rows if row.reason]
+    """Why ways do not run, each reason once: it is the same for every bundle."""
+    return list(dict.fromkeys(f"not {row.way.provider} {row.way.precision}: {row.reason}" for row in rows if row.reason))
 
 
 def scaling_table(rows: Sequence[ScalingRow]) -> Table:
