@@ -76,7 +76,9 @@ def matrix_table(rows: Sequence[MatrixRow]) -> Table:
 
 def matrix_reasons(rows: Sequence[MatrixRow]) -> list[str]:
     """Why ways do not run, each reason once: it is the same for every bundle."""
-    return list(dict.fromkeys(f"not {row.way.provider} {row.way.precision}: {row.reason}" for row in rows if row.reason))
+    return list(
+        dict.fromkeys(f"not {row.way.provider} {row.way.precision}: {row.reason}" for row in rows if row.reason)
+    )
 
 
 def scaling_table(rows: Sequence[ScalingRow]) -> Table:

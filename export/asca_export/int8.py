@@ -49,6 +49,16 @@ class _Encoded(NamedTuple):
     cells: NDArray[np.int64]
 
 
+class _Sensitivity(NamedTuple):
+    """What came out of the sweep over the layers; errors are those of `_logit_error`."""
+
+    alone: dict[str, float]
+    """With all layers in 8 bits but this one."""
+    kept_float: list[str]
+    total: float
+    """Without those that are kept in floating point."""
+
+
 def quantize_bundle(
     folder: Path,
     bundle: Bundle,
@@ -62,32 +72,33 @@ def quantize_bundle(
     Args:
         folder: a proven float bundle.
         detector: what it was exported from, in evaluation mode.
-        calibration: at least MIN_CALIBRATION scans (N, 4) that set the ranges.
+        calibration: scans (N, 4) that set the ranges, at least MIN_CALIBRATION of them with points on the grid.
         scans: others, to measure on.
         say: told what is being done.
 
     Raises:
-        ExportError: too few scans, or the canvas alone costs more than MAX_LOGIT_ERROR.
+        ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
     """
-    if len(calibration) < MIN_CALIBRATION:
-        raise ExportError(f"{len(calibration)} scans given to calibrate on, at least {MIN_CALIBRATION} are needed")
-    say("Calibrating")
     runtime = Detector(folder)
-    encoded = [_encode(runtime, points) for points in calibration]
-    compared = [_encode(runtime, points) for points in scans]
-    expected = [_maps(runtime, each) for each in compared]
-    boxes = [runtime(points) for points in scans]
+    encoded = [each for each in (_encode(runtime, points) for points in calibration) if len(each.cells)]
+    if len(encoded) < MIN_CALIBRATION:
+        raise ExportError(
+            f"{len(encoded)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are needed"
+        )
+    say("Calibrating")
     steps = canvas_steps(each.features for each in encoded)
     form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
-    backbone = FastBackbone(detector, steps).eval()
-    scale_to_steps(backbone, _canvases(encoded, bundle, form, steps), steps)
+    rounded = FastBackbone(detector, steps).eval()
+    scale_to_steps(rounded, _canvases(encoded, bundle, form, steps), steps)
     say("Rounding the weights")
-    moments = input_moments(backbone, _canvases(encoded, bundle, form, steps), steps)
-    layers = layer_names(backbone)
-    exact, rounded = copy.deepcopy(backbone), backbone
+    moments = input_moments(rounded, _canvases(encoded, bundle, form, steps), steps)
+    exact, layers = copy.deepcopy(rounded), layer_names(rounded)
     round_weights(exact, [], moments)
     round_weights(rounded, layers, moments)
 
+    compared = [_encode(runtime, points) for points in scans]
+    expected = [runtime.neck_and_head(runtime.scatter(*each)) for each in compared]
+    boxes = [runtime(points) for points in scans]
     with tempfile.TemporaryDirectory() as work:
         template, trial = Path(work) / "template.onnx", Path(work) / "trial.onnx"
         graphs.export_backbone(exact, detector.grid, template)
@@ -100,35 +111,20 @@ def quantize_bundle(
             logits = (session.run({"canvas": canvas}, ["scores"])[0] for canvas in canvases)
             return _logit_error(expected, logits, len(bundle.spec.classes))
 
-        total = error_of(layers)
-        alone = {}
-        for number, layer in enumerate(layers, start=1):
-            say(f"Sensitivity of layer {number} of {len(layers)}")
-            alone[layer] = error_of([other for other in layers if other != layer])
-        kept: list[str] = []
-        for layer in sorted(layers, key=alone.__getitem__):
-            if total <= MAX_LOGIT_ERROR:
-                break
-            kept.append(layer)
-            total = error_of([other for other in layers if other not in kept])
-        if total > MAX_LOGIT_ERROR:
-            raise ExportError(
-                f"an 8-bit canvas alone moves the class logits by {total:.3g}, more than {MAX_LOGIT_ERROR}; "
-                "calibrate on scans like those trained on"
-            )
-        eight_bit = [layer for layer in layers if layer not in kept]
+        found = _sweep(layers, error_of, say)
+        eight_bit = [layer for layer in layers if layer not in found.kept_float]
         qdq.quantize_backbone(template, folder / BACKBONE, eight_bit, _parameters(exact, rounded, eight_bit))
     qdq.quantize_encoder(folder / ENCODER, steps)
     report = Quantization(
-        calibration_scans=len(calibration),
+        calibration_scans=len(encoded),
         compared_scans=len(scans),
-        layers=tuple(LayerQuantization(layer, alone[layer], layer in kept) for layer in layers),
-        logit_rms_error=total,
+        layers=tuple(LayerQuantization(name, found.alone[name], name in found.kept_float) for name in layers),
+        logit_rms_error=found.total,
         boxes=sum(map(len, boxes)),
         boxes_matched=0,
         boxes_added=0,
     )
-    quantized = replace(
+    draft = replace(
         bundle,
         name=f"{bundle.name}_int8",
         precision="int8",
@@ -136,25 +132,44 @@ def quantize_bundle(
         graphs=Graphs.of(folder),
         quantization=report,
     )
-    write_bundle_manifest(folder, quantized)
-    found = list(map(Detector(folder), scans))
-    matched = sum(_partnered(float_boxes, int8_boxes) for float_boxes, int8_boxes in zip(boxes, found, strict=True))
-    added = sum(
-        len(int8_boxes) - _partnered(int8_boxes, float_boxes)
-        for float_boxes, int8_boxes in zip(boxes, found, strict=True)
-    )
-    quantized = replace(quantized, quantization=replace(report, boxes_matched=matched, boxes_added=added))
+    write_bundle_manifest(folder, draft)
+    quantized = replace(draft, quantization=_count_boxes(report, boxes, list(map(Detector(folder), scans))))
     write_bundle_manifest(folder, quantized)
     return quantized
+
+
+def _sweep(
+    layers: Sequence[str], error_of: Callable[[Sequence[str]], float], say: Callable[[str], None]
+) -> _Sensitivity:
+    """Try every layer in floating point, and keep the most harmful ones so until the error is small enough."""
+    total, alone = error_of(layers), {}
+    for number, layer in enumerate(layers, start=1):
+        say(f"Sensitivity of layer {number} of {len(layers)}")
+        alone[layer] = error_of([other for other in layers if other != layer])
+    kept: list[str] = []
+    for layer in sorted(layers, key=alone.__getitem__):
+        if total <= MAX_LOGIT_ERROR:
+            break
+        kept.append(layer)
+        total = error_of([other for other in layers if other not in kept])
+    if total > MAX_LOGIT_ERROR:
+        raise ExportError(
+            f"an 8-bit canvas alone moves the class logits by {total:.3g}, more than {MAX_LOGIT_ERROR}; "
+            "calibrate on scans like those trained on"
+        )
+    return _Sensitivity(alone, kept, total)
+
+
+def _count_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
+    """The report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
+    matched = sum(map(_partnered, expected, found))
+    added = sum(map(len, found)) - sum(map(_partnered, found, expected))
+    return replace(report, boxes_matched=matched, boxes_added=added)
 
 
 def _encode(runtime: Detector, points: Points) -> _Encoded:
     pillars = runtime.pillarize(points)
     return _Encoded(runtime.encode(pillars), pillars.cells)
-
-
-def _maps(runtime: Detector, encoded: _Encoded) -> HeadMaps[NDArray[np.float32]]:
-    return runtime.neck_and_head(runtime.scatter(*encoded))
 
 
 def _canvases(

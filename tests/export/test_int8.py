@@ -101,8 +101,9 @@ def test_layers_that_hurt_stay_in_floating_point(folder: Path, tmp_path: Path, m
 
 
 def test_scans_that_cannot_calibrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ExportError, match="7 scans given to calibrate on"):
-        export_bundle(tiny_checkpoint("none"), tmp_path / "a", SCANS, calibration=CALIBRATION[:7])
+    nothing = np.full((5, 4), 500.0, np.float32)  # nowhere on the grid
+    with pytest.raises(ExportError, match="7 scans with points on the grid given to calibrate on"):
+        export_bundle(tiny_checkpoint("none"), tmp_path / "a", SCANS, calibration=[*CALIBRATION[:7], nothing])
     monkeypatch.setattr(int8, "MAX_LOGIT_ERROR", 0.0)
     with pytest.raises(ExportError, match="an 8-bit canvas alone moves the class logits"):
         export_bundle(tiny_checkpoint("none"), tmp_path / "b", SCANS, calibration=CALIBRATION)
