@@ -19,11 +19,11 @@ from rich.table import Table
 
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.boxes import box_difference
+from asca_export.parity import COMPARED_ANCHORS
 from asca_pillars.data.scans import find_scans, read_scan
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.decode import HeadMaps
 
-COMPARED_ANCHORS = 100  # best of each class and scan: where boxes come from
 ROWS = (
     "class logits of the best anchors, rms",
     "class logits, rms",

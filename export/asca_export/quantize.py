@@ -137,14 +137,19 @@ def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Mome
 
 
 def _round_together(weight: Tensor, squares: Tensor) -> Tensor:
-    """(outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output, so that the outputs change little."""
-    unit = weight.abs().amax(dim=1).clamp_min(_TINY) / WEIGHT_STEPS
+    """(outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output, so that the outputs change little.
+
+    The largest weight of an output stays at the end of its grid, from which the graph's writer takes the grid's unit.
+    """
+    largest, peak = weight.abs().max(dim=1)
+    unit = largest.clamp_min(_TINY) / WEIGHT_STEPS
     damping = _DAMPING * squares.diagonal().mean().clamp_min(_TINY)
     inverse = torch.linalg.inv(squares.double() + damping * torch.eye(len(squares)))
     factor = torch.linalg.cholesky(inverse, upper=True).float()
     left, rounded = weight.clone(), torch.empty_like(weight)
     for k in range(weight.shape[1]):
-        rounded[:, k] = (left[:, k] / unit).round().clamp(-WEIGHT_STEPS, WEIGHT_STEPS) * unit
+        whole = (left[:, k] / unit).round().clamp(-WEIGHT_STEPS, WEIGHT_STEPS)
+        rounded[:, k] = torch.where(peak == k, weight[:, k].sign() * WEIGHT_STEPS, whole) * unit
         lost = (left[:, k] - rounded[:, k]) / factor[k, k]
         left[:, k:] -= lost[:, None] * factor[k, k:]
     return rounded

@@ -106,7 +106,8 @@ def test_rounded_weights_lie_on_the_grid_and_empty_space_keeps_its_values(
         before = before.T if name == "head" else before.flatten(1)
         units = by_output / before.abs().amax(dim=1, keepdim=True) * WEIGHT_STEPS
         torch.testing.assert_close(units, units.round(), atol=1e-3, rtol=0)
-        assert units.abs().max() <= WEIGHT_STEPS + 1e-3
+        # Were an output's largest weight smaller, the writer of the graph would round its weights to another grid.
+        torch.testing.assert_close(units.abs().amax(dim=1), torch.full((len(units),), float(WEIGHT_STEPS)))
     canvas = steps.empty.expand(1, 257, 257, -1)
     exact, ours = _outputs(backbone, canvas), _outputs(rounded, canvas)
     for name in exact:
