@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 import yaml
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.pillars.spec import DetectorSpec
 from asca_pillars.schema import Strict, parse
 
 T = TypeVar("T")

@@ -25,14 +25,13 @@ from rich.progress import track
 
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import compare
-from asca_export.export import MIN_SCANS, export_bundle
+from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.commands.bench_tables import comparison_table
-from asca_pillars.data.scans import find_scans, read_scan
-from asca_pillars.environment import package_versions
+from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.machine import cpu_model, default_threads
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.system import cpu_model, default_threads, package_versions
 from benchmarks.padded import PaddedDetector
 from benchmarks.random_weights import random_weights
 

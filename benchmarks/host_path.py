@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from asca_deploy import Bundle, default_bundle_path, load_bundle, sample_scan_path
 from asca_deploy.detector import _finite_points
 from asca_deploy.input_check import check_input
-from asca_pillars.data.scans import read_scan
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.overlap import rotated_nms
-from asca_pillars.machine import cpu_model
+from asca_pillars.system import cpu_model
 
 CAMERA_VIEW = 0.84, 0.25  # |y| / x and |z| / x: about what KITTI's camera 2 sees
 DISTURBANCE = np.zeros(4 << 20, np.float32)  # 16 MB

@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asca_deploy import Detector, sample_scan_path
-from asca_deploy.benchmark.memory import peak_memory_mib, resident_mib
-from asca_pillars.data.scans import read_scan
+from asca_deploy.benchmark.resident_memory import peak_memory_mib, resident_mib
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.files import atomic_path
 

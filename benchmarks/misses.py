@@ -14,10 +14,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from asca_pillars.evaluation.kitti import CLASS_NAMES
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
+from asca_pillars.evaluation.kitti.states import is_type
+from asca_pillars.evaluation.kitti.verdicts import Scene, judge
 from asca_pillars.evaluation.report import markdown_table
-from asca_pillars.evaluation.states import is_type
-from asca_pillars.evaluation.verdicts import Scene, judge
 from benchmarks.transfer import FOUND_IOU, read_evaluation
 
 DISTANCES_M = (0, 15, 25, 40, 80)

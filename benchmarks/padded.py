@@ -14,9 +14,9 @@ from torch import Tensor
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.pillarize import FEATURES, Pillars
-from asca_pillars.geometry.spec import DetectorSpec
-from asca_pillars.models.detector import PillarDetector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillars.pillarize import FEATURES, Pillars
+from asca_pillars.pillars.spec import DetectorSpec
 
 
 @dataclass(frozen=True)

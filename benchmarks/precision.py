@@ -18,9 +18,9 @@ from rich.progress import track
 from rich.table import Table
 
 from asca_deploy import Detector, sample_scan_path
-from asca_deploy.benchmark.boxes import box_difference
+from asca_deploy.benchmark.box_differences import box_difference
 from asca_export.parity import COMPARED_ANCHORS
-from asca_pillars.data.scans import find_scans, read_scan
+from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.decode import HeadMaps
 

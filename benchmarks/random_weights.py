@@ -17,11 +17,11 @@ from rich.console import Console
 from torch import nn
 
 from asca_deploy import sample_scan_path
-from asca_export.export import MIN_SCANS, export_bundle
+from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.config import load_config
-from asca_pillars.data.scans import read_scan
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.detector import batch_pillars, build_detector
+from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_detector
 
 
 def main(

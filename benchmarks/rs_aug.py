@@ -34,13 +34,13 @@ from shapely.geometry import MultiPoint, Polygon
 
 from asca_pillars.config import Config, load_config
 from asca_pillars.data.frames import LabeledFrame, in_grid, read_frame
-from asca_pillars.data.free_space import FreeSpace
-from asca_pillars.data.insertion import insert_objects, prepare_inserter
+from asca_pillars.data.insertion.free_space import FreeSpace
+from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
-from asca_pillars.drawing import BACKGROUND
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
+from asca_pillars.pictures.drawing import BACKGROUND
+from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_layers, write_png
 from asca_pillars.schema import parse
-from asca_pillars.visualize import BoxLayer, class_color, draw_layers, write_png
 
 METHODS = {"gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}
 MAX_HEIGHT_ERROR_M = 0.2
@@ -144,7 +144,7 @@ def _truths(data: Path) -> tuple[int, Any] | None:
     path = data / "simulation.json"
     if not path.exists():
         return None
-    from asca_pillars.sim.simulate import SimulationConfig
+    from asca_pillars.sim.simulation import SimulationConfig
 
     found = json.loads(path.read_text(encoding="utf-8"))
     return found.pop("seed"), parse(SimulationConfig, found, str(path)).scene
@@ -152,7 +152,7 @@ def _truths(data: Path) -> tuple[int, Any] | None:
 
 def _stand(tally: Tally, inserted: NDArray[np.float32], truths: tuple[int, Any], index: int) -> None:
     """Count which of the objects stand on true ground, see the top of the file."""
-    from asca_pillars.sim.scene import draw_scene
+    from asca_pillars.sim.world.scene import draw_scene
 
     seed, config = truths
     scene = draw_scene(config, np.random.default_rng([seed, index, 0]))
@@ -169,7 +169,7 @@ def _stand(tally: Tally, inserted: NDArray[np.float32], truths: tuple[int, Any],
 
 
 def _is_street_or_flat(box: NDArray[np.float64], ground: Any) -> bool:
-    from asca_pillars.sim.groundcast import VERGE, ground_material
+    from asca_pillars.sim.casting.groundcast import VERGE, ground_material
 
     xy = _spread(box)
     verge = np.array([ground_material(x, y, ground.shape) == VERGE for x, y in xy])

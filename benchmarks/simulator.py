@@ -23,12 +23,12 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.data.kitti import in_image
-from asca_pillars.sim.labels import make_labels
-from asca_pillars.sim.raycast import cast
-from asca_pillars.sim.returns import measure
-from asca_pillars.sim.scene import build, draw_scene
-from asca_pillars.sim.sensor import draw_firings
-from asca_pillars.sim.simulate import SimulationConfig, simulate_frame
+from asca_pillars.sim.annotation import make_labels
+from asca_pillars.sim.casting.raycast import cast
+from asca_pillars.sim.sensor.lidar import draw_firings
+from asca_pillars.sim.sensor.returns import measure
+from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
+from asca_pillars.sim.world.scene import build, draw_scene
 
 STAGES = ("scene", "bodies", "cast", "returns", "labels", "frame")
 VIEWS: tuple[Literal["camera", "full"], ...] = ("camera", "full")

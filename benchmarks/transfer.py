@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.evaluation.kitti import CLASS_NAMES
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.operating_point import OperatingPoint, best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU

@@ -16,10 +16,10 @@ import yaml
 
 from asca_deploy import Detector, sample_scan_path
 from asca_pillars.data.kitti import KittiSplit, read_labels
-from asca_pillars.data.scans import read_scan, write_scan
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.schema import to_dict
 from tests.scenes import make_scene, write_dataset
-from tests.test_training import CONFIG
+from tests.training.test_loop import CONFIG
 
 WITHOUT_TORCH = """
 import sys

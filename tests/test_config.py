@@ -22,7 +22,7 @@ from asca_pillars.config import (
 )
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ClassSpec
-from asca_pillars.models.detector import build_detector
+from asca_pillars.models.pillar.pillar_detector import build_detector
 from asca_pillars.schema import parse, to_dict
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))

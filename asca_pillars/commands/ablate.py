@@ -11,16 +11,15 @@ from rich.console import Console
 from rich.markdown import Markdown
 from rich.progress import track
 
-from asca_pillars.ablation import VARIANTS, Run, Variant, evaluate_runs, runs, train_runs
-from asca_pillars.ablation_table import Speed, read_results, tables
+from asca_pillars.ablation.ablation_table import Speed, read_results, tables
+from asca_pillars.ablation.variants import VARIANTS, Run, Variant, evaluate_runs, runs, train_runs
 from asca_pillars.commands import prepare
 from asca_pillars.commands.extras import require
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.environment import command_line, package_versions
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path
-from asca_pillars.machine import cpu_model, default_threads
 from asca_pillars.schema import to_dict
+from asca_pillars.system import command_line, cpu_model, default_threads, package_versions
 
 TIMED_ROUNDS = 10
 
@@ -93,7 +92,7 @@ def _speeds(todo: Sequence[Run], data: Path, console: Console) -> dict[str, Spee
     """Export one checkpoint of every variant and time them in alternation on the same scans."""
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
-    from asca_export.export import MIN_SCANS, export_bundle
+    from asca_export.exporter import MIN_SCANS, export_bundle
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.checkpoint import load_checkpoint
 

@@ -26,7 +26,7 @@ from asca_deploy.benchmark import (
 )
 from asca_deploy.benchmark.matrix import ON_THE_CPU
 from asca_pillars.commands import bench_tables as show
-from asca_pillars.data.scans import find_scans, read_scan
+from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.files import atomic_path
 

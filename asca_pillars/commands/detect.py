@@ -16,9 +16,9 @@ from rich.table import Table
 from asca_deploy import Detections, Detector, FrameReport, sample_scan_path
 from asca_deploy.auto import summary
 from asca_pillars.data.kitti import Calibration, objects_from_boxes, read_calibration, write_labels
-from asca_pillars.data.scans import find_scans, read_scan
+from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.files import atomic_path
-from asca_pillars.visualize import draw_bev, draw_on_image, write_png
+from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
 
 TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
 

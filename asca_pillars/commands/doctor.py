@@ -10,9 +10,8 @@ from asca_deploy import Detector, default_bundle_path, openvino_session
 from asca_deploy.auto import summary
 from asca_deploy.providers import AUTO, PROVIDERS, require
 from asca_pillars.commands.extras import EXTRAS, missing_modules
-from asca_pillars.environment import package_versions
 from asca_pillars.errors import AscaError
-from asca_pillars.machine import cpu_model
+from asca_pillars.system import cpu_model, package_versions
 
 
 def run() -> None:

@@ -13,17 +13,17 @@ from rich.console import Console
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.environment import describe_environment
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.kitti import CLASS_NAMES, DIFFICULTIES, evaluate
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
+from asca_pillars.evaluation.kitti.verdicts import verdicts
 from asca_pillars.evaluation.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
-from asca_pillars.evaluation.verdicts import verdicts
 from asca_pillars.files import atomic_directory, atomic_path
-from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.system import describe_environment
 
 TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
 GALLERY = 8

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from asca_deploy.bundle import Quantization
 from asca_pillars.commands.extras import require
-from asca_pillars.data.scans import find_scans, read_scan
+from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.errors import ConfigError
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
@@ -33,7 +33,7 @@ def run(
 ) -> None:
     """See `asca export --help`."""
     require("train")
-    from asca_export.export import export_bundle
+    from asca_export.exporter import export_bundle
     from asca_pillars.models.checkpoint import load_checkpoint
 
     console = Console(markup=False)
@@ -99,7 +99,7 @@ def _scans(
         chosen = paths if len(paths) <= most else [paths[i * len(paths) // most] for i in range(most)]
         return [read_scan(path).points for path in chosen]
     require("sim")
-    from asca_pillars.sim.simulate import SimulationConfig, simulate_frame
+    from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
 
     config = SimulationConfig(field_of_view=view)
     frames = track(range(most), f"Simulating {most} scans", console=console, transient=True)

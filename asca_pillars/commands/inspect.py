@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.config import Config, load_config
-from asca_pillars.data.findings import findings
 from asca_pillars.data.frames import NEIGHBOR_TYPES
-from asca_pillars.data.inspection import ClassFacts, Inspection, Spread, inspect_dataset
+from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread, inspect_dataset
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asca_deploy import Detections, Detector
 from asca_pillars.commands.extras import require
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.pillars.spec import DetectorSpec
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
     import torch
 
     from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.models.inference import ScanDetector
+    from asca_pillars.models.scan_detector import ScanDetector
 
     if threads is not None and threads < 1:
         raise ConfigError(f"threads {threads} must be at least 1")

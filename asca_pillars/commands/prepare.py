@@ -14,8 +14,8 @@ def run(config: Path, data: Path, overrides: list[str], workers: int) -> None:
 
     settings = load_config(config, overrides)
     require("train")
-    from asca_pillars.data.free_maps import prepare_free_spaces
-    from asca_pillars.data.insertion import prepare_inserter
+    from asca_pillars.data.insertion.free_maps import prepare_free_spaces
+    from asca_pillars.data.insertion.insert_objects import prepare_inserter
     from asca_pillars.data.kitti import KittiSplit
 
     insert = settings.augment.insert

@@ -23,8 +23,8 @@ def run(
     require("sim")
     if report:
         require("eval")
-    from asca_pillars.sim.config_files import load_simulation_config
-    from asca_pillars.sim.simulate import simulate
+    from asca_pillars.sim.simulation import simulate
+    from asca_pillars.sim.simulation_configs import load_simulation_config
 
     console = Console(markup=False)
     config = load_simulation_config(config_path, view)
@@ -39,9 +39,9 @@ def run(
 def _report(out: Path, console: Console) -> None:
     """Compare the frames below `out` with KITTI; print the tables and write them, and the plots, to out/report/."""
     from asca_pillars.sim.report.comparison import compare
-    from asca_pillars.sim.report.measuring import measure
+    from asca_pillars.sim.report.measured import measure
     from asca_pillars.sim.report.plots import write_plots
-    from asca_pillars.sim.report.statistics import kitti_reference
+    from asca_pillars.sim.report.reference import kitti_reference
     from asca_pillars.sim.report.tables import print_comparison, write_report
 
     reference = kitti_reference()

@@ -15,7 +15,7 @@ def run(
 
     settings = load_config(config, overrides)
     require("train")
-    from asca_pillars.training import train
+    from asca_pillars.training.loop import train
 
     last = train(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)
     Console(markup=False).print(f"Trained: {last}\nNext: asca export {last} -o {out / 'bundle'}")

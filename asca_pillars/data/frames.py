@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image
-from asca_pillars.data.scans import read_scan
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.pillars.grid import PillarGrid
 
 # What KITTI's protocol treats as neither right nor wrong for a class.
 NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from asca_pillars.evaluation.kitti import DIFFICULTIES, Curve, KittiResults
+from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, Curve, KittiResults
 from asca_pillars.files import atomic_path
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image, read_labels
-from asca_pillars.data.scans import read_scan
-from asca_pillars.drawing import Color, Image
-from asca_pillars.evaluation.verdicts import Verdict
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.evaluation.kitti.verdicts import Verdict
 from asca_pillars.files import atomic_path
-from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.visualize import BoxLayer, draw_layers, draw_on_image, write_png
+from asca_pillars.pictures.drawing import Color, Image
+from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, write_png
+from asca_pillars.pillars.grid import PillarGrid
 
 INDEX = "index.md"
 _INTRODUCTION = """# {title}: worst frames

@@ -15,10 +15,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from asca_pillars.evaluation.kitti import DIFFICULTIES
-from asca_pillars.evaluation.objects import FrameObjects
-from asca_pillars.evaluation.pairs import Frames
-from asca_pillars.evaluation.verdicts import Scene, Verdict, judge
+from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES
+from asca_pillars.evaluation.kitti.objects import FrameObjects
+from asca_pillars.evaluation.kitti.pairs import Frames
+from asca_pillars.evaluation.kitti.verdicts import Scene, Verdict, judge
 
 Z_95 = 1.959964  # what a standard normal variable exceeds in 2.5 % of all cases
 

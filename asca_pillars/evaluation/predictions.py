@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_pillars.data.kitti import KittiSplit, in_image, objects_from_boxes, read_labels, write_labels
-from asca_pillars.data.scans import read_scan
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import DatasetError
-from asca_pillars.evaluation.objects import FrameObjects, frame_objects
+from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
 from asca_pillars.geometry.detections import Detections
 
 KITTI_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")

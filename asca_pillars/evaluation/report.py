@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.evaluation.kitti import DIFFICULTIES, METRICS, Curve, KittiEvaluation, KittiResults
+from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, Curve, KittiEvaluation, KittiResults
 from asca_pillars.evaluation.operating_point import OperatingPoint
 from asca_pillars.evaluation.predictions import ScoredFrames
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.pillars.grid import PillarGrid
 
 ANCHOR_YAWS_RAD = (0.0, math.pi / 2)
 

@@ -1,40 +1,28 @@
-"""How `kernels_pillars` and `kernels_overlap` are compiled by numba.
-
-The compiled functions take memory made by NumPy and have their signatures written out: that takes a quarter off the
-time to compile, and all of it is spent when they are imported, once per machine (numba's cache keeps the result).
-`nogil` lets other threads run meanwhile; nothing is `parallel`, because the network owns the cores.
-"""
+"""Whether numba runs the loops of `pillarize` and `rotated_nms`, or NumPy."""
 
 from collections.abc import Callable
-from typing import Any
-
-import numba
-from numba import types
-
-# NumPy's division, which does not look out for zeros; no entry for C programs.
-_PLAIN = {"error_model": "numpy", "no_cfunc_wrapper": True}
-
-inner = numba.njit(no_cpython_wrapper=True, **_PLAIN)
-"""Decorates what is called by compiled functions of the same file alone."""
+from functools import cache
+from typing import Any, NamedTuple
 
 
-def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: compiled for arguments of these types, cached where a folder for it can be written."""
+class Kernels(NamedTuple):
+    """Compiled forms of the functions of these names (with an underscore) in `pillarize` and `overlap`."""
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        try:
-            return numba.njit(arguments, cache=True, nogil=True, **_PLAIN)(function)
-        except RuntimeError:  # no such folder: each process compiles for two seconds, and is then as fast as others
-            return numba.njit(arguments, nogil=True, **_PLAIN)(function)
-
-    return decorate
+    sort_points: Callable[..., Any]
+    fill_pillars: Callable[..., Any]
+    suppress: Callable[..., Any]
 
 
-def given(dtype: Any, axes: int = 1) -> Any:
-    """Type of an array that is only read."""
-    return types.Array(dtype, axes, "C", readonly=True)
+@cache
+def load_kernels() -> Kernels | None:
+    """The compiled forms, or None where numba is not installed or does not fit the NumPy beside it.
 
-
-def written(dtype: Any, axes: int = 1) -> Any:
-    """Type of an array that is written: results, or room to work in."""
-    return types.Array(dtype, axes, "C")
+    Without them the results are the same and a full scan takes some milliseconds more. The first call of a process
+    imports numba and takes a few tenths of a second; the very first one on a machine compiles, two seconds.
+    """
+    try:
+        from asca_pillars.geometry import overlap_kernels as kernels_overlap
+        from asca_pillars.pillars import pillar_kernels as kernels_pillars
+    except ImportError:
+        return None
+    return Kernels(kernels_pillars.sort_points, kernels_pillars.fill_pillars, kernels_overlap.suppress)

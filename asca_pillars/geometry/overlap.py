@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.compiled import load_kernels
+from asca_pillars.geometry.kernels import load_kernels
 
 _Boxes = NDArray[np.floating[Any]]
 _Doubles = NDArray[np.float64]

@@ -7,7 +7,7 @@ import torch
 
 from asca_pillars.config import Config
 from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.models.detector import PillarDetector, build_detector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_detector
 from asca_pillars.schema import parse
 
 

@@ -12,7 +12,7 @@ from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.pillars.spec import DetectorSpec
 
 REFERENCE = ("cpu", "float32")
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.schema import Strict
 
 

@@ -17,13 +17,13 @@ from asca_deploy.graph import Graph, Tensor
 from asca_deploy.input_check import check_input
 from asca_deploy.ort_session import OrtSession, check_onnxruntime
 from asca_deploy.stream import overlapped
-from asca_pillars.data.scans import read_scan
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError, ScanError
-from asca_pillars.geometry.compiled import load_kernels
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.pillarize import FEATURES, PillarCounts, Pillars
-from asca_pillars.machine import default_threads
+from asca_pillars.geometry.kernels import load_kernels
+from asca_pillars.pillars.pillarize import FEATURES, PillarCounts, Pillars
+from asca_pillars.system import default_threads
 
 Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 

@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 
-from asca_pillars.geometry.pillarize import PillarCounts
+from asca_pillars.pillars.pillarize import PillarCounts
 
 STAGES = ("input", "pillarize", "encode", "scatter", "neck+head", "decode")
 GRAPHS = ("encode", "neck+head")  # the stages that are a network's; the others are ours

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.pillarize import PillarCounts
 from asca_pillars.geometry.sensor_height import TOLERANCE_M, ground_z_m
+from asca_pillars.pillars.pillarize import PillarCounts
 from asca_pillars.schema import Strict
 
 OUTSIDE_SHARE = 0.95

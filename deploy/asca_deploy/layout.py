@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD
-from asca_pillars.geometry.pillarize import FEATURES
-from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.pillars.pillarize import FEATURES
+from asca_pillars.pillars.spec import DetectorSpec
 
 _SAME_M = 1e-6
 

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from asca_pillars.models.detector import PillarDetector
-from asca_pillars.models.head import SSDHead
+from asca_pillars.models.pillar.head import SSDHead
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 
 # What one step of an 8-bit tensor counts for in the graph: any number would do but one, which OpenVINO leaves out and
 # then takes the tensor for a float.

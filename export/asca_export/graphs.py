@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.geometry.pillarize import FEATURES
-from asca_pillars.models.detector import PillarDetector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillarize import FEATURES
 
 OPSET = 20
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max

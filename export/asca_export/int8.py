@@ -31,7 +31,7 @@ from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.models.detector import PillarDetector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 
 MIN_CALIBRATION = 8
 # Of the class logits of the best anchors. With the bundle that ships 0.04 costs 0.2 points of AP and 0.10 costs two;

@@ -15,8 +15,8 @@ from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.geometry.spec import DetectorSpec
-from asca_pillars.models.detector import PillarDetector, batch_pillars
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, batch_pillars
+from asca_pillars.pillars.spec import DetectorSpec
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
 BOX_TOLERANCE_M = 0.01

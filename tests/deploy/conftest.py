@@ -13,9 +13,9 @@ from onnx import TensorProto, helper, numpy_helper
 from asca_deploy.bundle import Bundle, Graphs, Provenance, write_bundle_manifest
 from asca_deploy.canvas import CanvasFormat
 from asca_deploy.input_check import ExpectedInput
-from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.geometry.pillarize import FEATURES, PillarLimits
-from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
+from asca_pillars.pillars.spec import DetectorSpec
 
 needs_openvino = pytest.mark.skipif(
     importlib.util.find_spec("openvino") is None, reason="needs pip install 'asca-pillars[openvino]'"

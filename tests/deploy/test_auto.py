@@ -12,7 +12,7 @@ from asca_deploy import Detector, auto
 from asca_pillars.errors import BundleError, ProviderError
 from asca_pillars.geometry.anchors import KITTI_CLASSES
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.pillars.spec import DetectorSpec
 from tests.deploy.conftest import SPEC
 
 BOXES = np.array(

@@ -10,11 +10,11 @@ import torch
 from asca_pillars.config import CpaReading, NetworkConfig
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.detector import batch_pillars, build_detector
+from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_detector
 from benchmarks.memory import crops
 from benchmarks.padded import PaddedDetector
 from tests.scenes import make_scene
-from tests.test_training import CONFIG
+from tests.training.test_loop import CONFIG
 
 
 def network(cpa: CpaReading) -> tuple:

@@ -21,9 +21,9 @@ from asca_deploy.bundle import (
     write_bundle_manifest,
 )
 from asca_pillars.errors import BundleError
-from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.geometry.pillarize import FEATURES
-from asca_pillars.geometry.spec import DetectorSpec
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillarize import FEATURES
+from asca_pillars.pillars.spec import DetectorSpec
 
 
 def edit(bundle: Path, change: Callable[[dict[str, Any]], object]) -> Path:

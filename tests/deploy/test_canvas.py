@@ -3,7 +3,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy.canvas import Canvas, CanvasFormat
-from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.pillars.grid import PillarGrid
 
 # 8 + 16 + 32 columns by 16 rows, off centre.
 GRID = PillarGrid(x_range_m=(1.0, 8.68), y_range_m=(-0.64, 1.92))

@@ -4,8 +4,8 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import load_bundle
 from asca_deploy.input_check import ExpectedInput, InputWarning, check_input, expected_input
-from asca_pillars.geometry.grid import PillarGrid
-from asca_pillars.geometry.pillarize import PillarLimits, pillarize
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillarize import PillarLimits, pillarize
 
 Points = NDArray[np.float32]
 GRID = PillarGrid(x_range_m=(0.0, 23.04), y_range_m=(-7.68, 10.24))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.kitti import Curve, KittiResults
+from asca_pillars.evaluation.kitti.average_precision import Curve, KittiResults
 
 
 def results(precision: list[float]) -> KittiResults:

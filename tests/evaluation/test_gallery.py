@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.kitti import KittiSplit, read_labels, write_labels
-from asca_pillars.data.labels import KittiObject
+from asca_pillars.data.kitti.kitti_labels import KittiObject
 from asca_pillars.evaluation.gallery import worst_frames, write_gallery
+from asca_pillars.evaluation.kitti.verdicts import Verdict, verdicts
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
-from asca_pillars.evaluation.verdicts import Verdict, verdicts
 from tests.scenes import GRID, write_dataset
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")

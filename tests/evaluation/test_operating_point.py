@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.data.labels import KittiObject
-from asca_pillars.evaluation.objects import FrameObjects, frame_objects
+from asca_pillars.data.kitti.kitti_labels import KittiObject
+from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
+from asca_pillars.evaluation.kitti.verdicts import verdicts
 from asca_pillars.evaluation.operating_point import (
     OperatingPoint,
     best_scores,
@@ -18,7 +19,6 @@ from asca_pillars.evaluation.operating_point import (
     recall_table,
     wilson_interval,
 )
-from asca_pillars.evaluation.verdicts import verdicts
 from asca_pillars.geometry.overlap import bev_iou, iou_3d
 
 NAMES = ("Car", "Pedestrian", "Cyclist")

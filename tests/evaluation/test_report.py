@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from asca_pillars.data.kitti import KittiObject
-from asca_pillars.evaluation.kitti import DIFFICULTIES, METRICS, evaluate
-from asca_pillars.evaluation.objects import frame_objects
+from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, evaluate
+from asca_pillars.evaluation.kitti.objects import frame_objects
 from asca_pillars.evaluation.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, notes, print_report, tables, to_json, to_markdown

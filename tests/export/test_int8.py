@@ -11,7 +11,7 @@ from onnx import numpy_helper
 
 from asca_deploy import Bundle, Detector, load_bundle
 from asca_export import int8
-from asca_export.export import export_bundle
+from asca_export.exporter import export_bundle
 from asca_pillars.errors import ExportError
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.scenes import make_scene

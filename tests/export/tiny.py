@@ -5,9 +5,9 @@ import dataclasses
 import torch
 
 from asca_pillars.config import Config, NetworkConfig
-from asca_pillars.geometry.spec import DetectorSpec
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.detector import build_detector
+from asca_pillars.models.pillar.pillar_detector import build_detector
+from asca_pillars.pillars.spec import DetectorSpec
 from tests.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)

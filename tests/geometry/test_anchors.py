@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import KITTI_CLASSES, ClassSpec, decode_boxes, encode_boxes, make_anchors
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.pillars.grid import PillarGrid
 
 GRID = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))
 # Anchors of a car at yaw 0 and at 90 degrees.

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import KITTI_CLASSES, decode_boxes, encode_boxes, make_anchors
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
-from asca_pillars.geometry.grid import PillarGrid
 from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.pillars.grid import PillarGrid
 
 GRID = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))
 CLASSES = tuple(

@@ -13,11 +13,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.geometry import kernels, overlap
-from asca_pillars.geometry.compiled import load_kernels
-from asca_pillars.geometry.grid import PillarGrid
+from asca_pillars.geometry import compiling as kernels
+from asca_pillars.geometry import overlap
+from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.geometry.overlap import rotated_nms
-from asca_pillars.geometry.pillarize import PillarLimits, Pillars, pillarize
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillarize import PillarLimits, Pillars, pillarize
 
 # Rectangular, off centre, with a positive minimum, and columns of one to three depths.
 GRIDS = tuple(
@@ -33,7 +34,7 @@ DRAWN = 57, 4111435180, 2859312739, 1432910283
 def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
     """The function's result where numba is not installed."""
     with (
-        patch("asca_pillars.geometry.pillarize.load_kernels", lambda: None),
+        patch("asca_pillars.pillars.pillarize.load_kernels", lambda: None),
         patch("asca_pillars.geometry.overlap.load_kernels", lambda: None),
     ):
         return function(*arguments)

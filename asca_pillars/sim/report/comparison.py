@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from .distance import coarse, jensen_shannon, noise_of_points, noise_of_units
-from .measuring import Measured
-from .scans import MATERIALS, OBJECTS, unit_histograms
-from .statistics import BAND_M, PERCENTILES, REFLECTANCES, Band, ScanStatistics, Statistics
+from asca_pillars.sim.report.distance import coarse, jensen_shannon, noise_of_points, noise_of_units
+from asca_pillars.sim.report.measured import Measured
+from asca_pillars.sim.report.reference import BAND_M, PERCENTILES, REFLECTANCES, Band, ScanStatistics, Statistics
+from asca_pillars.sim.report.scan_statistics import MATERIALS, OBJECTS, unit_histograms
 
 RATIO_BAR = 0.15
 DISTANCE_BAR = 0.15

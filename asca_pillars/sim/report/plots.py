@@ -8,12 +8,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from asca_pillars.files import atomic_path
-
-from .comparison import BARRED_RANGES_M, RATIO_BAR, Comparison
-from .distance import coarse
-from .measuring import Measured
-from .scans import MATERIALS
-from .statistics import BAND_M, BANDS, CAR_FIT_RANGE_M, CLASSES, NEAR_CARS_M, SECTORS, Band, Sensor
+from asca_pillars.sim.report.comparison import BARRED_RANGES_M, RATIO_BAR, Comparison
+from asca_pillars.sim.report.distance import coarse
+from asca_pillars.sim.report.measured import Measured
+from asca_pillars.sim.report.reference import (
+    BAND_M,
+    BANDS,
+    CAR_FIT_RANGE_M,
+    CLASSES,
+    NEAR_CARS_M,
+    SECTORS,
+    Band,
+    Sensor,
+)
+from asca_pillars.sim.report.scan_statistics import MATERIALS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

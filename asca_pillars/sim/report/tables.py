@@ -14,10 +14,9 @@ from rich.table import Table
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.files import atomic_path
 from asca_pillars.schema import to_dict
-
-from .comparison import Comparison, Row
-from .scans import OBJECTS
-from .statistics import CAR_FIT_RANGE_M, NEAR_CARS_M
+from asca_pillars.sim.report.comparison import Comparison, Row
+from asca_pillars.sim.report.reference import CAR_FIT_RANGE_M, NEAR_CARS_M
+from asca_pillars.sim.report.scan_statistics import OBJECTS
 
 _COLUMNS = ("", "KITTI", "this set", "ratio\nor JS", "bar", "kept", "by\nchance")
 _LEFT = 1

@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.benchmark.boxes import BoxDifference, box_difference
-from asca_deploy.benchmark.comparison import Contestant, compare
+from asca_deploy.benchmark.box_comparison import Contestant, compare
+from asca_deploy.benchmark.box_differences import BoxDifference, box_difference
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
 from asca_deploy.providers import PRECISIONS, PROVIDERS
 from asca_pillars.errors import AscaError
-from asca_pillars.machine import default_threads
+from asca_pillars.system import default_threads
 
 ON_THE_CPU = ("cpu", "openvino")  # the number of threads matters to these
 

@@ -1,0 +1,112 @@
+"""The ablation's Markdown: what was trained, how, and what came of it, with the spread over the seeds."""
+
+import json
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from asca_pillars.ablation.variants import VARIANTS, Run, Variant
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES
+from asca_pillars.evaluation.report import markdown_table
+
+TABLES = {
+    "Components (the rows of the paper's Table 5)": (
+        *("baseline", "gt_aug", "rs_aug", "asp_k3", "cpa_channel", "asp_k3_cpa_channel"),
+        "asp_k3_cpa_channel_rs_aug",
+    ),
+    "Zones of the adaptive-scale pillars (K)": ("baseline", "asp_k2", "asp_k3", "asp_k4"),
+    "Readings of the correlative point attention": (
+        *("asp_k3", "asp_k3_cpa_paper", "asp_k3_cpa_channel", "asp_k3_cpa_point"),
+    ),
+}
+BANDS_M = ((0.0, 40.0), (40.0, 80.0))
+
+
+@dataclass(frozen=True)
+class Speed:
+    """The exported detector on a CPU: frames per second (median), time against the baseline's with its quartiles."""
+
+    fps: float
+    ratio: float
+    ratio_quartiles: tuple[float, float]
+    parameters: int
+
+
+def tables(results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
+    """Markdown of every table whose variants have results.
+
+    Args:
+        results: what `asca eval --json` wrote, one per seed, by name of the variant.
+        speeds: of the variants that were exported.
+    """
+    parts = []
+    for title, names in TABLES.items():
+        there = [name for name in names if results.get(name)]
+        if there:
+            parts += [f"### {title}\n", _summary(there, results, speeds), _by_difficulty(there, results)]
+    return "\n".join(parts)
+
+
+def read_results(runs: Iterable[Run]) -> dict[str, list[dict[str, Any]]]:
+    """The evaluations that are there, one per seed, by name of the variant."""
+    results: dict[str, list[dict[str, Any]]] = {}
+    for run in runs:
+        if run.evaluated.exists():
+            results.setdefault(run.variant.name, []).append(json.loads(run.evaluated.read_text(encoding="utf-8")))
+    return results
+
+
+def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
+    bands = [f"{low:g}-{high:g} m" for low, high in BANDS_M]
+    header = ["ASP", "CPA", "Aug", *CLASS_NAMES, "mean", *bands, "parameters", "FPS", "time / baseline"]
+    rows = []
+    for name in names:
+        runs, speed = results[name], speeds.get(name)
+        cells = [_spread([_ap(run, c, "moderate") for run in runs]) for c in CLASS_NAMES]
+        cells.append(_spread([_mean_ap(run) for run in runs]))
+        cells += [_spread([_band(run, *band) for run in runs]) for band in BANDS_M]
+        if speed is None:
+            cells += ["-"] * 3
+        else:
+            low, high = speed.ratio_quartiles
+            cells += [f"{speed.parameters:,}", f"{speed.fps:.1f}", f"{speed.ratio:.2f} ({low:.2f}-{high:.2f})"]
+        rows.append([*_components(VARIANTS[name]), *cells])
+    return markdown_table(header, rows, left=3)
+
+
+def _by_difficulty(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
+    header = ["ASP", "CPA", "Aug", *(f"{c} {d}" for c in CLASS_NAMES for d in DIFFICULTIES)]
+    rows = []
+    for name in names:
+        cells = [_spread([_ap(run, c, d) for run in results[name]]) for c in CLASS_NAMES for d in DIFFICULTIES]
+        rows.append([*_components(VARIANTS[name]), *cells])
+    return markdown_table(header, rows, left=3)
+
+
+def _components(variant: Variant) -> tuple[str, str, str]:
+    zones = f"K={variant.zones}" if variant.zones > 1 else "-"
+    cpa = "-" if variant.cpa == "none" else variant.cpa
+    return zones, cpa, {"none": "-", "gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}[variant.insert]
+
+
+def _ap(result: dict[str, Any], class_name: str, difficulty: str) -> float:
+    """3D AP R40 in percent; a class that no detection names has found nothing, which is 0 here."""
+    found = result["results"][class_name]
+    values = found and found["3d"]
+    return float(values["R40"][DIFFICULTIES.index(difficulty)]) if values else 0.0
+
+
+def _band(result: dict[str, Any], low_m: float, high_m: float) -> float:
+    band = next(b for b in result["bands"] if (b["low_m"], b["high_m"]) == (low_m, high_m))
+    return _mean_ap(band)
+
+
+def _mean_ap(result: dict[str, Any]) -> float:
+    return statistics.fmean(_ap(result, class_name, "moderate") for class_name in CLASS_NAMES)
+
+
+def _spread(values: Sequence[float]) -> str:
+    """Mean over the seeds, and half the distance between the best and the worst."""
+    mean = f"{statistics.fmean(values):.2f}"
+    return mean if len(values) == 1 else f"{mean} ± {(max(values) - min(values)) / 2:.2f}"

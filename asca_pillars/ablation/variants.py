@@ -1,0 +1,156 @@
+"""The ablation: the rows of the paper's Table 5, the number of zones K and the readings of CPA, trained on equal terms.
+
+Every run is `asca train` with one base configuration and a few overrides, in a process of its own; finished runs are
+kept, so that an interrupted ablation goes on where it stopped.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.progress import track
+
+from asca_pillars.errors import TrainingError
+from asca_pillars.files import atomic_path
+from asca_pillars.system import default_threads
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row: what it changes in the base configuration."""
+
+    name: str
+    zones: int = 1
+    cpa: str = "none"
+    insert: str = "none"
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """For `asca train -s`. One zone means PointPillars' pillars of 0.16 m, several start at the paper's 0.32 m."""
+        return (
+            f"detector.grid.zones={self.zones}",
+            f"detector.grid.v_max_m={0.16 if self.zones == 1 else 0.32}",
+            f"network.cpa={self.cpa}",
+            f"augment.insert.method={self.insert}",
+        )
+
+
+VARIANTS = {
+    variant.name: variant
+    for variant in (
+        Variant("baseline"),
+        Variant("asp_k3", zones=3),
+        Variant("cpa_channel", cpa="channel"),
+        Variant("asp_k3_cpa_channel", zones=3, cpa="channel"),
+        Variant("asp_k2", zones=2),
+        Variant("asp_k4", zones=4),
+        Variant("asp_k3_cpa_paper", zones=3, cpa="paper"),
+        Variant("gt_aug", insert="gt_aug"),
+        Variant("rs_aug", insert="rs_aug"),
+        Variant("asp_k3_cpa_channel_rs_aug", zones=3, cpa="channel", insert="rs_aug"),
+        Variant("asp_k3_cpa_point", zones=3, cpa="point"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: a variant with a seed, in a folder of its own."""
+
+    variant: Variant
+    seed: int
+    folder: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.folder / "checkpoints" / "last.ckpt"
+
+    @property
+    def trained(self) -> Path:
+        """Written when training has ended: how long it took."""
+        return self.folder / "trained.json"
+
+    @property
+    def evaluated(self) -> Path:
+        """The report of `asca eval`."""
+        return self.folder / "evaluation" / "report.json"
+
+
+def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Variant]) -> list[Run]:
+    """Every run, all variants of the first seed before those of the next."""
+    return [Run(variant, seed, Path(out) / variant.name / f"seed{seed}") for seed in seeds for variant in variants]
+
+
+def train_runs(todo: Sequence[Run], config: str, data: str | Path, jobs: int, overrides: Sequence[str] = ()) -> None:
+    """Train what is not trained yet, `jobs` processes at a time that share the cores.
+
+    Args:
+        overrides: of every run, in the form of `asca train -s`; those of the variant win over them.
+
+    Raises:
+        TrainingError: a training failed; the message names its log.
+    """
+    threads = max(1, default_threads() // jobs)
+
+    def train(run: Run) -> None:
+        settings = (*overrides, *run.variant.overrides, f"train.seed={run.seed}")
+        where = ("--data", str(data), "--out", str(run.folder), "--devices", "1")
+        seconds = _asca(run, ("train", config, *where, *(part for text in settings for part in ("-s", text))), threads)
+        with atomic_path(run.trained) as temporary:
+            temporary.write_text(json.dumps({"seconds": round(seconds), "threads": threads}), encoding="utf-8")
+
+    _at_once([run for run in todo if not run.trained.exists()], train, jobs, "Training")
+
+
+def evaluate_runs(todo: Sequence[Run], data: str | Path, jobs: int) -> None:
+    """Evaluate what is not evaluated yet, on the validation list of the data.
+
+    Raises:
+        TrainingError: an evaluation failed; the message names its log.
+    """
+    threads = max(1, default_threads() // jobs)
+
+    def evaluate(run: Run) -> None:
+        where = ("--data", str(data), "--split", "val", "--out", str(run.evaluated.parent))
+        _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
+
+    _at_once([run for run in todo if not run.evaluated.exists()], evaluate, jobs, "Evaluating")
+
+
+def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int, what: str) -> None:
+    with ThreadPoolExecutor(jobs) as pool:
+        waiting = [pool.submit(work, run) for run in todo]
+        try:
+            for future in track(waiting, what, disable=not waiting):
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _asca(run: Run, arguments: Sequence[str], threads: int) -> float:
+    """Run one command as a user would, its output in the run's folder; returns the seconds it took."""
+    run.folder.mkdir(parents=True, exist_ok=True)
+    log = run.folder / f"{arguments[0]}.log"
+    start = time.monotonic()
+    with log.open("a", encoding="utf-8") as file:
+        done = subprocess.run(
+            [sys.executable, "-m", "asca_pillars.cli", *arguments],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            # One thread count for every run: sums of floats depend on it, and so do the weights.
+            env=os.environ | {"OMP_NUM_THREADS": str(threads)},
+            check=False,
+        )
+    if done.returncode:
+        words = log.read_text(encoding="utf-8").split("\n")
+        reason = next((line for line in reversed(words) if line.strip()), "it said nothing")
+        name = f"{run.variant.name}, seed {run.seed}"
+        raise TrainingError(f"{log}: `asca {arguments[0]}` of {name} failed: {reason.removeprefix('asca: ')}")
+    return time.monotonic() - start

@@ -1,0 +1,90 @@
+"""Free space of a list's frames on disk: computed when a frame is first used, or all at once."""
+
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from asca_pillars.data.insertion.free_space import CELLS_PER_NODE, FreeSpace, find_free_space
+from asca_pillars.data.insertion.ground_fit import Ground
+from asca_pillars.data.insertion.prepared import require_writable, writing
+from asca_pillars.data.kitti import KittiSplit, in_image
+from asca_pillars.data.scans.scan_reader import read_scan
+
+VERSION = 1  # of what is computed; files of another version are computed again
+
+
+def prepare_free_spaces(split: KittiSplit, prepared: Path, *, camera_view: bool, workers: int) -> None:
+    """Make the files of all frames of a list that are missing or outdated.
+
+    Raises:
+        DatasetError: a frame cannot be read, or the folder cannot be written.
+    """
+    require_writable(prepared)
+    job = partial(_prepare, split, prepared, camera_view)
+    with get_context("spawn").Pool(max(workers, 1)) as pool:
+        for _ in track(pool.imap_unordered(job, split.frame_ids, 8), "Free ground", total=len(split.frame_ids)):
+            pass
+
+
+def load_free_space(split: KittiSplit, frame_id: str, prepared: Path, *, camera_view: bool) -> FreeSpace:
+    """The free space of a frame from its file below `prepared`; computed and kept there if missing or outdated.
+
+    Raises:
+        DatasetError: the calibration cannot be read, or the folder cannot be written.
+        ScanError: the scan cannot be read.
+    """
+    path = prepared / "free_space" / split.folder.name / ("camera" if camera_view else "full") / f"{frame_id}.npz"
+    stamp = _stamp(split, frame_id)
+    if (space := _read(path, stamp)) is not None:
+        return space
+    points = read_scan(split.scan_path(frame_id)).points
+    if camera_view:
+        points = points[in_image(points, split.calibration(frame_id), split.image_size_wh(frame_id))]
+    space = find_free_space(points)
+    _write(path, stamp, space)
+    return space
+
+
+def _stamp(split: KittiSplit, frame_id: str) -> NDArray[np.int64]:
+    """What tells that the files which the map was made from are still the same."""
+    states = [path.stat() for path in (split.scan_path(frame_id), split.calib_path(frame_id))]
+    numbers = [number for state in states for number in (state.st_size, state.st_mtime_ns)]
+    return np.array([VERSION, *split.image_size_wh(frame_id), *numbers])
+
+
+def _read(path: Path, stamp: NDArray[np.int64]) -> FreeSpace | None:
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            if not np.array_equal(file["stamp"], stamp):
+                return None
+            rise, clusters = file["rise_m"], file["clusters"]
+            if not rise.size:
+                return FreeSpace(None, np.zeros((0, 0), bool), clusters)
+            shape = np.array(rise.shape) * CELLS_PER_NODE
+            free = np.unpackbits(file["free"], count=shape.prod()).astype(bool).reshape(shape)
+            return FreeSpace(Ground(file["plane"], file["origin_m"], rise), free, clusters)
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):  # none there, or a damaged one: it is made again
+        return None
+
+
+def _write(path: Path, stamp: NDArray[np.int64], space: FreeSpace) -> None:
+    ground = space.ground or Ground(np.zeros(3), np.zeros(2), np.zeros((0, 0), np.float16))
+    with writing(path) as temporary:
+        np.savez(
+            temporary,
+            stamp=stamp,
+            plane=ground.plane,
+            origin_m=ground.origin_m,
+            rise_m=ground.rise_m,
+            free=np.packbits(space.free),
+            clusters=space.clusters,
+        )
+
+
+def _prepare(split: KittiSplit, prepared: Path, camera_view: bool, frame_id: str) -> None:
+    load_free_space(split, frame_id, prepared, camera_view=camera_view)

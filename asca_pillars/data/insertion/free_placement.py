@@ -1,0 +1,201 @@
+"""Finding a place for an object in a frame, and what it hides there (section 3.5, steps 5 and 6)."""
+
+import itertools
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.frames import LabeledFrame, in_grid
+from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace
+from asca_pillars.data.insertion.gt_database import StoredObject
+from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
+from asca_pillars.geometry.overlap import paired_bev_touch
+from asca_pillars.pillars.grid import PillarGrid
+
+PLACE_TRIES = 32  # places that are tried for one object
+CHECKED_PLACES = 4  # of those on free ground, looked at closely
+MARGIN_M = 0.2  # around the footprint that must be free, too
+MIN_SEEN_SHARE = 0.5  # of an object's points
+
+_Floats = NDArray[np.floating[Any]]
+
+
+class Scene:
+    """A frame while objects are put into it.
+
+    Attributes:
+        frame: as it was.
+        obstacles: (K, 7) boxes that another one must not touch.
+        inserted: objects so far, with all their points.
+    """
+
+    def __init__(self, frame: LabeledFrame, obstacles: NDArray[np.float32]) -> None:
+        self.frame = frame
+        self.obstacles = obstacles
+        self.inserted: list[StoredObject] = []
+        self._seen_points: list[NDArray[np.float32]] = []
+        inside = points_in_boxes(frame.points, frame.boxes)
+        self._owned = np.flatnonzero(inside.any(axis=1))
+        self._owners = np.ascontiguousarray(inside[self._owned].T)
+        self._wanted = self._owners[frame.labels >= 0]
+        self._enough = MIN_SEEN_SHARE * np.count_nonzero(self._wanted, axis=1)
+        self._owned_rays = Rays(frame.points[self._owned])
+        self._hidden = np.zeros(len(self._owned), bool)
+
+    def add(self, item: StoredObject) -> None:
+        """Put an object where it says."""
+        self._hidden |= self._owned_rays.entering(item.box[None])
+        self._seen_points = [*self._seen_with(item), self._seen_of(item)]
+        self.inserted.append(item)
+        self.obstacles = np.concatenate([self.obstacles, item.box[None]])
+
+    def shows_all_with(self, item: StoredObject) -> bool:
+        """Whether most of every object, `item` included, would be seen if `item` were added."""
+        seen = ~(self._hidden | self._owned_rays.entering(item.box[None]))
+        if (np.count_nonzero(self._wanted & seen, axis=1) < self._enough).any():
+            return False
+        if len(self._seen_of(item)) < MIN_SEEN_SHARE * len(item.points):
+            return False
+        after = zip(self._seen_with(item), self.inserted, strict=True)
+        return all(len(points) >= MIN_SEEN_SHARE * len(other.points) for points, other in after)
+
+    def frame_with_inserted(self, min_points: int) -> LabeledFrame:
+        """The frame with the objects, without what they hide; what keeps fewer than `min_points` becomes IGNORED."""
+        if not self.inserted:
+            return self.frame
+        boxes = np.array([item.box for item in self.inserted])
+        seen = ~rays_entering(self.frame.points, boxes)
+        labels = self.frame.labels.copy()
+        labels[np.count_nonzero(self._owners & seen[self._owned], axis=1) < min_points] = IGNORED
+        counts = np.array([len(points) for points in self._seen_points])
+        added = np.where(counts >= min_points, [item.label for item in self.inserted], IGNORED)
+        return replace(
+            self.frame,
+            points=np.concatenate([self.frame.points[seen], *self._seen_points]),
+            boxes=np.concatenate([self.frame.boxes, boxes]),
+            labels=np.concatenate([labels, added.astype(np.int64)]),
+        )
+
+    def _seen_of(self, item: StoredObject) -> NDArray[np.float32]:
+        """Points of `item` that no inserted object hides."""
+        hiding = [other.box for other in self.inserted if _share_azimuths(other.box, item.box)]
+        return item.points[~rays_entering(item.points, np.array(hiding))] if hiding else item.points
+
+    def _seen_with(self, item: StoredObject) -> list[NDArray[np.float32]]:
+        """Points of each inserted object that neither another one nor `item` hides."""
+        return [
+            points[~rays_entering(points, item.box[None])] if _share_azimuths(other.box, item.box) else points
+            for other, points in zip(self.inserted, self._seen_points, strict=True)
+        ]
+
+
+class Rays:
+    """The straight ways from the sensor to points (N, >=3), looked at again and again while places are tried."""
+
+    def __init__(self, points: _Floats) -> None:
+        self._ends = np.ascontiguousarray(points[:, :3].T, dtype=np.float64)
+        self._reach = np.hypot(self._ends[0], self._ends[1]) * (1 + 1e-5) + 1e-3
+
+    def entering(self, boxes: _Floats) -> NDArray[np.bool_]:
+        """Which of them touch one of boxes (M, 7), their ends included: (N,)."""
+        px, py, _ = self._ends
+        hits = np.zeros(len(px), bool)
+        for x, y, z, length, width, height, yaw in boxes.tolist():
+            # Most ways pass the box's circumscribed circle by; both sides are scaled by the distance to the point.
+            near = (np.abs(px * y - py * x) <= math.hypot(length, width) / 2 * self._reach).nonzero()[0]
+            if not len(near):
+                continue
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            into_box = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+            ray = into_box @ self._ends[:, near]
+            center = (into_box @ (x, y, z))[:, None]
+            ray[np.abs(ray) < 1e-9] = 1e-9
+            half = np.array([[length], [width], [height]]) / 2
+            one, other = (center - half) / ray, (center + half) / ray
+            enters = np.minimum(one, other).max(axis=0)
+            leaves = np.maximum(one, other).min(axis=0)
+            hits[near] |= (enters <= leaves) & (leaves >= 0) & (enters <= 1)
+        return hits
+
+
+def rays_entering(points: _Floats, boxes: _Floats) -> NDArray[np.bool_]:
+    """Which straight ways from the sensor to points (N, >=3) touch one of boxes (M, 7), their ends included: (N,)."""
+    return Rays(points).entering(boxes)
+
+
+def is_clear(box: _Floats, obstacles: _Floats, grid: PillarGrid) -> bool:
+    """Whether a box (7,) stands over the grid and touches none of the others (K, 7)."""
+    reach = (np.hypot(obstacles[:, 3], obstacles[:, 4]) + math.hypot(box[3], box[4])) / 2
+    near = obstacles[np.hypot(obstacles[:, 0] - box[0], obstacles[:, 1] - box[1]) <= reach]
+    if not in_grid(box[None], grid)[0]:
+        return False
+    return not paired_bev_touch(np.broadcast_to(box, near.shape).astype(np.float64), near.astype(np.float64)).any()
+
+
+def to_free_place(
+    item: StoredObject, space: FreeSpace, scene: Scene, grid: PillarGrid, rng: np.random.Generator
+) -> StoredObject | None:
+    """The object turned about the sensor's vertical axis to a free place, or None where none was found."""
+    distance_m, azimuth_rad = math.hypot(*item.box[:2]), math.atan2(item.box[1], item.box[0])
+    cells, distances_m = space.cells
+    ring = np.flatnonzero(np.abs(distances_m - distance_m) < CELL_M / 2)
+    if space.ground is None or not len(ring):
+        return None
+    x, y = cells[:, rng.choice(ring, PLACE_TRIES)]
+    azimuths = np.arctan2(y, x)
+    boxes = np.tile(item.box.astype(np.float64), (PLACE_TRIES, 1))
+    boxes[:, 0], boxes[:, 1] = distance_m * np.cos(azimuths), distance_m * np.sin(azimuths)
+    boxes[:, 6] = wrap_angle(boxes[:, 6] + azimuths - azimuth_rad)
+    obstacles = np.concatenate([scene.obstacles, space.clusters])
+    grid_points = _footprint_grid(item.box)
+    possible = np.flatnonzero(space.is_free(_placed(grid_points[:4], boxes)).all(axis=1))
+    free = (place for place in possible if space.is_free(_placed(grid_points[4:], boxes[place, None])).all())
+    for place in itertools.islice(free, CHECKED_PLACES):
+        box = boxes[place].astype(np.float32)
+        if not is_clear(box, obstacles, grid):
+            continue
+        box[2] = space.ground.heights(box[None, :2])[0] + box[5] / 2
+        turned = _turned(item, box, float(azimuths[place]) - azimuth_rad)
+        if scene.shows_all_with(turned):
+            return turned
+    return None
+
+
+def _turned(item: StoredObject, box: NDArray[np.float32], turn_rad: float) -> StoredObject:
+    """The object at its new box (7,), to which it was turned about the sensor's vertical axis."""
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    points = item.points.copy()
+    points[:, :2] = points[:, :2] @ np.array([[cos, sin], [-sin, cos]], dtype=np.float32)
+    points[:, 2] += box[2] - item.box[2]
+    return StoredObject(box, item.label, points)
+
+
+def _footprint_grid(box: _Floats) -> NDArray[np.float64]:
+    """Offsets (P, 2) along and across a box (7,), all over its footprint and margin, the four corners first."""
+    length, width = (float(size) + 2 * MARGIN_M for size in box[3:5])
+    rows, columns = (math.ceil(size / CELL_M) + 1 for size in (length, width))
+    along, across = (np.arange(rows) / (rows - 1) - 0.5) * length, (np.arange(columns) / (columns - 1) - 0.5) * width
+    u, v = np.repeat(along, columns), np.tile(across, rows)
+    corners = [0, columns - 1, (rows - 1) * columns, rows * columns - 1]
+    order = np.r_[corners, np.delete(np.arange(rows * columns), corners)]
+    return np.stack([u[order], v[order]], axis=1)
+
+
+def _placed(offsets: NDArray[np.float64], boxes: _Floats) -> NDArray[np.float64]:
+    """Offsets (P, 2) along and across boxes (N, 7) as x, y: (N, P, 2)."""
+    cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
+    u, v = offsets.T
+    return np.stack([boxes[:, 0, None] + cos * u - sin * v, boxes[:, 1, None] + sin * u + cos * v], axis=-1)
+
+
+def _share_azimuths(a: _Floats, b: _Floats) -> bool:
+    """Whether boxes (7,) may stand, seen from the sensor, one before the other: by their circumscribed circles."""
+    widths_rad = sum(
+        math.asin(min(math.hypot(box[3], box[4]) / 2 / max(math.hypot(box[0], box[1]), 1e-6), 1.0)) for box in (a, b)
+    )
+    apart_rad = math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])
+    return abs(apart_rad) <= widths_rad

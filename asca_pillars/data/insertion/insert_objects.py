@@ -1,0 +1,149 @@
+"""GT-Aug and RS-Aug: labelled objects of other frames are put into a training frame (section 3.5, steps 5 and 6).
+
+Both draw as many objects, of the same classes and from the same database, so that they differ in the place alone:
+
+- GT-Aug (SECOND): an object stays where it stood in its own frame. It must not touch a labelled object.
+- RS-Aug: an object is turned about the sensor's vertical axis to a free place. Its distance stays, and with it the
+  density of its points and the side that the sensor sees; its height follows the ground. Its footprint with a margin
+  must lie on free ground, and touch neither a labelled object nor a cluster. A place where it would hide most of
+  another object, or be hidden by one inserted before it, is not taken ("avoiding the occlusion of existing objects").
+
+Free ground is ground that the sensor saw (`free_space`), so nothing of the scan stands between it and such an object.
+What an inserted object would hide is removed: every point whose ray enters its box on the way. The paper does not say
+so; without it, walls would shine through cars. Points of GT-Aug objects behind walls stay, as in SECOND.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.config import Config, InsertConfig
+from asca_pillars.data.frames import LabeledFrame, in_grid
+from asca_pillars.data.insertion.free_maps import load_free_space
+from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
+from asca_pillars.data.insertion.free_space import FreeSpace
+from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
+from asca_pillars.data.insertion.prepared import prepared_folder
+from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
+from asca_pillars.errors import DatasetError
+from asca_pillars.pillars.grid import PillarGrid
+
+OBJECT_TRIES = 10  # objects of a class that are tried before one is given up
+
+
+@dataclass(frozen=True)
+class Inserter:
+    """Everything that inserting into the frames of one list needs.
+
+    Attributes:
+        split: the list.
+        settings: how many, and by which method.
+        grid: objects are put where the detector looks.
+        camera_view: whether frames are cut to what the camera sees.
+        min_points: what loses so many points that fewer are left becomes IGNORED.
+        prepared: folder of the free-space maps.
+        database: where objects come from.
+        shares: probability of each class.
+    """
+
+    split: KittiSplit
+    settings: InsertConfig
+    grid: PillarGrid
+    camera_view: bool
+    min_points: int
+    prepared: Path
+    database: ObjectDatabase
+    shares: tuple[float, ...]
+
+    @cached_property
+    def candidates(self) -> tuple[NDArray[np.int64], ...]:
+        """Objects of each class that may be inserted, as numbers in the database."""
+        enough = self.database.point_counts >= self.settings.min_points
+        return tuple(np.flatnonzero(enough & (self.database.labels == label)) for label in range(len(self.shares)))
+
+    def free_space(self, frame_id: str) -> FreeSpace:
+        """Where there is room in a frame."""
+        return load_free_space(self.split, frame_id, self.prepared, camera_view=self.camera_view)
+
+
+def prepare_inserter(split: KittiSplit, config: Config) -> Inserter:
+    """Build or find the object database, and work out how often each class is to be drawn.
+
+    Raises:
+        DatasetError: a class is wanted of which no object may be inserted, or the database cannot be built.
+    """
+    data, spec, insert = config.data, config.detector, config.augment.insert
+    prepared = prepared_folder(split.root, data)
+    database = prepare_database(split, spec.class_names, prepared, camera_view=data.camera_view)
+    counted = (database.point_counts >= data.min_points) & in_grid(database.boxes, spec.grid)
+    counts = np.bincount(database.labels[counted], minlength=len(spec.class_names))
+    wanted = np.array([insert.proportions.get(name, 0.0) for name in spec.class_names])
+    if not insert.proportions:
+        wanted[:] = 1.0
+    shares = insertion_shares(counts / len(split.frame_ids), wanted, insert.objects)
+    inserter = Inserter(
+        split, insert, spec.grid, data.camera_view, data.min_points, prepared, database, tuple(shares.tolist())
+    )
+    for name, share, objects in zip(spec.class_names, shares, inserter.candidates, strict=True):
+        if share > 0 and not len(objects):
+            raise DatasetError(
+                f"{split.root}: list `{split.name}` has no {name} with {insert.min_points} or more points to insert; "
+                "lower augment.insert.min_points, or name the other classes in augment.insert.proportions"
+            )
+    return inserter
+
+
+def insertion_shares(per_frame: NDArray[np.float64], wanted: NDArray[np.float64], objects: int) -> NDArray[np.float64]:
+    """Probability (C,) of each class among the inserted, so that together with what is there the counts are as wanted.
+
+    A class that has more than its part already gets none; the others are filled up to one level, counted in units of
+    what is wanted: sum over classes of max(0, level * wanted - per_frame) = objects.
+
+    Args:
+        per_frame: (C,) mean number of objects in a frame.
+        wanted: (C,) proportions, not all 0; a class with 0 is not inserted.
+        objects: inserted into each frame.
+    """
+    shares = np.zeros(len(wanted))
+    classes = np.flatnonzero(wanted > 0)
+    if objects == 0:
+        shares[classes] = wanted[classes] / wanted.sum()
+        return shares
+    order = classes[np.argsort(per_frame[classes] / wanted[classes])]
+    for number in range(1, len(order) + 1):
+        filled = order[:number]
+        level = (objects + per_frame[filled].sum()) / wanted[filled].sum()
+        if number == len(order) or level <= per_frame[order[number]] / wanted[order[number]]:
+            break
+    shares[filled] = (level * wanted[filled] - per_frame[filled]) / objects
+    return shares
+
+
+def insert_objects(frame: LabeledFrame, inserter: Inserter, rng: np.random.Generator) -> LabeledFrame:
+    """The frame with up to `settings.objects` more objects, which come last in it.
+
+    For each, a class is drawn; where an object of it finds no place, another of the same class is tried, so that the
+    classes keep their proportions. A frame without room, or without ground, keeps fewer or none. Labelled objects that
+    an inserted one hides become IGNORED as those that the data hides.
+    """
+    space = inserter.free_space(frame.frame_id) if inserter.settings.method == "rs_aug" else None
+    scene = Scene(frame, _labeled_boxes(inserter.split, frame.frame_id))
+    for label in rng.choice(len(inserter.shares), inserter.settings.objects, p=inserter.shares):
+        for _ in range(OBJECT_TRIES):
+            item = inserter.database[int(rng.choice(inserter.candidates[label]))]
+            if space is not None:
+                placed = to_free_place(item, space, scene, inserter.grid, rng)
+            else:
+                placed = item if is_clear(item.box, scene.obstacles, inserter.grid) else None
+            if placed is not None:
+                scene.add(placed)
+                break
+    return scene.frame_with_inserted(inserter.min_points)
+
+
+def _labeled_boxes(split: KittiSplit, frame_id: str) -> NDArray[np.float32]:
+    """Every labelled object's box (K, 7), whatever its type: nothing may be put into a lorry either."""
+    return boxes_from_objects(objects_3d(split.objects(frame_id)), split.calibration(frame_id))

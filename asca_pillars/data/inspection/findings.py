@@ -1,0 +1,211 @@
+"""What is wrong with a dataset before anything is trained on it, each with its remedy."""
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from asca_pillars.config import Config
+from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
+from asca_pillars.geometry.sensor_height import TOLERANCE_M
+from asca_pillars.pillars.spec import DetectorSpec
+
+# From these shares on something is a mistake or costs recall; KITTI and the simulator stay well below all of them.
+BOXES_OUTSIDE = 0.05
+BOXES_CUT_IN_Z = 0.1
+BOXES_WITHOUT_POINTS = 0.2
+BOXES_WITH_FEW_POINTS = 0.3
+BOXES_MISFIT = 0.25
+BOXES_FORCED = 0.6
+BOXES_MISSED = 0.02
+POINTS_OUTSIDE = 0.75  # a grid that looks forward loses half of what a sensor sees in a full turn
+POINTS_CUT = 0.2
+SCANS_OVER_MAX_PILLARS = 0.05
+FEWEST_BOXES = 10  # with fewer a share or a mean says nothing
+DIM_REFLECTANCE = 0.1  # the brightest point of all scans; the reflectance was scaled down twice
+
+
+class Finding(NamedTuple):
+    """`error`: training would be in vain. `about` names the class or the part, `text` is one line with the remedy."""
+
+    level: Literal["error", "warning"]
+    about: str
+    text: str
+
+
+def findings(inspection: Inspection, config: Config) -> list[Finding]:
+    """Errors first: frames that cannot be read, classes without positives; then whatever else looks wrong."""
+    found: list[Finding] = []
+    if inspection.damaged:
+        text = f"frames that cannot be read: {len(inspection.damaged)}, the first: {inspection.damaged[0]}"
+        found.append(Finding("error", "frames", text))
+    for facts in inspection.classes:
+        if facts.positives == 0:
+            frames = f"{inspection.frames} of {inspection.frames_in_split} frames of '{inspection.split}'"
+            text = f"no anchor is positive for {facts.name} in {frames}: {_why_none(facts, inspection, config)}"
+            found.append(Finding("error", facts.name, text))
+    for facts in inspection.classes:
+        if facts.positives:
+            found += [Finding("warning", facts.name, f"{facts.name}: {text}") for text in _of_class(facts, config)]
+    scans = inspection.scans
+    found += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
+    found += [Finding("warning", "height", text) for text in _of_height(inspection)]
+    found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, config.detector)]
+    return found
+
+
+def _why_none(facts: ClassFacts, inspection: Inspection, config: Config) -> str:
+    if facts.boxes == 0:
+        return _why_no_boxes(facts.name, inspection)
+    if facts.no_points == facts.boxes:
+        return "none of its boxes holds a point; labels and calib must belong to the scans"
+    if facts.few_points == facts.boxes:
+        return f"all of its boxes have fewer points than data.min_points = {config.data.min_points}; lower it"
+    if facts.missed == 0:
+        return f"its boxes with enough points lie outside the grid; {_widen(facts, config.detector)}"
+    return "the anchors stand too far apart to overlap its boxes; make detector.grid.v_max_m and v_y_m smaller"
+
+
+def _why_no_boxes(name: str, inspection: Inspection) -> str:
+    for other in inspection.types:
+        if other.casefold() == name.casefold():
+            return f"the labels spell it '{other}'; rename it there or in detector.classes"
+    there = ", ".join(f"{kind} {count}" for kind, count in inspection.types.items()) or "none at all"
+    if inspection.sampled:
+        advice = f"look at all frames with --frames {inspection.frames_in_split}, or list other frames in ImageSets/"
+    else:
+        advice = "list frames that have some in ImageSets/, or take the class out of detector.classes"
+    return f"no label is of this type (there are: {there}); {advice}"
+
+
+def _of_class(facts: ClassFacts, config: Config) -> Iterator[str]:
+    spec, boxes = config.detector, facts.boxes
+    if boxes < FEWEST_BOXES:
+        number = "1 box" if boxes == 1 else f"{boxes} boxes"
+        yield f"only {number}, too few to learn from or to compare with the anchors; inspect or add more frames"
+        return
+    assert facts.size_m is not None and facts.z_m is not None, "there are boxes"
+    if facts.no_points > BOXES_WITHOUT_POINTS * boxes:
+        share = _percent(facts.no_points, boxes)
+        yield f"{share} of the boxes hold no point; check that labels and calib belong to the scans"
+    elif facts.few_points > BOXES_WITH_FEW_POINTS * boxes:
+        share, limit = _percent(facts.few_points, boxes), config.data.min_points
+        yield f"{share} of the boxes have fewer points than data.min_points = {limit} and are ignored; lower it"
+    if max(facts.outside_xyz[:2]) > BOXES_OUTSIDE * boxes:
+        x, y = (_percent(count, boxes) for count in facts.outside_xyz[:2])
+        yield f"boxes lie outside the grid, {x} in x and {y} in y, and are left out; {_widen(facts, spec)}"
+    if facts.cut_in_z > BOXES_CUT_IN_Z * boxes:
+        share, z_range = _percent(facts.cut_in_z, boxes), list(spec.grid.z_range_m)
+        yield f"{share} of the boxes reach beyond detector.grid.z_range_m {z_range} and lose points; widen it"
+    if abs(facts.z_m - facts.anchor_z_m) > TOLERANCE_M:
+        yield (
+            f"the boxes' centers are at z = {facts.z_m:.2f} m on average, the anchor's at {facts.anchor_z_m:.2f} m; "
+            f"set its z_m to {facts.z_m:.2f}"
+        )
+    if facts.misfits > BOXES_MISFIT * boxes:
+        length, width, height = facts.size_m
+        yield (
+            f"{_percent(facts.misfits, boxes)} of the boxes differ too much in size from the anchor for positive_iou; "
+            f"set length_m {length:.2f}, width_m {width:.2f}, height_m {height:.2f}, or lower positive_iou"
+        )
+    to_find = facts.overlapped + facts.forced + facts.missed
+    if facts.missed > BOXES_MISSED * to_find:
+        yield (
+            f"{_percent(facts.missed, to_find)} of the objects have no positive anchor; "
+            "make detector.grid.v_max_m and v_y_m smaller, or look for labels that stand twice"
+        )
+    if facts.forced > BOXES_FORCED * to_find >= facts.misfits:
+        yield (
+            f"{_percent(facts.forced, to_find)} of the objects have no anchor that overlaps them by positive_iou, only "
+            "the nearest; make detector.grid.v_max_m and v_y_m smaller, or lower positive_iou and negative_iou"
+        )
+
+
+def _of_reflectance(scans: ScanFacts, frames: int) -> Iterator[str]:
+    low, high = scans.reflectance_stored
+    if low < 0:
+        yield f"reflectance goes down to {low:.4g} and is cut off at 0; store it as 0..1"
+    if high == 0:
+        yield "reflectance is 0 everywhere; check what exported the scans, the detector uses it"
+    elif high < DIM_REFLECTANCE:
+        yield f"reflectance reaches {high:.2g} only; store it as 0..1 (was it divided twice?)"
+    if scans.lowest_above_one is None:
+        return
+    if scans.lowest_above_one < 2:
+        yield (
+            f"reflectance reaches {scans.lowest_above_one:.3g} in a scan, which is therefore taken as 0..255 and "
+            "divided by 255; cut it off at 1 in the files"
+        )
+    elif high > 255:
+        yield f"reflectance reaches {high:.5g} and is cut off at 255; divide it by its full scale, such as 65535"
+    elif scans.scans_above_one < frames:
+        yield (
+            f"reflectance reaches {high:.4g} in {scans.scans_above_one} of {frames} scans, which are divided by 255; "
+            "the others are taken as 0..1: store all of them as 0..1"
+        )
+    else:
+        yield (
+            f"reflectance reaches {high:.4g} and is divided by 255 when read: training sees 0 to {high / 255:.2f}; "
+            "divide it by its full scale in the files, then no dark scan is taken for one of 0..1"
+        )
+
+
+def _of_height(inspection: Inspection) -> Iterator[str]:
+    if inspection.scans.ground_z_m is None:
+        return
+    ground, (low, high) = inspection.scans.ground_z_m.median, inspection.scans.anchor_bottoms_m
+    known = [item for item in inspection.classes if item.boxes >= FEWEST_BOXES]
+    bottoms = [item.z_m - item.size_m[2] / 2 for item in known if item.z_m is not None and item.size_m is not None]
+    floating = [bottom - ground for bottom in bottoms if abs(bottom - ground) > TOLERANCE_M]
+    if floating and len(floating) == len(bottoms):
+        yield (
+            f"the ground near the sensor lies at z = {ground:.2f} m, the boxes stand {floating[0]:+.2f} m from it; "
+            "calib and labels must belong to the scans"
+        )
+    elif not low - TOLERANCE_M <= ground <= high + TOLERANCE_M:
+        yield (
+            f"the ground near the sensor lies at z = {ground:.2f} m, the anchors stand on z = {low:.2f} to {high:.2f} "
+            f"m; move z_m of the classes and z_range_m by about {ground - (low + high) / 2:+.1f} m"
+        )
+
+
+def _of_points(scans: ScanFacts, frames: int, spec: DetectorSpec) -> Iterator[str]:
+    if scans.dropped_points:
+        yield (
+            f"points with a value that is not finite: {scans.dropped_points}, in {scans.scans_with_dropped} of "
+            f"{frames} scans; they are dropped: remove them where the scans are written"
+        )
+    if scans.scans_without_points:
+        yield (
+            f"scans without a point inside the grid: {scans.scans_without_points} of {frames}; "
+            "check their calib and the grid's ranges, or take them out of the list"
+        )
+    if scans.outside_share > POINTS_OUTSIDE:
+        yield (
+            f"{100 * scans.outside_share:.0f} % of the points lie outside the grid; widen its ranges, or check the "
+            "axes: x is forward, y left, z up, in meters"
+        )
+    if scans.scans_over_max_pillars > SCANS_OVER_MAX_PILLARS * frames:
+        yield (
+            f"{_percent(scans.scans_over_max_pillars, frames)} of the scans have more pillars than "
+            f"limits.max_pillars = {spec.limits.max_pillars} and lose the rest; raise it to {scans.pillars.largest:.0f}"
+        )
+    if scans.cut_share > POINTS_CUT:
+        yield (
+            f"limits.max_points = {spec.limits.max_points} takes away {100 * scans.cut_share:.0f} % of the points; "
+            "raise it, or make the pillars smaller"
+        )
+
+
+def _widen(facts: ClassFacts, spec: DetectorSpec) -> str:
+    """Where the boxes are, beside the range of x, of y or both that does not hold them."""
+    assert facts.reach_m is not None, "there are boxes"
+    ranges = (spec.grid.x_range_m, spec.grid.y_range_m)
+    wrong = [
+        f"they reach from {axis} = {low:.1f} to {high:.1f} m: widen detector.grid.{axis}_range_m {list(span)}"
+        for axis, (low, high), span, count in zip("xy", facts.reach_m, ranges, facts.outside_xyz, strict=False)
+        if count
+    ]
+    return ", ".join(wrong)
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.0f} %"

@@ -1,0 +1,262 @@
+"""What a detector is going to be trained on: a KITTI-layout dataset measured against a configuration.
+
+`data.measuring` measures a frame, this module a dataset, and `data.findings` says what is wrong with it.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from asca_pillars.config import Config
+from asca_pillars.data.inspection.measurements import Fate, FrameMeasure, ScanMeasure, measure_frame
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.errors import DatasetError, ScanError
+from asca_pillars.geometry.anchors import ClassSpec
+from asca_pillars.geometry.overlap import aligned_bev_iou
+from asca_pillars.pillars.spec import DetectorSpec
+
+
+class Spread(NamedTuple):
+    """How a quantity is spread: 10 % of the values lie below `p10`, 10 % above `p90`."""
+
+    p10: float
+    median: float
+    p90: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class ClassFacts:
+    """The labelled objects of one class.
+
+    Attributes:
+        boxes: how many there are. With none, what is measured on them is None.
+        points: points inside one box; `no_points` boxes have none, `few_points` fewer than data.min_points.
+        size_m: mean length, width and height; `size_std_m` their standard deviations.
+        misfits: boxes that no anchor can overlap by positive_iou, wherever it stands: the size is too different.
+        z_m: mean z of the centers, LiDAR frame.
+        reach_m: lowest and highest x, y and z of the centers.
+        outside_xyz: boxes whose center lies outside the grid's range of x, of y, of z.
+        cut_in_z: boxes whose top or bottom reaches beyond the range of z.
+        overlapped, forced, missed: boxes by their `Fate`; together those that training is to find.
+        positives: positive anchors.
+    """
+
+    name: str
+    boxes: int
+    points: Spread | None
+    no_points: int
+    few_points: int
+    size_m: tuple[float, ...] | None
+    size_std_m: tuple[float, ...] | None
+    anchor_size_m: tuple[float, float, float]
+    misfits: int
+    z_m: float | None
+    anchor_z_m: float
+    reach_m: tuple[tuple[float, float], ...] | None
+    outside_xyz: tuple[int, ...]
+    cut_in_z: int
+    overlapped: int
+    forced: int
+    missed: int
+    positives: int
+
+
+@dataclass(frozen=True)
+class ScanFacts:
+    """The scans, and their pillars before any limit.
+
+    Attributes:
+        points: points of a scan that training sees.
+        dropped_points: stored points with a value that is not finite, `scans_with_dropped` the scans that have any.
+        scans_without_points: those with no point inside the grid.
+        outside_share: share of the points seen that lie outside the grid.
+        reflectance_stored: lowest and highest in the files.
+        scans_above_one: those whose stored reflectance exceeds 1 and is divided by 255 for it; `lowest_above_one` is
+            the lowest highest value of any of them.
+        reflectance: mean reflectance of a scan, in 0..1.
+        ground_z_m: height of the ground near the sensor; None where no scan shows it.
+        anchor_bottoms_m: lowest and highest bottom of the classes' anchors.
+        pillars: pillars of a scan; `scans_over_max_pillars` have too many.
+        fullest_pillar: most points of any pillar.
+        crowded_share: share of the pillars with more than max_points.
+        cut_share: share of the points inside the grid that max_points takes away.
+    """
+
+    points: Spread
+    dropped_points: int
+    scans_with_dropped: int
+    scans_without_points: int
+    outside_share: float
+    reflectance_stored: tuple[float, float]
+    scans_above_one: int
+    lowest_above_one: float | None
+    reflectance: Spread
+    ground_z_m: Spread | None
+    anchor_bottoms_m: tuple[float, float]
+    pillars: Spread
+    scans_over_max_pillars: int
+    fullest_pillar: int
+    crowded_share: float
+    cut_share: float
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found in `frames` of a split's frames.
+
+    `types` counts the labels by type, those of no class included; `damaged` holds a line for each frame that was
+    wanted and cannot be read.
+    """
+
+    data: str
+    split: str
+    config: str
+    frames: int
+    frames_in_split: int
+    frames_without_objects: int
+    types: dict[str, int]
+    classes: tuple[ClassFacts, ...]
+    scans: ScanFacts
+    damaged: tuple[str, ...]
+
+    @property
+    def sampled(self) -> bool:
+        """Whether frames of the split were left out."""
+        return self.frames + len(self.damaged) < self.frames_in_split
+
+
+def inspect_dataset(
+    root: str | Path, config: Config, *, split: str | None = None, frames: int = 500, progress: bool = False
+) -> Inspection:
+    """Measure `frames` evenly spaced frames of a split, or all of them if there are fewer.
+
+    Args:
+        root: KITTI-layout folder.
+        config: what is to be trained.
+        split: default: the config's data.train_set.
+        progress: show a bar.
+
+    Raises:
+        DatasetError: a list, scan, calibration or label file is missing, anywhere in the split.
+        DatasetError, ScanError: no frame can be read.
+    """
+    dataset = KittiSplit(root, config.data.train_set if split is None else split)
+    _require_files(dataset)
+    in_split = len(dataset.frame_ids)
+    wanted = min(frames, in_split)
+    measured: list[FrameMeasure] = []
+    damaged: list[DatasetError | ScanError] = []
+    for number in track(range(wanted), "Inspecting", disable=not progress, transient=True):
+        try:
+            measured.append(measure_frame(dataset, dataset.frame_ids[number * in_split // wanted], config))
+        except (DatasetError, ScanError) as error:
+            damaged.append(error)
+    if not measured:
+        raise damaged[0]
+    types = sum((frame.types for frame in measured), Counter[str]())
+    return Inspection(
+        data=str(root),
+        split=dataset.name,
+        config=config.name,
+        frames=len(measured),
+        frames_in_split=in_split,
+        frames_without_objects=sum(not len(frame.boxes) for frame in measured),
+        types=dict(types.most_common()),
+        classes=tuple(_class_facts(measured, index, config) for index in range(len(config.detector.classes))),
+        scans=_scan_facts([frame.scan for frame in measured], config.detector),
+        damaged=tuple(map(str, damaged)),
+    )
+
+
+def _require_files(split: KittiSplit) -> None:
+    """Of every frame, not of the inspected ones only: training would stop at the first that lacks one."""
+    paths = [path(frame_id) for path in (split.calib_path, split.label_path) for frame_id in split.frame_ids]
+    if missing := [path for path in paths if not path.exists()]:
+        raise DatasetError(
+            f"{missing[0]}: not there ({len(missing)} of {len(paths)} calibration and label files of '{split.name}' "
+            "are missing); every frame needs both, a label file may be empty"
+        )
+
+
+def _class_facts(frames: Sequence[FrameMeasure], index: int, config: Config) -> ClassFacts:
+    spec, grid = config.detector.classes[index], config.detector.grid
+    own = np.concatenate([frame.labels for frame in frames]) == index
+    boxes = np.concatenate([frame.boxes for frame in frames])[own].astype(np.float64)
+    points = np.concatenate([frame.points for frame in frames])[own]
+    fates = np.concatenate([frame.fates for frame in frames])[own]
+    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
+    outside = (boxes[:, :3] < low) | (boxes[:, :3] >= high)
+    cut = (boxes[:, 2] - boxes[:, 5] / 2 < low[2]) | (boxes[:, 2] + boxes[:, 5] / 2 > high[2])
+    return ClassFacts(
+        name=spec.name,
+        boxes=len(boxes),
+        points=_spread(points),
+        no_points=int((points == 0).sum()),
+        few_points=int((points < config.data.min_points).sum()),
+        size_m=tuple(boxes[:, 3:6].mean(axis=0).tolist()) if len(boxes) else None,
+        size_std_m=tuple(boxes[:, 3:6].std(axis=0).tolist()) if len(boxes) else None,
+        anchor_size_m=(spec.length_m, spec.width_m, spec.height_m),
+        misfits=_misfits(boxes, spec),
+        z_m=float(boxes[:, 2].mean()) if len(boxes) else None,
+        anchor_z_m=spec.z_m,
+        reach_m=tuple((float(axis.min()), float(axis.max())) for axis in boxes[:, :3].T) if len(boxes) else None,
+        outside_xyz=tuple(outside.sum(axis=0).tolist()),
+        cut_in_z=int(cut.sum()),
+        overlapped=int((fates == Fate.OVERLAPPED).sum()),
+        forced=int((fates == Fate.FORCED).sum()),
+        missed=int((fates == Fate.MISSED).sum()),
+        positives=int(sum(frame.positives[index] for frame in frames)),
+    )
+
+
+def _misfits(boxes: NDArray[np.float64], spec: ClassSpec) -> int:
+    """How many boxes stay below positive_iou even with an anchor of their own place and yaw."""
+    in_place = boxes.copy()
+    in_place[:, [0, 1, 6]] = 0
+    anchor = np.array([[0, 0, 0, spec.length_m, spec.width_m, spec.height_m, 0]])
+    return int((aligned_bev_iou(anchor, in_place) < spec.positive_iou).sum())
+
+
+def _scan_facts(scans: Sequence[ScanMeasure], spec: DetectorSpec) -> ScanFacts:
+    column = dict(zip(ScanMeasure._fields, np.array(scans, dtype=np.float64).T, strict=True))
+    points, inside, pillars = column["points"], column["inside"].sum(), column["pillars"]
+    highest, ground = column["stored_reflectance_high"], column["ground_z_m"]
+    bottoms = [item.z_m - item.height_m / 2 for item in spec.classes]
+    above_one = highest[highest > 1]
+    return ScanFacts(
+        points=_some(points),
+        dropped_points=int(column["dropped"].sum()),
+        scans_with_dropped=int((column["dropped"] > 0).sum()),
+        scans_without_points=int((column["inside"] == 0).sum()),
+        outside_share=_share(points.sum() - inside, points.sum()),
+        reflectance_stored=(float(column["stored_reflectance_low"].min()), float(highest.max())),
+        scans_above_one=len(above_one),
+        lowest_above_one=float(above_one.min()) if len(above_one) else None,
+        reflectance=_some(column["reflectance"]),
+        ground_z_m=_spread(ground[np.isfinite(ground)]),
+        anchor_bottoms_m=(min(bottoms), max(bottoms)),
+        pillars=_some(pillars),
+        scans_over_max_pillars=int((pillars > spec.limits.max_pillars).sum()),
+        fullest_pillar=int(column["fullest"].max()),
+        crowded_share=_share(column["crowded"].sum(), pillars.sum()),
+        cut_share=_share(column["cut"].sum(), inside),
+    )
+
+
+def _spread(values: NDArray[np.number]) -> Spread | None:
+    return _some(values) if len(values) else None
+
+
+def _some(values: NDArray[np.number]) -> Spread:
+    return Spread(*np.percentile(values, (10, 50, 90, 100)).tolist())
+
+
+def _share(part: float, whole: float) -> float:
+    return float(part / whole) if whole else 0.0

@@ -1,0 +1,133 @@
+"""One labelled frame, measured as training sees it: by the functions that the training loader calls."""
+
+from collections import Counter
+from dataclasses import replace
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.config import Config
+from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.scans.scan_reader import stored_points
+from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.overlap import aligned_bev_iou
+from asca_pillars.geometry.sensor_height import ground_z_m
+from asca_pillars.geometry.targets import assign_targets
+from asca_pillars.pillars.spec import DetectorSpec
+
+
+class Fate(IntEnum):
+    """What training makes of a labelled object."""
+
+    LEFT_OUT = 0
+    """Too few points, or its center beside the grid."""
+    OVERLAPPED = 1
+    """An anchor overlaps it by positive_iou."""
+    FORCED = 2
+    """None does; the nearest ones are to find it all the same, and fit it badly."""
+    MISSED = 3
+    """No anchor is to find it."""
+
+
+class ScanMeasure(NamedTuple):
+    """A scan as its file has it (stored) and as training sees it, and its pillars before any limit.
+
+    `inside` counts the points seen inside the grid, `reflectance` is the mean over those seen, in 0..1, and
+    `ground_z_m` is NaN where the ground near the sensor cannot be seen. `crowded` pillars have more than max_points,
+    which takes `cut` points away.
+    """
+
+    points: int
+    inside: int
+    dropped: int
+    stored_reflectance_low: float
+    stored_reflectance_high: float
+    reflectance: float
+    ground_z_m: float
+    pillars: int
+    fullest: int
+    crowded: int
+    cut: int
+
+
+class FrameMeasure(NamedTuple):
+    """A frame: its labels by type, the M objects of the C classes, and its scan.
+
+    `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `fates` (M,), `positives` (C,) positive
+    anchors of each class.
+    """
+
+    types: Counter[str]
+    boxes: NDArray[np.float32]
+    labels: NDArray[np.int64]
+    points: NDArray[np.int64]
+    fates: NDArray[np.int64]
+    positives: NDArray[np.int64]
+    scan: ScanMeasure
+
+
+def measure_frame(split: KittiSplit, frame_id: str, config: Config) -> FrameMeasure:
+    """Read a frame without random changes, match it with the anchors, and count.
+
+    Raises:
+        DatasetError, ScanError: a damaged file, see `read_frame`.
+    """
+    spec = config.detector
+    # min_points=0: objects that training ignores for their few points are to be counted by class, too.
+    frame = read_frame(split, frame_id, spec.class_names, camera_view=config.data.camera_view, min_points=0)
+    points = points_in_boxes(frame.points, frame.boxes).sum(axis=0)
+    to_find = replace(frame, labels=np.where(points < config.data.min_points, IGNORED, frame.labels))
+    fates, positives = match(to_find, spec)
+    own = frame.labels != IGNORED
+    return FrameMeasure(
+        types=Counter(item.type for item in split.objects(frame_id)),
+        boxes=frame.boxes[own],
+        labels=frame.labels[own],
+        points=points[own],
+        fates=fates[own],
+        positives=positives,
+        scan=measure_scan(stored_points(split.scan_path(frame_id)), frame.points, spec),
+    )
+
+
+def match(frame: LabeledFrame, spec: DetectorSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The `Fate` of each box (M,), and the number of positive anchors of each class (C,)."""
+    # Rows in the place of the labels tell which boxes the grid holds.
+    kept = within_grid(replace(frame, labels=np.arange(len(frame.boxes))), spec.grid).labels
+    boxes, labels = frame.boxes[kept], frame.labels[kept]
+    targets = assign_targets(spec.anchors, spec.classes, boxes, labels)
+    anchors = spec.anchors.reshape(-1, 7)[targets.positives]
+    fates = np.full(len(frame.boxes), Fate.LEFT_OUT, dtype=np.int64)
+    for row in np.flatnonzero(labels != IGNORED):
+        overlap = aligned_bev_iou(anchors[targets.matched == row], boxes[row : row + 1]).max(initial=0)
+        if overlap >= spec.classes[labels[row]].positive_iou:
+            fates[kept[row]] = Fate.OVERLAPPED
+        else:
+            fates[kept[row]] = Fate.FORCED if overlap > 0 else Fate.MISSED
+    return fates, np.bincount(labels[targets.matched], minlength=len(spec.classes))
+
+
+def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: DetectorSpec) -> ScanMeasure:
+    """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4)."""
+    finite = stored[np.isfinite(stored).all(axis=1)]
+    ground = ground_z_m(finite)
+    cells = spec.grid.cells(seen)
+    per_pillar = np.bincount(cells[cells >= 0])
+    per_pillar = per_pillar[per_pillar > 0]
+    return ScanMeasure(
+        points=len(seen),
+        inside=int(per_pillar.sum()),
+        dropped=len(stored) - len(finite),
+        stored_reflectance_low=float(finite[:, 3].min(initial=0)),
+        stored_reflectance_high=float(finite[:, 3].max(initial=0)),
+        reflectance=float(seen[:, 3].mean(dtype=np.float64)) if len(seen) else 0.0,
+        ground_z_m=np.nan if ground is None else ground,
+        pillars=len(per_pillar),
+        fullest=int(per_pillar.max(initial=0)),
+        crowded=int((per_pillar > spec.limits.max_points).sum()),
+        cut=int(np.maximum(per_pillar - spec.limits.max_points, 0).sum()),
+    )

@@ -1,0 +1,113 @@
+"""KITTI's folder layout.
+
+root/training/velodyne/000000.bin   root/testing/velodyne/...
+              calib/000000.txt                   calib/...
+              label_2/000000.txt                 image_2/...
+              image_2/000000.png (optional)
+     ImageSets/train.txt, val.txt ...: one frame id per line
+"""
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, read_calibration
+from asca_pillars.data.kitti.kitti_labels import KittiObject, read_labels
+from asca_pillars.errors import DatasetError
+from asca_pillars.files import atomic_path
+
+
+@dataclass(frozen=True)
+class KittiSplit:
+    """The frames of one split of a KITTI-layout dataset.
+
+    `name` is a folder, "training" or "testing" (every scan in it), or the name of a list below ImageSets/
+    ("train", "val", "trainval": frames of training/; "test": frames of testing/).
+    """
+
+    root: str | Path
+    name: str = "training"
+
+    @property
+    def folder(self) -> Path:
+        """root/training or root/testing."""
+        return Path(self.root) / ("testing" if self.name in ("test", "testing") else "training")
+
+    @cached_property
+    def frame_ids(self) -> tuple[str, ...]:
+        """The split's frames, sorted, without repetitions; all of them have a scan.
+
+        Raises:
+            DatasetError: the folder or list is missing or empty, or a listed scan does not exist.
+        """
+        scans = {path.stem for path in (self.folder / "velodyne").glob("*.bin")}
+        if not scans:
+            raise DatasetError(
+                f"{self.folder / 'velodyne'}: no *.bin scans there; KITTI's layout is "
+                "<root>/training/{velodyne,calib,label_2}, and <root> is what to give"
+            )
+        if self.name in ("training", "testing"):
+            return tuple(sorted(scans))
+        wanted = _read_image_set(Path(self.root), self.name)
+        if missing := sorted(wanted - scans):
+            raise DatasetError(
+                f"{self.scan_path(missing[0])}: listed in ImageSets/{self.name}.txt but not there "
+                f"({len(missing)} of {len(wanted)} scans are missing); complete the folder or the list"
+            )
+        return tuple(sorted(wanted))
+
+    def scan_path(self, frame_id: str) -> Path:
+        """velodyne/<id>.bin."""
+        return self.folder / "velodyne" / f"{frame_id}.bin"
+
+    def calib_path(self, frame_id: str) -> Path:
+        """calib/<id>.txt."""
+        return self.folder / "calib" / f"{frame_id}.txt"
+
+    def label_path(self, frame_id: str) -> Path:
+        """label_2/<id>.txt."""
+        return self.folder / "label_2" / f"{frame_id}.txt"
+
+    def image_path(self, frame_id: str) -> Path:
+        """image_2/<id>.png, which need not exist."""
+        return self.folder / "image_2" / f"{frame_id}.png"
+
+    def calibration(self, frame_id: str) -> Calibration:
+        """The frame's calibration; DatasetError if it is missing or damaged."""
+        return read_calibration(self.calib_path(frame_id))
+
+    def objects(self, frame_id: str) -> list[KittiObject]:
+        """The frame's labels, DontCare areas included; DatasetError if they are missing or damaged."""
+        return read_labels(self.label_path(frame_id))
+
+    def image_size_wh(self, frame_id: str) -> tuple[int, int]:
+        """Width and height of the frame's image in pixels; KITTI's commonest size where there is no image."""
+        try:
+            with self.image_path(frame_id).open("rb") as file:
+                # PNG: 8 bytes of signature, length and name of the first chunk, then width and height.
+                width, height = struct.unpack(">16x2I", file.read(24))
+        except (OSError, struct.error):
+            return DEFAULT_IMAGE_SIZE_WH
+        return width, height
+
+
+def write_image_set(root: str | Path, name: str, frame_ids: Iterable[str]) -> None:
+    """Write ImageSets/<name>.txt, one frame id per line."""
+    with atomic_path(Path(root) / "ImageSets" / f"{name}.txt") as temporary:
+        temporary.write_text("".join(f"{frame_id}\n" for frame_id in frame_ids), encoding="utf-8")
+
+
+def _read_image_set(root: Path, name: str) -> set[str]:
+    path = root / "ImageSets" / f"{name}.txt"
+    try:
+        frame_ids = set(path.read_text(encoding="utf-8").split())
+    except OSError as error:
+        there = ", ".join(sorted(p.stem for p in path.parent.glob("*.txt"))) or "none"
+        raise DatasetError(
+            f"{path}: no such split (lists there: {there}); write the list, or use 'training' for every scan"
+        ) from error
+    if not frame_ids:
+        raise DatasetError(f"{path}: the list is empty; write one frame id per line")
+    return frame_ids

@@ -1,0 +1,174 @@
+"""KITTI's assignment of detections to ground truth, for all frames and all score thresholds at once.
+
+Ground truth is served in file order, each object taking the best detection that is still free. Inside a frame that is
+sequential; frames and thresholds do not touch each other. So one round serves the first object of every frame at every
+threshold, the next round the second ones, and as many rounds do as the fullest frame has objects with a candidate.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.evaluation.kitti.pairs import Pairs
+from asca_pillars.evaluation.kitti.states import ABSENT, COUNTED
+
+_Doubles = NDArray[np.float64]
+_Indices = NDArray[np.int64]
+_Mask = NDArray[np.bool_]
+
+
+class Judged(NamedTuple):
+    """What one class, difficulty and distance band makes of the objects of all frames.
+
+    Attributes:
+        truth_states: (N,) COUNTED, IGNORED or ABSENT.
+        detection_states: (D,) likewise.
+        scores: (D,).
+        excused: (D,) detections that are not false though they find nothing.
+    """
+
+    truth_states: NDArray[np.int8]
+    detection_states: NDArray[np.int8]
+    scores: _Doubles
+    excused: _Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """True and false positives and missed objects at each of T score thresholds.
+
+    Attributes:
+        counted: objects that count.
+        matched: how many of them the first pass matched with a counted detection.
+        thresholds: (T,) scores, descending; T <= 41.
+        tp, fp, fn: (T,).
+        similarity: (T,) sum over the true positives of what `count` was given for their pairs.
+    """
+
+    counted: int
+    matched: int
+    thresholds: _Doubles
+    tp: _Indices
+    fp: _Indices
+    fn: _Indices
+    similarity: _Doubles
+
+
+def count(pairs: Pairs, metric: str, judged: Judged, similarity: _Doubles, recall_steps: int) -> Counts:
+    """Both passes of the protocol: score thresholds at even steps of recall, then the counts at each of them.
+
+    Args:
+        pairs: those that overlap enough for the class.
+        metric: whose overlap decides in the second pass.
+        similarity: (P,) of the headings of each pair.
+        recall_steps: steps into which the recall from 0 to 1 is cut.
+    """
+    states = judged.truth_states[pairs.truth], judged.detection_states[pairs.detection]
+    present = (states[0] != ABSENT) & (states[1] != ABSENT)
+    pairs, similarity = pairs.where(present), similarity[present]
+    truth_counted, detection_counted = states[0][present] == COUNTED, states[1][present] == COUNTED
+    true = truth_counted & detection_counted
+    scores = judged.scores[pairs.detection]
+
+    # First pass: the highest score wins, the earlier line of the file among equals.
+    best = np.lexsort((pairs.detection, -scores, pairs.truth))
+    taken = assign(pairs, best, np.ones((len(scores), 1), dtype=bool))[:, 0]
+    counted = int((judged.truth_states == COUNTED).sum())
+    thresholds = score_thresholds(scores[taken & true], counted, recall_steps)
+
+    # Second pass: the greatest overlap among counted detections wins; an ignored one is the last resort.
+    overlaps = np.where(detection_counted, pairs.overlaps[metric], 0.0)
+    best = np.lexsort((pairs.detection, -overlaps, ~detection_counted, pairs.truth))
+    found = assign(pairs, best, scores[:, None] >= thresholds)
+
+    alone = (judged.detection_states == COUNTED) & ~judged.excused
+    reported = alone.sum() - np.searchsorted(np.sort(judged.scores[alone]), thresholds)
+    return Counts(
+        counted=counted,
+        matched=int((taken & true).sum()),
+        thresholds=thresholds,
+        tp=found[true].sum(axis=0),
+        fp=reported - found[alone[pairs.detection]].sum(axis=0),
+        fn=counted - found[truth_counted].sum(axis=0),
+        similarity=_sums(found[true], similarity[true]),
+    )
+
+
+def assign(pairs: Pairs, best: _Indices, candidates: _Mask) -> _Mask:
+    """Let each ground truth in turn take the first candidate in its order of preference that is still free.
+
+    Args:
+        pairs: P pairs.
+        best: (P,) order of the pairs: by ground truth, and for each of them the preferred detections first.
+        candidates: (P, T) which pairs may be matched, in each of T separate assignments.
+
+    Returns:
+        (P, T) which pairs are matched.
+    """
+    found = np.zeros_like(candidates)
+    _, detection = np.unique(pairs.detection, return_inverse=True)
+    used = np.zeros((detection.max(initial=-1) + 1, candidates.shape[1]), dtype=bool)
+    for rows, starts in _rounds(pairs.truth[best], pairs.frame[best]):
+        chosen = best[rows]
+        free = candidates[chosen] & ~used[detection[chosen]]
+        first = _first_true(free, starts)
+        found[chosen] = first
+        # A round serves one object per frame, so that no detection stands here twice.
+        used[detection[chosen]] |= first
+    return found
+
+
+def score_thresholds(scores: _Doubles, counted: int, recall_steps: int) -> _Doubles:
+    """Those scores at which recall comes nearest to 0, 1 / recall_steps, 2 / recall_steps ...; descending.
+
+    Args:
+        scores: (S,) of the matched objects, in any order.
+        counted: objects that recall 1 stands for, >= S.
+    """
+    ranked = np.sort(scores)[::-1]
+    chosen: list[float] = []
+    recall = 0.0
+    for index, score in enumerate(ranked.tolist(), start=1):
+        # The next score is nearer to the wanted recall than this one is; the last score has no next.
+        if index < len(ranked) and (index + 1) / counted - recall < recall - index / counted:
+            continue
+        chosen.append(score)
+        recall += 1 / recall_steps
+    return np.array(chosen, dtype=np.float64)
+
+
+def _rounds(truth: _Indices, frame: _Indices) -> Iterator[tuple[_Indices, _Indices]]:
+    """The rows of each round, and where in them the rows of each ground truth begin.
+
+    Round k holds the k-th ground truth of every frame. `truth` and `frame` ascend: (P,), (P,).
+    """
+    starts = np.flatnonzero(np.diff(truth, prepend=-1))
+    lengths = np.diff(starts, append=len(truth))
+    frame_starts = np.flatnonzero(np.diff(frame[starts], prepend=-1))
+    turns = np.arange(len(starts)) - np.repeat(frame_starts, np.diff(frame_starts, append=len(starts)))
+    row_turns = np.repeat(turns, lengths)
+    rows = np.argsort(row_turns, kind="stable")
+    cuts = np.searchsorted(row_turns[rows], np.arange(turns.max(initial=-1) + 2))
+    for turn, (low, high) in enumerate(pairwise(cuts)):
+        sizes = lengths[turns == turn]
+        yield rows[low:high], np.cumsum(sizes) - sizes
+
+
+def _first_true(mask: _Mask, starts: _Indices) -> _Mask:
+    """The first true row of each run of rows, in every column: (R, T), starts of the G runs (G,) -> (R, T)."""
+    row = np.arange(len(mask), dtype=np.int32)[:, None]
+    place = np.where(mask, row, np.int32(len(mask)))
+    first = np.minimum.reduceat(place, starts, axis=0)
+    matched: _Mask = row == np.repeat(first, np.diff(starts, append=len(mask)), axis=0)
+    return matched
+
+
+def _sums(mask: _Mask, values: _Doubles) -> _Doubles:
+    """Sum of the values (P,) that each column of the mask (P, T) chooses: (T,)."""
+    rows, columns = np.nonzero(mask)
+    sums: _Doubles = np.bincount(columns, weights=values[rows], minlength=mask.shape[1]).astype(np.float64)
+    return sums

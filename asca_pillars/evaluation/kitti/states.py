@@ -1,0 +1,90 @@
+"""Which objects KITTI counts, which it ignores and which it does not see, per class and difficulty.
+
+An ignored object need not be found, but it takes a detection; an ignored detection is never false, but it takes an
+object. An absent one does neither.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.frames import NEIGHBOR_TYPES
+from asca_pillars.evaluation.kitti.objects import FrameObjects
+
+COUNTED, IGNORED, ABSENT = 0, 1, -1
+
+# Types so like a class that finding one is no mistake, and missing one neither.
+NEIGHBORS: Mapping[str, str] = {name.casefold(): other.casefold() for name, other in NEIGHBOR_TYPES.items()}
+
+_Band = tuple[float, float]
+
+
+class Limits(NamedTuple):
+    """What counts at one difficulty; the limits themselves still count."""
+
+    min_height_px: float
+    max_occluded: int
+    max_truncated: float
+
+
+LIMITS: Mapping[str, Limits] = {
+    "easy": Limits(40.0, 0, 0.15),
+    "moderate": Limits(25.0, 1, 0.30),
+    "hard": Limits(25.0, 2, 0.50),
+}
+
+
+def is_type(objects: FrameObjects, name: str) -> NDArray[np.bool_]:
+    """(N,) which objects are of the named type, compared without case."""
+    mask: NDArray[np.bool_] = objects.folded_types == name.casefold()
+    return mask
+
+
+def is_neighbor(objects: FrameObjects, class_name: str) -> NDArray[np.bool_]:
+    """(N,) which objects are ignored beside the class: Van for Car, Person_sitting for Pedestrian."""
+    neighbor = NEIGHBORS.get(class_name.casefold())
+    return np.zeros(len(objects), dtype=bool) if neighbor is None else is_type(objects, neighbor)
+
+
+def truth_states(
+    truth: FrameObjects, class_name: str, difficulty: str, band_m: _Band | None = None
+) -> NDArray[np.int8]:
+    """(N,) COUNTED, IGNORED or ABSENT for ground truth.
+
+    Counted: of the class and within the difficulty's limits. Ignored: of the class but beyond a limit, or of its
+    neighboring type. Absent: every other type. In a distance band, what is counted but stands at a horizontal
+    distance outside [low, high) is ignored.
+    """
+    limits = LIMITS[difficulty]
+    beyond = truth.bbox[:, 3] - truth.bbox[:, 1] < limits.min_height_px
+    beyond |= (truth.occluded > limits.max_occluded) | (truth.truncated > limits.max_truncated)
+    own = is_type(truth, class_name)
+    counted = own & ~beyond & _in_band(truth, band_m)
+    return _states(counted, own | is_neighbor(truth, class_name))
+
+
+def detection_states(
+    detections: FrameObjects, class_name: str, difficulty: str, band_m: _Band | None = None
+) -> NDArray[np.int8]:
+    """(N,) COUNTED, IGNORED or ABSENT for detections.
+
+    Ignored: lower in the image than the difficulty's minimum, *whatever the class*. Counted: otherwise, if of the
+    class. Absent: every other type. In a distance band, what is counted but stands at a horizontal distance outside
+    [low, high) is ignored.
+    """
+    low = np.abs(detections.bbox[:, 1] - detections.bbox[:, 3]) < LIMITS[difficulty].min_height_px
+    own = is_type(detections, class_name)
+    return _states(own & ~low & _in_band(detections, band_m), own | low)
+
+
+def _in_band(objects: FrameObjects, band_m: _Band | None) -> NDArray[np.bool_]:
+    if band_m is None:
+        return np.ones(len(objects), dtype=bool)
+    inside: NDArray[np.bool_] = (objects.distances_m >= band_m[0]) & (objects.distances_m < band_m[1])
+    return inside
+
+
+def _states(counted: NDArray[np.bool_], present: NDArray[np.bool_]) -> NDArray[np.int8]:
+    return np.where(counted, COUNTED, np.where(present, IGNORED, ABSENT)).astype(np.int8)

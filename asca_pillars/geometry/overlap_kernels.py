@@ -1,0 +1,99 @@
+"""The loop of `rotated_nms`, compiled; what it computes is said in `overlap`, in NumPy.
+
+Here the cosine of the turn between two boxes is a sum of products of theirs, so overlaps differ in their last digits:
+the same boxes stay unless an overlap is within 1e-12 or so of the threshold.
+"""
+
+import math
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.compiling import compiled, given, inner, written
+
+_Doubles = NDArray[np.float64]
+_Integers = NDArray[np.int64]
+
+
+def suppress(boxes: _Doubles, iou_threshold: float, limit: int) -> _Integers:
+    """`overlap._suppress`, box by box."""
+    kept = np.empty(len(boxes), np.int64)
+    count = _suppress(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
+    return kept[:count]
+
+
+@inner
+def _within(value: float, limit: float) -> float:
+    return -limit if value < -limit else (limit if value > limit else value)
+
+
+@inner
+def _share(part: float, whole: float) -> float:
+    share = part / whole if abs(part) < abs(whole) else 1.0
+    return share if share > 0.0 else 0.0
+
+
+@inner
+def _shared_area(x: float, y: float, cos: float, sin: float, al: float, aw: float, bl: float, bw: float) -> float:
+    """`paired_bev_intersection` for a of half extents al, aw, seen from b of half extents bl, bw."""
+    cos_abs, sin_abs = abs(cos), abs(sin)
+    if (
+        abs(x) >= bl + cos_abs * al + sin_abs * aw
+        or abs(y) >= bw + sin_abs * al + cos_abs * aw
+        or abs(cos * x + sin * y) >= al + cos_abs * bl + sin_abs * bw
+        or abs(cos * y - sin * x) >= aw + sin_abs * bl + cos_abs * bw
+    ):
+        return 0.0
+    area = 0.0
+    along, across = al, aw
+    x0, y0 = x + cos * along - sin * across, y + sin * along + cos * across
+    for corner in range(4):
+        if corner % 2 == 0:
+            along = -along
+        else:
+            across = -across
+        x1, y1 = x + cos * along - sin * across, y + sin * along + cos * across
+        left, right = _within(x0, bl), _within(x1, bl)
+        y_left = y0 + (y1 - y0) * _share(left - x0, x1 - x0)
+        y_right = y1 - (y1 - y0) * _share(x1 - right, x1 - x0)
+        low, high = _within(y_left, bw), _within(y_right, bw)
+        before = _share(abs(y_left - low), abs(y_right - y_left))
+        after = _share(abs(y_right - high), abs(y_right - y_left))
+        area -= (right - left) * ((low + high) / 2 + (before - after) * (low - high) / 2)
+        x0, y0 = x1, y1
+    return min(max(area, 0.0), 4 * min(al * aw, bl * bw))
+
+
+@compiled(
+    *(given(types.float64, 2), types.float64, types.int64),
+    *(written(types.float64, 2), written(types.float64, 2), written(types.int64)),
+)
+def _suppress(
+    boxes: _Doubles, iou_threshold: float, limit: int, circles: _Doubles, shapes: _Doubles, kept: _Integers
+) -> int:
+    """`circles`: x, y and radius of the kept boxes; `shapes`: half length, half width, area, cosine and sine."""
+    count = 0
+    for i in range(len(boxes)):
+        if count == limit:
+            break
+        x, y, bl, bw, area = boxes[i, 0], boxes[i, 1], boxes[i, 3] / 2, boxes[i, 4] / 2, boxes[i, 3] * boxes[i, 4]
+        cos, sin, reach = math.cos(boxes[i, 6]), math.sin(boxes[i, 6]), math.hypot(bl, bw)
+        clash = False
+        for k in range(count):
+            dx, dy, reaches = circles[k, 0] - x, circles[k, 1] - y, circles[k, 2] + reach
+            if dx * dx + dy * dy < reaches * reaches:
+                al, aw, a_cos, a_sin = shapes[k, 0], shapes[k, 1], shapes[k, 3], shapes[k, 4]
+                turn_cos, turn_sin = a_cos * cos + a_sin * sin, a_sin * cos - a_cos * sin
+                shared = _shared_area(cos * dx + sin * dy, cos * dy - sin * dx, turn_cos, turn_sin, al, aw, bl, bw)
+                union = shapes[k, 2] + area - shared
+                if union > 0 and shared / union > iou_threshold:
+                    clash = True
+                    break
+        if not clash:
+            circles[count, 0], circles[count, 1], circles[count, 2] = x, y, reach
+            shapes[count, 0], shapes[count, 1], shapes[count, 2] = bl, bw, area
+            shapes[count, 3], shapes[count, 4] = cos, sin
+            kept[count] = i
+            count += 1
+    return count

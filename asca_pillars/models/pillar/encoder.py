@@ -1,0 +1,81 @@
+"""Feature encoding network: points of pillars -> one feature vector per pillar (section 3.2 of the paper)."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from asca_pillars.config import CpaReading
+from asca_pillars.models.pillar.attention import ChannelAttention, PaperAttention, PointAttention
+from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
+
+NORM_EPS, NORM_MOMENTUM = 1e-3, 0.01  # of every batch normalisation, as in PointPillars
+
+
+@torch.library.custom_op("asca::pillar_max", mutates_args=())
+def _traced_pillar_max(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+    return torch.segment_reduce(features, "max", lengths=point_counts, unsafe=True)
+
+
+@_traced_pillar_max.register_fake
+def _(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+    return features.new_empty(point_counts.shape[0], features.shape[1])
+
+
+def pillar_max(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+    """Largest value of each channel among the points of each pillar: (M, C) -> (P, C).
+
+    Points lie flat, without padding, so nothing but real points can win. While a graph is exported the reduction is
+    one named operator, because the exporter knows no segment reduction (asca_export.graphs translates it).
+    """
+    if torch.compiler.is_exporting():
+        pooled: Tensor = _traced_pillar_max(features, pillar_index, point_counts)
+        return pooled
+    return torch.segment_reduce(features, "max", lengths=point_counts, unsafe=True)
+
+
+class PillarEncoder(nn.Module):
+    """PFN and CPA: Linear(9 -> C), BatchNorm, ReLU, max over the points of a pillar, attention.
+
+    Args:
+        channels: C, features of one pillar.
+        cpa: reading of the attention; `point` acts before the max, `paper` and `channel` after it.
+        limits: caps on pillars and points, which the `paper` and `point` readings lay their tables out for.
+    """
+
+    def __init__(self, channels: int, cpa: CpaReading, limits: PillarLimits) -> None:
+        super().__init__()
+        self.linear = nn.Linear(len(FEATURES), channels, bias=False)
+        self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
+        self.point_attention = PointAttention(channels, limits.max_points) if cpa == "point" else None
+        self.pillar_attention: nn.Module | None = None
+        if cpa == "paper":
+            self.pillar_attention = PaperAttention(channels, limits.max_pillars)
+        elif cpa == "channel":
+            self.pillar_attention = ChannelAttention(channels)
+
+    def forward(
+        self,
+        features: Tensor,
+        pillar_index: Tensor,
+        point_counts: Tensor,
+        frame_pillars: Sequence[int] | None = None,
+    ) -> Tensor:
+        """Point features (M, 9) -> pillar features (P, C).
+
+        Args:
+            features: (M, 9) decorated points, see `geometry.pillarize.FEATURES`.
+            pillar_index: (M,) pillar of each point, ascending.
+            point_counts: (P,) points of each pillar.
+            frame_pillars: pillars of each frame of a batch, summing to P; None is one frame.
+        """
+        points = torch.relu(self.norm(self.linear(features)))  # (M, C)
+        if self.point_attention is not None:
+            points = self.point_attention(points, pillar_index, point_counts)
+        pillars = pillar_max(points, pillar_index, point_counts)  # (P, C)
+        if self.pillar_attention is None:
+            return pillars
+        if frame_pillars is None:
+            attended: Tensor = self.pillar_attention(pillars)
+            return attended
+        return torch.cat([self.pillar_attention(frame) for frame in pillars.split(list(frame_pillars))])

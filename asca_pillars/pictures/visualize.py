@@ -1,0 +1,218 @@
+"""Pictures of scans and boxes, from above and over the camera image: uint8 BGR, as OpenCV has them."""
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.kitti.calibration import Calibration, project_edges
+from asca_pillars.files import atomic_path
+from asca_pillars.geometry.boxes import footprints
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.pictures.drawing import BACKGROUND, OVERSAMPLING, SUBPIXEL_BITS, Color, Image, Texts, View, subpixels
+from asca_pillars.pillars.grid import PillarGrid
+
+_CLASS_COLORS: dict[str, Color] = {
+    "Car": (40, 165, 255),
+    "Pedestrian": (150, 80, 255),
+    "Cyclist": (120, 235, 60),
+}
+_OTHER_COLORS: tuple[Color, ...] = ((255, 200, 70), (255, 120, 200), (90, 230, 230), (200, 200, 200))
+_RING, _GRAY, _WHITE = (74, 62, 54), (190, 180, 172), (255, 255, 255)
+_POINT_PX = 3
+_LEGEND_PX, _LEGEND_ROW_PX = 200, 22  # width kept free for it, and height of a row
+_RING_TEXT_DEG = (-40, -30, 40, 30, 0, -135, 135, 180)
+
+
+def class_color(name: str) -> Color:
+    """The BGR color of a class: the same in every picture, whatever else is in it."""
+    return _CLASS_COLORS.get(name) or _OTHER_COLORS[zlib.crc32(name.encode()) % len(_OTHER_COLORS)]
+
+
+def write_png(path: str | Path, image: Image) -> None:
+    """Write an image (H, W, 3) as PNG."""
+    encoded = cv2.imencode(".png", image)[1]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+
+
+@dataclass(frozen=True, eq=False)
+class BoxLayer:
+    """Boxes that are drawn alike, and their line in the legend."""
+
+    name: str
+    boxes: NDArray[np.floating]
+    """(N, 7) LiDAR boxes."""
+    color: Color
+    texts: Sequence[str] = ()
+    """What stands beside each box; nothing if empty."""
+    thickness_px: int = 4
+    """Of the outline, before the picture is made half as large."""
+
+
+def draw_bev(
+    points: NDArray[np.floating],
+    detections: Detections | None,
+    grid: PillarGrid,
+    *,
+    labels: NDArray[np.floating] | None = None,
+    width_px: int = 1000,
+) -> Image:
+    """A scan from above: (H, width_px, 3), the LiDAR's x upwards and y to the left.
+
+    Args:
+        points: (N, >=3) metres; those in the grid's x and y range are drawn, the higher the brighter.
+        detections: drawn in their class's color with their score; a line leads from the center to the front.
+        labels: ground truth boxes (M, 7), drawn thin and white.
+
+    The picture shows the part of the grid's range in which there is something.
+    """
+    layers = []
+    found = Detections.empty(()) if detections is None else detections
+    for label, name in enumerate(found.class_names):
+        own = found[found.labels == label]
+        layers.append(BoxLayer(name, own.boxes, class_color(name), [f"{score:.2f}" for score in own.scores]))
+    if labels is not None and len(labels):
+        layers.append(BoxLayer("ground truth", labels, _WHITE, thickness_px=2))
+    return draw_layers(points, layers, grid, width_px=width_px)
+
+
+def draw_layers(
+    points: NDArray[np.floating], layers: Sequence[BoxLayer], grid: PillarGrid, *, width_px: int = 1000
+) -> Image:
+    """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend."""
+    points = points[_in_range(points, grid)]
+    outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
+    view = View.around(np.concatenate([points[:, :2], *(o.reshape(-1, 2) for o in outlines)]), grid, width_px)
+
+    canvas = np.full((view.height_px, view.width_px, 3), BACKGROUND, np.uint8)
+    texts = Texts(canvas, 0.42 * OVERSAMPLING)
+    _draw_rings(texts, view, legend_rows=len(layers))
+    _draw_points(canvas, view, points)
+    for layer, layer_outlines in reversed(list(zip(layers, outlines, strict=True))):
+        for outline in layer_outlines:
+            _draw_footprint(canvas, view.pixels(outline), layer.color, layer.thickness_px)
+    _draw_legend(texts, view, layers)
+    for layer, layer_outlines in zip(layers, outlines, strict=True):
+        for outline, text in zip(layer_outlines, layer.texts, strict=bool(layer.texts)):
+            if view.shows(view.pixels(outline.mean(axis=0))):
+                _put_beside(texts, view.pixels(outline), text, layer.color)
+    size = (view.width_px // OVERSAMPLING, view.height_px // OVERSAMPLING)
+    return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def draw_on_image(
+    image: Image,
+    boxes: NDArray[np.floating],
+    names: Sequence[str],
+    scores: Sequence[float] | NDArray[np.floating] | None,
+    calib: Calibration,
+    *,
+    colors: Sequence[Color] | None = None,
+) -> Image:
+    """A copy of a camera image (H, W, 3) with LiDAR boxes (N, 7) as wireframes, their front faces tinted.
+
+    `scores` is None for ground truth, `colors` for those of the classes. What lies behind the camera is cut off.
+    """
+    colors = [class_color(name) for name in names] if colors is None else colors
+    canvas = image.copy()
+    edges = project_edges(boxes, calib)
+    _, depths_m = calib.project(np.asarray(boxes)[:, :3])
+    far_to_near = [int(i) for i in np.argsort(-depths_m, kind="stable") if np.isfinite(edges[i]).any()]
+    for i in far_to_near:
+        color = colors[i]
+        front = edges[i, [3, 11, 7, 8]]
+        if np.isfinite(front).all():
+            # Corners 3, 0, 4, 7 go round the front. With an edge behind the camera there is nothing to fill.
+            face = np.array([front[0, 0], front[0, 1], front[2, 1], front[2, 0]])
+            tinted = canvas.copy()
+            cv2.fillPoly(tinted, [subpixels(face)], color, cv2.LINE_AA, SUBPIXEL_BITS)
+            canvas = cv2.addWeighted(tinted, 0.35, canvas, 0.65, 0)
+        thickness = 2 if depths_m[i] < 25 else 1
+        for ends in edges[i][np.isfinite(edges[i]).all(axis=(1, 2))]:
+            cv2.polylines(canvas, [subpixels(ends)], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+    texts = Texts(canvas, 0.42)
+    for i in reversed(far_to_near):
+        visible = edges[i].reshape(-1, 2)
+        visible = visible[np.isfinite(visible).all(axis=1)]
+        low, high = visible.min(axis=0), visible.max(axis=0)
+        if (high > 0).all() and (low < (canvas.shape[1], canvas.shape[0])).all():
+            text = names[i] if scores is None else f"{names[i]} {scores[i]:.2f}"
+            texts.put(text, [(low[0], low[1] - 5), (low[0], high[1] + 14)], colors[i])
+    return np.asarray(canvas, dtype=np.uint8)
+
+
+def _in_range(points: NDArray[np.floating], grid: PillarGrid) -> NDArray[np.bool_]:
+    (x_min, x_max), (y_min, y_max) = grid.x_range_m, grid.y_range_m
+    x, y = points[:, 0], points[:, 1]
+    return (x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max)
+
+
+def _draw_points(canvas: Image, view: View, points: NDArray[np.floating]) -> None:
+    if not len(points):
+        return
+    points = points[np.argsort(points[:, 2])]  # the highest last, on top
+    ground_m = np.percentile(points[:, 2], 10)
+    height = np.clip((points[:, 2] - ground_m) / 3.0, 0, 1)
+    ramp = np.round(70 + 185 * height).astype(np.uint8)[:, None]
+    colors = cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS)[:, 0]
+    columns, rows = view.pixels(points[:, :2]).astype(np.int64).T
+    for down in range(_POINT_PX):
+        for right in range(_POINT_PX):
+            row = np.minimum(rows + down, view.height_px - 1)
+            canvas[row, np.minimum(columns + right, view.width_px - 1)] = colors
+
+
+def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
+    """Circles of equal distance to the sensor, with texts beside the legend's place, and the sensor as an arrow."""
+    legend = np.array([_LEGEND_PX, _LEGEND_ROW_PX * (legend_rows + 1)]) * OVERSAMPLING
+    reach_m = math.hypot(view.x_max_m, max(abs(view.y_max_m), abs(view.y_max_m - view.width_px / view.px_per_m)))
+    step_m = 10 if reach_m < 100 else 20
+    around = np.radians(np.arange(360))
+    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+    for radius_m in range(step_m, math.ceil(reach_m) + 1, step_m):
+        ring = view.pixels(radius_m * circle)
+        cv2.polylines(texts.canvas, [subpixels(ring)], True, _RING, 2, cv2.LINE_AA, SUBPIXEL_BITS)
+        # Beside the way ahead, where there is the least to hide; elsewhere only if the picture does not show that.
+        places = [ring[angle_deg] for angle_deg in _RING_TEXT_DEG]
+        visible = [pixel for pixel in places if view.shows(pixel, 60) and (pixel > legend).any()]
+        if visible:
+            texts.put(f"{radius_m} m", [(visible[0][0] - 20, visible[0][1] + 8)], _GRAY)
+    arrow = view.pixels(np.array([[1.3, 0], [-0.5, 0.8], [0, 0], [-0.5, -0.8]]))
+    cv2.fillPoly(texts.canvas, [subpixels(arrow)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def _draw_footprint(canvas: Image, outline: NDArray[np.float64], color: Color, thickness: int) -> None:
+    front, center = (outline[0] + outline[3]) / 2, outline.mean(axis=0)
+    for line, closed in ((outline, True), (np.array([center, front]), False)):
+        cv2.polylines(canvas, [subpixels(line)], closed, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def _put_beside(texts: Texts, outline: NDArray[np.float64], text: str, color: Color) -> None:
+    (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
+    width, height = texts.size(text)
+    middle = (top + bottom + height) / 2
+    above = ((left + right - width) / 2, top - 8)
+    below = (above[0], bottom + height + 8)
+    texts.put(text, [(right + 8, middle), (left - width - 8, middle), above, below], color)
+
+
+def _draw_legend(texts: Texts, view: View, layers: Sequence[BoxLayer]) -> None:
+    """Legend with the number of boxes of each layer, and the scale."""
+    rows = [(f"{layer.name}  {len(layer.boxes)}", layer.color) for layer in layers]
+    line = _LEGEND_ROW_PX * OVERSAMPLING
+    for number, (text, color) in enumerate(rows):
+        left, base = 16 * OVERSAMPLING, 12 * OVERSAMPLING + (number + 1) * line - line // 4
+        cv2.rectangle(texts.canvas, (left, base - line // 2), (left + line // 2, base), color, -1)
+        texts.put(text, [(left + line, base)], _WHITE)
+    length_m = 10
+    right, base = view.width_px - 16 * OVERSAMPLING, view.height_px - 14 * OVERSAMPLING
+    left = right - round(length_m * view.px_per_m)
+    cv2.line(texts.canvas, (left, base), (right, base), _WHITE, 2 * OVERSAMPLING, cv2.LINE_AA)
+    text = f"{length_m} m"
+    texts.put(text, [((left + right - texts.size(text)[0]) / 2, base - 6 * OVERSAMPLING)], _WHITE)

@@ -1,0 +1,195 @@
+"""Points -> pillars: the network's input (paper section 3.2), in training, export and on the vehicle.
+
+Pillars are flat: the kept points of all pillars stand one after another, and `pillar_index` says whose each
+is. Nothing is padded, so nothing needs to be masked later.
+"""
+
+import zlib
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.kernels import load_kernels
+from asca_pillars.pillars.grid import PillarGrid
+
+FEATURES = ("x", "y", "z", "reflectance", "x_mean", "y_mean", "z_mean", "x_center", "y_center")
+"""Channels of a point (D = 9 of the paper): position in metres, LiDAR frame; reflectance; offsets in metres
+to the mean of the pillar's kept points and to the pillar's centre."""
+
+
+@dataclass(frozen=True)
+class PillarLimits:
+    """Upper bounds of one scan's input; a random subset is kept beyond them (P and N of the paper)."""
+
+    max_pillars: int = 12000
+    max_points: int = 64
+    """Points of one pillar."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
+    def __post_init__(self) -> None:
+        for name in ("max_pillars", "max_points"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} {getattr(self, name)} must be at least 1")
+
+
+@dataclass(frozen=True)
+class PillarCounts:
+    """What became of a scan's points: points = kept + points_outside + points_over_limit."""
+
+    points: int
+    """Points of the scan."""
+    points_outside: int
+    """Points outside the grid's ranges, or not finite."""
+    points_over_limit: int
+    """Points inside that either limit dropped."""
+    pillars: int
+    """Pillars kept."""
+    pillars_over_limit: int
+    """Pillars that hold points but were dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pillars:
+    """The pillars of one scan: M kept points in P pillars, both in flat-index order of the pillars.
+
+    Within a pillar the points keep the order of the scan.
+    """
+
+    features: NDArray[np.float32]
+    """(M, 9), channels as in FEATURES."""
+    pillar_index: NDArray[np.int64]
+    """(M,) the pillar 0..P-1 of each point, non-decreasing."""
+    point_counts: NDArray[np.int64]
+    """(P,) kept points of each pillar, at least 1."""
+    cells: NDArray[np.int64]
+    """(P,) flat grid index row * nx + column of each pillar, ascending."""
+    stats: PillarCounts
+
+
+def pillarize(
+    points: NDArray[np.float32],
+    grid: PillarGrid,
+    limits: PillarLimits,
+    rng: np.random.Generator | None = None,
+) -> Pillars:
+    """Sort a scan's points into pillars and compute their nine features (paper section 3.2).
+
+    Args:
+        points: (N, 4) float32 x, y, z in metres (LiDAR frame) and reflectance in [0, 1]; N may be 0.
+        rng: draws the subset kept beyond the limits. None seeds the draw by the points themselves, so that a
+            scan always gives the same pillars; training passes a generator.
+
+    Raises:
+        ValueError: if `points` is not (N, 4).
+    """
+    if points.ndim != 2 or points.shape[1] != 4:
+        raise ValueError(f"points must have shape (N, 4), not {points.shape}")
+    points = np.require(points, np.float32, ["C", "ALIGNED"])
+    kernels = load_kernels()
+    sort, fill = (_sort_points, _fill_pillars) if kernels is None else (kernels.sort_points, kernels.fill_pillars)
+    order, cells, counts = sort(points, grid)
+    kept, shuffled = _draw(points, counts, limits, rng)
+    features, pillar_index, point_counts = fill(points, order, cells, counts, kept, shuffled, limits.max_points, grid)
+    return Pillars(
+        features=features,
+        pillar_index=pillar_index,
+        point_counts=point_counts,
+        cells=cells[kept],
+        stats=PillarCounts(
+            points=len(points),
+            points_outside=len(points) - len(order),
+            points_over_limit=len(order) - len(features),
+            pillars=len(point_counts),
+            pillars_over_limit=len(cells) - len(point_counts),
+        ),
+    )
+
+
+def _draw(
+    points: NDArray[np.float32], counts: NDArray[np.int64], limits: PillarLimits, rng: np.random.Generator | None
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Which pillars stay, (Q,) bool, and in which order the points of the crowded ones among them are taken, (K,)."""
+    kept = np.ones(len(counts), bool)
+    if len(counts) <= limits.max_pillars and counts.max(initial=0) <= limits.max_points:
+        return kept, np.empty(0, np.int64)
+    if rng is None:
+        rng = np.random.default_rng(zlib.crc32(points.data))
+    kept[rng.permutation(len(counts))[limits.max_pillars :]] = False
+    crowded = kept & (counts > limits.max_points)
+    return kept, rng.permutation(counts[crowded].sum())
+
+
+def _sort_points(
+    points: NDArray[np.float32], grid: PillarGrid
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the points inside, sorted by cell; the occupied cells, ascending; how many points each holds."""
+    cell_of_point = grid.cells(points)
+    order = np.flatnonzero(cell_of_point >= 0)
+    order = order[_stable_argsort(cell_of_point[order])]
+    starts = np.flatnonzero(np.diff(cell_of_point[order], prepend=-1))
+    return order, cell_of_point[order[starts]], np.diff(starts, append=len(order))
+
+
+def _stable_argsort(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """np.argsort(keys, kind="stable") for keys >= 0, several times faster.
+
+    NumPy sorts 16-bit integers by radix, so one pass per 16-bit digit does it. Stable, hence the same on
+    every machine, which NumPy's default sort is not.
+    """
+    order = np.arange(len(keys))
+    for shift in range(0, int(keys.max(initial=0)).bit_length(), 16):
+        digit = (keys[order] >> shift).astype(np.uint16)
+        order = order[np.argsort(digit, kind="stable")]
+    return order
+
+
+def _fill_pillars(
+    points: NDArray[np.float32],
+    order: NDArray[np.int64],
+    cells: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    kept: NDArray[np.bool_],
+    shuffled: NDArray[np.int64],
+    max_points: int,
+    grid: PillarGrid,
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
+    """Features (M, 9), pillar index (M,) and points per pillar (P,) of what is kept.
+
+    Args:
+        order: the points inside, sorted by pillar; `cells` (Q,) and `counts` (Q,) describe the pillars.
+        kept: (Q,) which pillars stay.
+        shuffled: 0..K-1 in any order, one for each point of the crowded pillars that stay: of these points, taken in
+            this order, the first `max_points` of each pillar stay.
+    """
+    pillar_of_point = np.repeat(np.arange(len(cells)), counts)
+    stays = kept[pillar_of_point]
+    crowd = np.flatnonzero(stays & (counts > max_points)[pillar_of_point])[shuffled]
+    crowd = crowd[_stable_argsort(pillar_of_point[crowd])]
+    first = np.searchsorted(pillar_of_point[crowd], pillar_of_point[crowd])
+    stays[crowd[np.arange(len(crowd)) - first >= max_points]] = False
+
+    point_counts = np.minimum(counts[kept], max_points)
+    features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centres_m(cells[kept]))
+    return features, np.repeat(np.arange(len(point_counts)), point_counts), point_counts
+
+
+def _features(
+    points: NDArray[np.float32], counts: NDArray[np.int64], centres_m: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Points sorted by pillar (M, 4), points per pillar (P,) and pillar centres (P, 2) -> (M, 9)."""
+    features = np.empty((len(points), len(FEATURES)), np.float32)
+    pillar_index = np.repeat(np.arange(len(counts)), counts)
+    # One channel at a time: NumPy is slow along an axis as short as the channels'.
+    for channel in range(4):
+        features[:, channel] = points[:, channel]
+    for axis in range(3):
+        # bincount sums in float64 and in order, so the mean does not depend on the machine.
+        means = np.bincount(pillar_index, weights=points[:, axis], minlength=len(counts)) / counts
+        features[:, 4 + axis] = points[:, axis] - np.repeat(means.astype(np.float32), counts)
+    for axis in range(2):
+        features[:, 7 + axis] = points[:, axis] - np.repeat(centres_m[:, axis], counts)
+    return features

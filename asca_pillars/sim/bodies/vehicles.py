@@ -1,0 +1,216 @@
+"""Cars and vans as triangle meshes around the origin: x ahead, wheels on z = 0.
+
+A car is lofted: at stations along its length stand cross-sections (sill, waist, belt, edge of hood or roof, and on
+to the middle), joined by panels that are paint below the belt and glass above it. Hood and roof are crowned, nose and
+tail are bowed in plan, as those of real cars are: a ring of a LiDAR draws arcs on them. Bodies are given by the size
+of the BODY, not of the looser label box.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, quads
+from asca_pillars.sim.bodies.styles import Paint, Profile, draw_paint
+
+Floats = npt.NDArray[np.float64]
+MIRROR = np.array([1.0, -1.0, 1.0])
+_SPOKES = 10
+
+
+def _unit_wheel() -> Floats:
+    """Tread (without its width), sidewall and rim of a wheel of radius 1: corners (25,4,3), the rim's two by two."""
+    angle = np.linspace(0, 2 * np.pi, _SPOKES + 1)
+    ring = np.stack([np.cos(angle), np.zeros(_SPOKES + 1), np.sin(angle)], axis=1)
+    a, b = ring[:-1], ring[1:]
+    return np.concatenate(
+        [np.stack([a, b, b, a], 1), np.stack([a, b, 0.65 * b, 0.65 * a], 1),
+         0.65 * np.stack([a[::2], b[::2], b[1::2], np.zeros_like(a[::2])], 1)]
+    )  # fmt: skip
+
+
+_WHEEL = _unit_wheel()
+_LID = ((1.0, 1.0), (0.85, 0.66), (0.45, 0.2), (0.0, 0.0))  # across hood and roof: share of half width, of the crown
+
+
+class _Hull(NamedTuple):
+    """Dimensions of one body, metres, and its style."""
+
+    length: float
+    width: float
+    height: float
+    profile: Profile
+    clearance: float
+    wheel_x: Floats  # (2,) shares of length
+    wheel_radius: float
+    crown: float
+    nose_bow: float  # the corners of the nose stand back by this much
+    tail_bow: float
+
+
+def car_body(
+    rng: np.random.Generator, length: float, width: float, height: float, profile: Profile, dark_share: float = 0.5
+) -> Primitives:
+    """A lofted car or van with wheels, mirrors, plates and seats behind its glass."""
+    hull = _Hull(
+        length, width, height, profile,
+        clearance=float(rng.uniform(0.15, 0.24)),
+        wheel_x=np.array([rng.uniform(0.17, 0.21), rng.uniform(0.78, 0.83)]),
+        wheel_radius=float(rng.uniform(0.29, 0.34)) * float(np.clip(1.0 + 0.25 * (height - 1.5), 0.95, 1.2)),
+        crown=float(rng.uniform(0.04, 0.09)),
+        nose_bow=float(rng.uniform(0.18, 0.42)),
+        tail_bow=float(rng.uniform(0.05, 0.16)),
+    )  # fmt: skip
+    paint = draw_paint(rng, dark_share)
+    trim = Surface(float(rng.uniform(0.005, 0.04)), 0.5)
+    corners, table = _shell(hull, paint, trim, rng)
+    corners = np.concatenate([corners, corners * MIRROR])
+    floor = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (0.45 * length, 0.45 * width)
+    underside = np.column_stack([floor, np.full(4, hull.clearance + 0.08)])
+    parts = [quads(corners, np.concatenate([table, table])), quads(underside, trim)]
+    parts.append(wheels((0.5 - hull.wheel_x) * length, width / 2 - 0.05, hull.wheel_radius, rng))
+    parts += [_fittings(rng, hull, paint.upright), _seats(rng, hull)]
+    return Primitives.join(parts)
+
+
+def _sections(hull: _Hull, x: Floats) -> Floats:
+    """Left halves (S,7,3) of the cross-sections at shares `x` of the length: sill, waist, belt, edge, ..., middle."""
+    top = np.array(hull.profile.top)
+    z_top = np.interp(x, top[:, 0], top[:, 1]) * hull.height
+    arch = hull.wheel_radius + 0.06
+    to_wheel = np.abs(x[:, None] - hull.wheel_x).min(axis=1) * hull.length
+    sill = np.where(
+        to_wheel < arch, hull.wheel_radius + np.sqrt(np.maximum(arch**2 - to_wheel**2, 0.0)), hull.clearance
+    )
+    edge = z_top - hull.crown
+    belt = np.minimum(hull.profile.belt * hull.height, edge - 0.01)
+    waist = np.minimum(2 * hull.wheel_radius + 0.09, 0.3 * hull.clearance + 0.7 * belt)
+    sill = np.minimum(sill, waist - 0.01)
+    # Bodies narrow towards both ends and round their corners; they are widest above the wheels.
+    plan = 1.0 - 0.05 * np.maximum(1 - x / 0.25, 0) ** 2 - 0.12 * np.maximum(1 - x / 0.08, 0) ** 2
+    plan -= 0.05 * np.maximum(1 - (1 - x) / 0.25, 0) ** 2 + 0.10 * np.maximum(1 - (1 - x) / 0.06, 0) ** 2
+    plan *= hull.width / 2
+    over_belt = np.clip((z_top - hull.profile.belt * hull.height) / ((1 - hull.profile.belt) * hull.height), 0.0, 1.0)
+    roof = plan * (0.94 + (hull.profile.tumble - 0.94) * over_belt)
+    half = np.stack([0.95 * plan, plan, 0.98 * plan] + [share * roof for share, _ in _LID], axis=1)
+    high = np.stack([sill, waist, belt] + [z_top - drop * hull.crown for _, drop in _LID], axis=1)
+    along = (0.5 - x)[:, None] * hull.length + _bow(hull, x[:, None], half)
+    return np.stack([along, half, high], axis=2)
+
+
+def _bow(hull: _Hull, x: Floats, y_m: Floats) -> Floats:
+    """How far a section's points at `y_m` stand ahead of its middle, metres."""
+    outward = (y_m / (hull.width / 2)) ** 2
+    return outward * (
+        hull.tail_bow * np.maximum(1 - (1 - x) / 0.3, 0) - hull.nose_bow * np.maximum(1 - x / 0.45, 0) ** 1.5
+    )
+
+
+def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """The left half of a body: corners (Q,4,3) and surfaces (Q,3)."""
+    profile, top = hull.profile, np.array(hull.profile.top)
+    # What a pane does not let through it mirrors away: most windows of KITTI's cars are holes.
+    pane = Surface(0.05, 15.0, float(rng.uniform(0.1, 0.7)))
+    window = Surface(0.05, 15.0, float(rng.uniform(0.05, 0.6)))
+    arch = (hull.wheel_radius + 0.06) / hull.length
+    arches = (hull.wheel_x[:, None] + np.array([-1.0, -0.8, -0.4, 0.4, 0.8, 1.0]) * arch).ravel()
+    low = np.unique(np.concatenate([[0.0, 0.03, 0.08], arches, [0.93, 0.98, 1.0]]).clip(0, 1))
+    post = profile.cabin[0] + float(rng.uniform(0.40, 0.50)) * (profile.cabin[1] - profile.cabin[0])
+    posts = [post - 0.012, post + 0.012]
+    high = np.unique(np.concatenate([top[:, 0], profile.cabin, posts]).clip(0, 1))
+    sections = _sections(hull, np.concatenate([low, high]))
+    lower, upper = sections[: len(low), :2], sections[len(low) :, 1:]
+
+    middle = (high[:-1] + high[1:]) / 2
+    raised = np.interp(middle, top[:, 0], top[:, 1]) > profile.belt + 0.08
+    in_cabin = (middle > profile.cabin[0]) & (middle < profile.cabin[1]) & raised & (np.abs(middle - post) > 0.012)
+    in_pane = np.zeros(len(middle), bool)
+    for begin, end in profile.glass:
+        in_pane |= (middle > begin) & (middle < end)
+    steep = np.abs(np.diff(upper[:, -1, 2])) > 0.6 * np.abs(np.diff(high)) * hull.length
+    # Panels from waist to belt, to the edge of the roof, over the posts beside the panes, and two to the middle.
+    table = np.empty((len(middle), 5, 3))
+    table[:, :2] = paint.upright.row
+    table[:, 2:] = np.where(steep[:, None, None], paint.upright.row, paint.flat.row)
+    table[in_cabin, 1] = window.row
+    table[in_pane, 3:] = pane.row
+    skirt = np.broadcast_to(paint.upright.row, (len(low) - 1, 3))
+    ends = [_end(hull, x, sections[at]) for x, at in ((0.0, 0), (1.0, -1))]
+    bumper = np.tile(np.stack([trim.row, paint.upright.row]), (4, 1))
+    return np.concatenate([_panels(lower), _panels(upper), *ends]), np.concatenate(
+        [skirt, table.reshape(-1, 3), bumper]
+    )
+
+
+def _panels(grid: Floats) -> Floats:
+    """Quadrilaterals (..., 4, 3) between the neighbors of a grid of points (R,C,3)."""
+    return np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
+
+
+def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
+    """Left half of the nose (x = 0) or the tail (x = 1) inside its section (7,3): corners (4,4,3), low and high by
+    turns."""
+    levels = outline[[0, 1, 3]]  # sill, waist, edge
+    share = np.array([1.0, 0.6, 0.0])[:, None]
+    y = share * levels[:, 1]
+    z = np.broadcast_to(levels[:, 2], y.shape).copy()
+    z[:, 2] += hull.crown * (1 - share[:, 0] ** 2)
+    along = (0.5 - x) * hull.length + _bow(hull, np.full_like(y, x), y)
+    along[:, 0] -= np.sign(0.5 - x) * 0.06  # bumpers recede towards the road
+    return _panels(np.stack([along, y, z], axis=2))
+
+
+def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
+    """A wheel at each x on both sides: tyre tread, and a dark sidewall around a rim that shines more or less."""
+    rubber = Surface(float(rng.uniform(0.005, 0.025)), 0.5)
+    rim = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.5)))), 1.0)
+    faces = radius_m * _WHEEL
+    faces[:_SPOKES, 2:, 1] -= min(0.2, half_track_m)  # the tread reaches inwards
+    table = np.repeat(np.stack([rubber.row, rim.row]), (2 * _SPOKES, _SPOKES // 2), axis=0)
+    hubs = np.column_stack([np.atleast_1d(x_m), np.full(np.size(x_m), half_track_m), np.full(np.size(x_m), radius_m)])
+    left = faces + hubs[:, None, None]  # (wheels,25,4,3) of 10 + 10 + 5 faces
+    both = np.stack([left, left * MIRROR])
+    return quads(both, np.broadcast_to(table, (*both.shape[:3], 3)))
+
+
+def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface) -> Primitives:
+    """Plates (they shine), lamps, mirrors, and the dashboard."""
+    length, width, height, profile = hull.length, hull.width, hull.height, hull.profile
+    plate = min(0.45 * height, 0.75)
+    rows: list[tuple[float, ...]] = [
+        (length / 2 - 0.01, 0, 0.27 * height, 0.03, 0.52, 0.11, 0, 3.0, 0.3, 0),
+        (-length / 2 + 0.01, 0, plate - 0.1, 0.03, 0.52, 0.11, 0, 3.0, 0.3, 0),
+        (length * (0.46 - profile.cabin[0]), 0, 0.45 * height, 0.4, 0.8 * width, 0.14 * height, 0, 0.05, 0.5, 0),
+    ]
+    nose, tail = length / 2 - 0.55 * hull.nose_bow, -length / 2 + 0.6 * hull.tail_bow
+    mirror = (0.5 - profile.cabin[0] - 0.05) * length
+    stands_out = float(rng.uniform(0.03, 0.08))
+    for sign in (1, -1):
+        rows += [
+            (tail, sign * width * 0.39, 0.5 * height, 0.06, 0.16, 0.14, 0, 1.2, 0.6, 0),
+            (nose - 0.02 * length, sign * width * 0.37, 0.40 * height, 0.06, 0.24, 0.11, 0, 0.8, 1.0, 0),
+            (mirror, sign * (width / 2 + stands_out), profile.belt * height, 0.10, 0.17, 0.13, 0,
+             paint.reflectance, paint.gloss, 0),
+        ]  # fmt: skip
+    return cuboids(rows)
+
+
+def _seats(rng: np.random.Generator, hull: _Hull) -> Primitives:
+    """Seats, headrests, and now and then a driver and a passenger."""
+    dark = float(np.exp(rng.uniform(np.log(0.003), np.log(0.06))))  # seen through glass twice
+    front = hull.length * (0.5 - hull.profile.cabin[0] - 0.18)
+    rows = []
+    for x in (front, front - 0.24 * hull.length):
+        for side in (0.37, -0.37):
+            y = side * hull.width / 1.65
+            rows.append((x - 0.1, y, 0.52 * hull.height, 0.10, 0.24, 0.27, dark))
+            rows.append((x - 0.14, y, 0.74 * hull.height, 0.06, 0.13, 0.10, dark))
+    for side, chance in ((0.37, 0.4), (-0.37, 0.12)):
+        if rng.random() < chance:
+            y = side * hull.width / 1.65
+            rows.append((front + 0.05, y, 0.58 * hull.height, 0.14, 0.22, 0.28, 0.12))
+            rows.append((front + 0.05, y, 0.80 * hull.height, 0.10, 0.08, 0.12, 0.12))
+    table = np.array(rows)
+    surface = np.column_stack([table[:, 6], np.full(len(table), 0.3), np.zeros(len(table))])
+    return ellipsoids(table[:, :3], table[:, 3:6], surface)

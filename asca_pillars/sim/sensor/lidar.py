@@ -1,0 +1,177 @@
+"""The spinning LiDAR: where each laser points at each firing, and what of the world it keeps.
+
+Every laser fires at counts of the azimuth encoder, in a repeating pattern of steps, and reports range and reflectance.
+What is drawn once per scan (calibration errors, thresholds) is drawn here; what is drawn per firing, in `returns`.
+
+The scan is taken as if the car stood still: KITTI's scans are corrected for the car's own motion. Others move on while
+a scan is taken, but the laser sweeps over one in some milliseconds, in which it moves less than its label box is loose.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.sim.sensor import hdl64
+
+MAX_COLUMNS = 4096  # the ray caster tells firings apart by ring * 4096 + column
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """A spinning LiDAR; the defaults are KITTI's HDL-64E. Angles in degrees, lengths in metres.
+
+    Attributes:
+        elevation_deg: of each laser, from the top downwards.
+        origin_z_m: heights in the LiDAR frame at which the lasers leave it: first and last laser of each block of
+            equally many lasers from the top, evenly spaced between.
+        azimuth_counts: encoder counts of one revolution.
+        azimuth_steps: counts from each firing to the next, repeated.
+        ego_first_ring, ego_beyond_ring: rings [first, beyond) that the own car hides, per equal sector of azimuth from
+            straight ahead, counter-clockwise; empty for none.
+        range_m: nearest and farthest range that is reported.
+    """
+
+    elevation_deg: tuple[float, ...] = hdl64.ELEVATION_DEG
+    origin_z_m: tuple[tuple[float, float], ...] = hdl64.ORIGIN_Z_M
+    azimuth_counts: int = 4000
+    azimuth_steps: tuple[int, ...] = (2, 2, 2, 2, 2, 2, 1)
+    ego_first_ring: tuple[int, ...] = hdl64.EGO_FIRST_RING
+    ego_beyond_ring: tuple[int, ...] = hdl64.EGO_BEYOND_RING
+    elevation_jitter_deg: float = 0.03  # known to the sensor: a scan of other angles, not an error
+    range_m: tuple[float, float] = (2.0, 80.0)
+    range_sigma_m: tuple[float, float] = (0.005, 0.010)  # drawn once per scan
+    ring_bias_sigma_m: float = 0.022  # with it, points of several rings on a plane spread over 2 to 3 cm
+    # A footprint that leans over an edge meets two surfaces: the share of firings that lean to either side, and
+    # the share of those that report nothing. KITTI misses one firing at every fifth step in depth.
+    beam_split_share: float = 0.3
+    split_lost_share: float = 0.35
+    loss_share: tuple[float, float] = (0.0, 0.003)  # returns lost for no reason, drawn once per scan
+    # A return is kept without a reflectance below the first power, and lost below the second. Power is
+    # reflectance * sqrt(cos(incidence)) / range^2; both thresholds are drawn together, once per scan.
+    zero_power: tuple[float, float] = (2.5e-5, 7.5e-5)
+    lost_share_of_zero_power: float = 0.2
+    # The true reflectance is reported through a power law about 0.4 (1: as it is) that starts at `dark_offset` below
+    # 0, times what each laser makes of it (empty: 1). Beyond `focus_m` it fades with exp(-((range - focus) / fade)^1.3)
+    # (0: not), and the lasers of the first block lose `near_fade` of it right before them.
+    response: float = 0.6
+    dark_offset: float = 0.03
+    ring_gain: tuple[float, ...] = hdl64.RING_GAIN
+    ring_gain_sigma: float = 0.06  # of the logarithm, once per scan: no two sensors have the same lasers
+    focus_m: float = 13.0
+    fade_m: float = 33.0
+    near_fade: float = 0.4
+    # Noise of each report, of the first block and of the others; in proportion to it; and of a laser without gain.
+    reflectance_sigma: tuple[float, float] = (0.04, 0.02)
+    reflectance_sigma_share: float = 0.1
+    weak_laser_sigma: float = 0.12
+    # Reflectances below a uniform draw up to this are reported as 0 too, of the first block and of the others.
+    faint_reflectance: tuple[float, float] = (0.2, 0.13)
+    zero_share: float = 0.03  # of all returns, reported as 0 for no reason: so the best lasers do on near, bright road
+    camera_half_angle_deg: float = 43.0
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+
+    def __post_init__(self) -> None:
+        if list(self.elevation_deg) != sorted(self.elevation_deg, reverse=True) or not self.elevation_deg:
+            raise ConfigError("elevation_deg must list the lasers from the top downwards")
+        if not self.origin_z_m or self.rings % len(self.origin_z_m):
+            raise ConfigError(f"origin_z_m has {len(self.origin_z_m)} blocks, which do not share {self.rings} lasers")
+        if min(self.azimuth_steps, default=0) < 1 or self.azimuth_counts < 8 * len(self.azimuth_steps):
+            raise ConfigError("azimuth_steps must be counts of 1 and more, few against azimuth_counts")
+        if self.azimuth_counts / self.mean_step >= MAX_COLUMNS:
+            raise ConfigError(f"azimuth_steps make {MAX_COLUMNS} firings per revolution or more; make them longer")
+        if self.ring_gain and len(self.ring_gain) != self.rings:
+            raise ConfigError(f"ring_gain has {len(self.ring_gain)} values for {self.rings} lasers")
+        if len(self.ego_first_ring) != len(self.ego_beyond_ring):
+            raise ConfigError("ego_first_ring and ego_beyond_ring must have one value per sector each")
+        for name in ("range_m", "range_sigma_m", "loss_share", "zero_power"):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high:
+                raise ConfigError(f"{name} is {low, high}: the lower bound comes first, and is not negative")
+
+    @property
+    def rings(self) -> int:
+        return len(self.elevation_deg)
+
+    @property
+    def mean_step(self) -> float:
+        """Encoder counts from firing to firing, on average."""
+        return sum(self.azimuth_steps) / len(self.azimuth_steps)
+
+
+@dataclass(frozen=True)
+class Firings:
+    """Every firing of one revolution, and the random state of the sensor for this scan.
+
+    Firing (k, c) points at `azimuth_rad[c] + phase_rad[k]` with slope `slope[k]`.
+    """
+
+    slope: npt.NDArray[np.float64]  # (K,) tan(elevation)
+    origin_z_m: npt.NDArray[np.float64]  # (K,)
+    phase_rad: npt.NDArray[np.float64]  # (K,)
+    ring_bias_m: npt.NDArray[np.float64]  # (K,)
+    ring_gain: npt.NDArray[np.float64]  # (K,)
+    reflectance_sigma: npt.NDArray[np.float64]  # (K,)
+    faint: npt.NDArray[np.float64]  # (K,)
+    near_fade: npt.NDArray[np.float64]  # (K,)
+    azimuth_rad: npt.NDArray[np.float64]  # (C,) of each column, without the phase
+    first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
+    cast: npt.NDArray[np.bool_]  # (C,) columns that are fired at all
+    in_camera: npt.NDArray[np.bool_]  # (C,) columns that the camera sees
+    hidden: npt.NDArray[np.bool_]  # (K,C) firings that the own car stops
+    range_sigma_m: float
+    loss_share: float
+    zero_power: float
+    lidar: Lidar
+
+    @property
+    def lost_power(self) -> float:
+        return self.zero_power * self.lidar.lost_share_of_zero_power
+
+
+def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool) -> Firings:
+    """The firings of one scan. `camera_only` leaves every random number as it is and only skips columns."""
+    rings, per_block = lidar.rings, lidar.rings // len(lidar.origin_z_m)
+    origin_z = np.concatenate([np.linspace(*block, per_block) for block in lidar.origin_z_m])
+    elevation = np.asarray(lidar.elevation_deg) + rng.normal(0.0, lidar.elevation_jitter_deg, rings)
+    elevation = np.sort(elevation)[::-1]  # the ring windows of the ray caster need descending slopes
+    steps = np.roll(lidar.azimuth_steps, int(rng.integers(len(lidar.azimuth_steps))))
+    columns = np.concatenate([[0], np.cumsum(np.resize(steps, lidar.azimuth_counts))])
+    columns = columns[columns < lidar.azimuth_counts]
+    count_rad = 2 * np.pi / lidar.azimuth_counts
+    azimuth = columns * count_rad
+    in_camera = np.minimum(azimuth, 2 * np.pi - azimuth) <= np.deg2rad(lidar.camera_half_angle_deg)
+    first_block = np.arange(rings) < per_block
+    gain = np.asarray(lidar.ring_gain or np.ones(rings))
+    weak = np.maximum(1.0 - gain, 0.0)
+    return Firings(
+        slope=np.tan(np.deg2rad(elevation)),
+        origin_z_m=origin_z,
+        phase_rad=rng.uniform(0.0, lidar.mean_step * count_rad, rings),
+        ring_bias_m=rng.normal(0.0, lidar.ring_bias_sigma_m, rings),
+        ring_gain=gain * np.exp(rng.normal(0.0, lidar.ring_gain_sigma, rings)),
+        reflectance_sigma=np.where(first_block, *lidar.reflectance_sigma) + weak * lidar.weak_laser_sigma,
+        faint=np.where(first_block, *lidar.faint_reflectance),
+        near_fade=np.where(first_block, lidar.near_fade, 0.0),
+        azimuth_rad=azimuth,
+        first_column=np.searchsorted(columns, np.arange(lidar.azimuth_counts + 1)),
+        cast=in_camera if camera_only else np.ones(len(columns), bool),
+        in_camera=in_camera,
+        hidden=_hidden(lidar, azimuth),
+        range_sigma_m=float(rng.uniform(*lidar.range_sigma_m)),
+        loss_share=float(rng.uniform(*lidar.loss_share)),
+        zero_power=float(np.exp(rng.uniform(*np.log(lidar.zero_power)))),
+        lidar=lidar,
+    )
+
+
+def _hidden(lidar: Lidar, azimuth_rad: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """(K,C) firings that the own car stops."""
+    if not lidar.ego_first_ring:
+        return np.zeros((lidar.rings, len(azimuth_rad)), bool)
+    sector = (azimuth_rad / (2 * np.pi) * len(lidar.ego_first_ring)).astype(int)
+    ring = np.arange(lidar.rings)[:, None]
+    first, beyond = np.asarray(lidar.ego_first_ring)[sector], np.asarray(lidar.ego_beyond_ring)[sector]
+    return np.asarray((ring >= first) & (ring < beyond))

@@ -1,0 +1,162 @@
+"""Collecting the unlabelled bodies of a street as rows of simple shapes, and setting them on the ground at once."""
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, prisms
+from asca_pillars.sim.scene_config import SceneConfig
+from asca_pillars.sim.world.ground import Ground
+from asca_pillars.sim.world.placement import Occupied
+
+Floats = npt.NDArray[np.float64]
+Material = tuple[float, float, float]  # reflectance, gloss, transparency
+HEAD_ROOM_M = 2.2  # leaves above may hang over objects
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A piece of one side of a road: from `start_m` on for `length_m` along it, `away_m` from its middle.
+
+    `side` is 1 left of the road and -1 right of it; `cross` means the crossing road.
+    """
+
+    start_m: float
+    length_m: float
+    side: float
+    away_m: float
+    cross: bool = False
+
+    @property
+    def middle_m(self) -> float:
+        return self.start_m + self.length_m / 2
+
+    def along(self, step_m: float) -> Floats:
+        """Middles of as many pieces of `step_m` as fit."""
+        return np.asarray(np.arange(self.start_m + step_m / 2, self.start_m + self.length_m - 0.45 * step_m, step_m))
+
+
+@dataclass
+class Builder:
+    """Bodies so far; heights are above the local ground until `primitives` sets them on it."""
+
+    rng: np.random.Generator
+    config: SceneConfig
+    ground: Ground
+    occupied: Occupied
+    kind: str
+    _kept_clear: Floats = field(init=False)  # footprints of the car and of the objects
+    _bodies: list[Primitives] = field(default_factory=list)
+    _boxes: list[tuple[float, ...]] = field(default_factory=list)  # as for `cuboids`
+    _posts: list[tuple[float, ...]] = field(default_factory=list)  # as for `prisms`
+    _blobs: list[Floats] = field(default_factory=list)  # rows of x y z, radii, yaw, reflectance, density
+
+    def __post_init__(self) -> None:
+        self._kept_clear = self.occupied.rows[: self.occupied.count].copy()
+
+    def to_lidar(self, along: float, across: float, cross: bool = False) -> tuple[float, float, float]:
+        """A place beside the main or the crossing road as x, y and the road's heading."""
+        return (self.ground.cross_to_lidar if cross else self.ground.to_lidar)(along, across)
+
+    def near_junction(self, start_m: float, end_m: float) -> bool:
+        """Whether a piece of the main road's side would stand on the crossing road."""
+        reach = self.ground.cross_half_m + self.ground.pavement_m + 1.0
+        middle = self.ground.cross_u_m
+        return self.ground.cross_half_m > 0 and start_m < middle + reach and end_m > middle - reach
+
+    def until_junction(self, start_m: float, length_m: float) -> float:
+        """As much of a piece of the main road's side as lies before the crossing road."""
+        first = self.ground.cross_u_m - self.ground.cross_half_m - self.ground.pavement_m - 1.0
+        return first - start_m if self.ground.cross_half_m > 0 and start_m < first < start_m + length_m else length_m
+
+    def claim(self, along: float, across: float, length: float, width: float, cross: bool = False) -> bool:
+        """Take a place aligned with the road; whether it was free."""
+        x, y, yaw = self.to_lidar(along, across, cross)
+        return self.occupied.take(x, y, length, width, yaw)
+
+    def body(self, body: Primitives, along: float, across: float, yaw: float) -> None:
+        """Any body, at a place beside the main road and turned against it."""
+        x, y, heading = self.to_lidar(along, across)
+        z = float(self.ground.heights((x, y))[0])
+        self._bodies.append(body.placed(x, y, z, heading + yaw))
+
+    def box(
+        self, along: float, across: float, z: float, size: tuple[float, float, float], material: Material,
+        cross: bool = False, yaw: float = 0.0,
+    ) -> None:  # fmt: skip
+        """A box of `size` (along, across, up) whose bottom is z above the ground."""
+        x, y, heading = self.to_lidar(along, across, cross)
+        self._boxes.append((x, y, z, *size, heading + yaw, *material))
+
+    def post(
+        self, along: float, across: float, z: float, height: float, radius: float, reflectance: float,
+        cross: bool = False, taper: float = 1.0, lean: tuple[float, float] = (0.0, 0.0),
+    ) -> None:  # fmt: skip
+        """A round post whose radius at the top is `taper` times that at the foot, leaning by `lean` metres per metre
+        of height along x and y."""
+        x, y, _ = self.to_lidar(along, across, cross)
+        self._posts.append((x, y, z, height, radius, taper * radius, reflectance, *lean))
+
+    def ball(
+        self, along: float, across: float, z: float, radii: tuple[float, float, float], reflectance: float
+    ) -> None:
+        """A solid ellipsoid around z above the ground."""
+        x, y, yaw = self.to_lidar(along, across)
+        self._blobs.append(np.array([[x, y, z, *radii, yaw, reflectance, 0.0]]))
+
+    def clouds(
+        self, along: Floats, across: Floats, z: Floats, radii: Floats, reflectance: float, density_per_m: Floats,
+        cross: bool = False, turned: bool = True,
+    ) -> None:  # fmt: skip
+        """Leaves (N): ellipsoids of radii (N,3) around z above the ground, each turned at random or, for hedges,
+        along the road."""
+        rows = np.empty((len(along), 9))
+        rows[:, :2] = self.ground.places(along, across, cross)
+        rows[:, 2], rows[:, 3:6] = z, radii
+        if turned:
+            rows[:, 6] = self.rng.uniform(0.0, np.pi, len(along))
+        else:
+            rows[:, 6] = self.to_lidar(float(along[0]), float(across[0]), cross)[2]
+        rows[:, 7], rows[:, 8] = reflectance, density_per_m
+        self._blobs.append(rows)
+
+    def primitives(self) -> Primitives:
+        """All bodies, set on the ground."""
+        parts = list(self._bodies)
+        if self._boxes:
+            parts.append(cuboids(self._grounded(np.array(self._boxes))))
+        if self._posts:
+            parts.append(prisms(self._grounded(np.array(self._posts)), sides=6))
+        if self._blobs:
+            rows = np.concatenate(self._blobs)
+            rows = self._grounded(rows[~_intrudes(rows, self._kept_clear)])
+            cos, sin, zero = np.cos(rows[:, 6]), np.sin(rows[:, 6]), np.zeros(len(rows))
+            axes = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]).transpose(2, 0, 1)
+            surface = np.column_stack([rows[:, 7], zero + 0.3, rows[:, 8]])
+            parts.append(ellipsoids(rows[:, :3], rows[:, 3:6], surface, axes))
+        return Primitives.join(parts)
+
+    def _grounded(self, rows: Floats) -> Floats:
+        rows[:, 2] += self.ground.heights(rows[:, :2])
+        return rows
+
+
+@numba.njit(cache=True)
+def _intrudes(blobs: Floats, footprints: Floats) -> npt.NDArray[np.bool_]:
+    """Which clouds would hang into the car (its sensor would see nothing else) or an object."""
+    result = np.zeros(len(blobs), np.bool_)
+    for i in range(len(blobs)):
+        if blobs[i, 2] - blobs[i, 5] >= HEAD_ROOM_M:
+            continue
+        radius = max(blobs[i, 3], blobs[i, 4])
+        for j in range(len(footprints)):
+            dx, dy = blobs[i, 0] - footprints[j, 0], blobs[i, 1] - footprints[j, 1]
+            cos, sin = np.cos(footprints[j, 4]), np.sin(footprints[j, 4])
+            along = max(abs(dx * cos + dy * sin) - footprints[j, 2] / 2, 0.0)
+            across = max(abs(dy * cos - dx * sin) - footprints[j, 3] / 2, 0.0)
+            if along * along + across * across < radius * radius:
+                result[i] = True
+                break
+    return result

@@ -1,0 +1,74 @@
+"""Things on pavements, verges and in yards, much of it the size of a person, a bicycle or a car: what a detector must
+not take for one. Nothing here has the shape of a labelled class."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from asca_pillars.sim.world.builder import Builder
+from asca_pillars.sim.world.furniture import (
+    barrier_boards,
+    bench,
+    billboard,
+    bins,
+    bollards,
+    cabinet,
+    delineators,
+    island,
+    low_stones,
+    planter,
+    pole,
+    pole_group,
+    shelter,
+)
+from asca_pillars.sim.world.lookalikes import (
+    column,
+    container,
+    heap,
+    parked_bicycles,
+    parked_motorbikes,
+    post_with_box,
+    stack,
+    thin_cylinder,
+)
+from asca_pillars.sim.world.vegetation import bush, hedge_block, shrub, tree, weeds
+
+Thing = Callable[[Builder, float, float], None]
+SCATTERED_WITHIN_M = 38.0  # of the road's middle
+
+
+def scatter(builder: Builder) -> None:
+    """Clutter along both sides of the main road, most of it right behind the kerb, some of it far from any road."""
+    rng, ground = builder.rng, builder.ground
+    pavement = ground.pavement_m
+    things, weights = zip(*SHARES.items(), strict=True)
+    upto = np.cumsum(weights) / sum(weights)
+    number = rng.uniform(*builder.config.clutter)
+    for _ in range(rng.poisson(1.6 * number)):  # 160 m of street
+        along = float(rng.uniform(-80, 80))
+        side = 1.0 if rng.random() < 0.5 else -1.0
+        edge = ground.left_edge_m if side > 0 and rng.random() < 0.7 else ground.half_width_m
+        beside = rng.uniform(0.25, 0.8) if rng.random() < 0.35 else rng.uniform(0.3, pavement + 6.0)
+        if rng.random() < 0.22:
+            edge, beside = 0.0, rng.uniform(edge + 2.0, SCATTERED_WITHIN_M)
+        elif rng.random() < 0.07:  # between parked cars, as planted build-outs of the kerb are
+            beside = -rng.uniform(0.3, 1.8)
+        if not builder.near_junction(along, along):
+            things[int(np.searchsorted(upto, rng.random()))](builder, along, float(side * (edge + beside)))
+    if ground.cross_half_m > 0 and rng.random() < 0.35:
+        reach = ground.cross_half_m + rng.uniform(1.5, 5.0)
+        island(builder, ground.cross_u_m + float(rng.choice([-1.0, 1.0])) * reach, 0.0)
+
+
+def any_shrub(builder: Builder, along: float, across: float) -> None:
+    """Low or tall."""
+    shrub(builder, along, across, tall=bool(builder.rng.random() < 0.35))
+
+
+SHARES: dict[Thing, float] = {
+    pole: 0.13, pole_group: 0.04, bollards: 0.07, delineators: 0.04, cabinet: 0.07, bins: 0.06, bench: 0.03,
+    planter: 0.03, shelter: 0.012, billboard: 0.025, barrier_boards: 0.02, low_stones: 0.07,
+    thin_cylinder: 0.035, post_with_box: 0.04, column: 0.025, container: 0.015, heap: 0.03, stack: 0.025,
+    hedge_block: 0.035, parked_bicycles: 0.04, parked_motorbikes: 0.013, any_shrub: 0.11, bush: 0.035, tree: 0.05,
+    weeds: 0.13,
+}  # fmt: skip

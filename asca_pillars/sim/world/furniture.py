@@ -1,0 +1,205 @@
+"""Street furniture: poles, bollards, cabinets, bins, benches, shelters, boards."""
+
+from asca_pillars.sim.world.builder import Builder, Material
+from asca_pillars.sim.world.vegetation import crown
+
+
+def material(builder: Builder) -> Material:
+    """Any painted, galvanized or bare surface."""
+    return (float(builder.rng.uniform(0.06, 0.6)), 0.4, 0.0)
+
+
+def pole(builder: Builder, along: float, across: float) -> None:
+    """A lamp, a sign, a traffic light, a mast."""
+    rng = builder.rng
+    mast = rng.random() < 0.15
+    radius = float(rng.uniform(0.12, 0.3) if mast else rng.uniform(0.03, 0.12))
+    if not builder.claim(along, across, 2 * radius, 2 * radius):
+        return
+    tilt = rng.normal(0.0, 0.015, 2)
+    builder.post(
+        along, across, -0.3, float(rng.uniform(2.2, 7.0)), radius, float(rng.uniform(0.1, 0.6)),
+        taper=float(rng.uniform(0.6, 1.0)), lean=(float(tilt[0]), float(tilt[1])),
+    )  # fmt: skip
+    what = rng.random()
+    if what < 0.35:  # signs send back nearly everything; from the side they are a line
+        size = float(rng.uniform(0.35, 0.95))
+        yaw = float(rng.choice([0.0, 0.0, 1.57]) + rng.normal(0, 0.3))
+        for z in (rng.uniform(1.2, 2.6),) if rng.random() < 0.75 else (1.5, 2.3):
+            builder.box(along, across, float(z), (0.04, size, size), (float(rng.uniform(0.4, 0.9)), 0.4, 0.0), yaw=yaw)
+    elif what < 0.5:  # traffic lights, one for drivers and one for people on foot
+        for z in (2.1, float(rng.uniform(1.2, 1.6))):
+            builder.box(along, across, z, (0.25, 0.3, 0.8), (0.12, 0.4, 0.0), yaw=float(rng.normal(0, 0.5)))
+    elif what < 0.65:  # a base with the fuses
+        builder.post(along, across, -0.2, float(rng.uniform(0.8, 1.4)), 1.8 * radius, 0.3)
+    elif what < 0.75:  # a litter bin on it
+        builder.box(along + 0.25, across, 0.6, (0.35, 0.4, 0.6), material(builder))
+
+
+def pole_group(builder: Builder, along: float, across: float) -> None:
+    """Two to five posts close together, as at crossings: from afar as wide as a person."""
+    rng = builder.rng
+    for _ in range(int(rng.integers(2, 6))):
+        at, beside = along + float(rng.normal(0, 0.35)), across + float(rng.normal(0, 0.35))
+        radius = float(rng.uniform(0.025, 0.09))
+        if builder.claim(at, beside, 2 * radius, 2 * radius):
+            builder.post(at, beside, -0.2, float(rng.uniform(1.2, 4.5)), radius, float(rng.uniform(0.1, 0.6)))
+
+
+def bollards(builder: Builder, along: float, across: float) -> None:
+    """A row of short posts."""
+    rng = builder.rng
+    radius, height = float(rng.uniform(0.03, 0.18)), float(rng.uniform(0.4, 1.3))
+    reflectance, step = float(rng.uniform(0.1, 0.6)), float(rng.uniform(1.0, 2.5))
+    for i in range(int(rng.integers(1, 9))):
+        if builder.claim(along + i * step, across, 2 * radius, 2 * radius):
+            builder.post(along + i * step, across, -0.2, height + 0.2, radius, reflectance)
+
+
+def delineators(builder: Builder, along: float, across: float) -> None:
+    """White posts with reflectors, or cones, in a row along the road."""
+    rng = builder.rng
+    cone = rng.random() < 0.4
+    step = float(rng.uniform(2.0, 5.0) if cone else rng.uniform(12.0, 25.0))
+    for i in range(int(rng.integers(1, 6))):
+        at = along + i * step
+        if builder.near_junction(at, at) or not builder.claim(at, across, 0.3, 0.3):
+            continue
+        if cone:
+            builder.post(at, across, 0.0, float(rng.uniform(0.4, 1.0)), 0.18, 0.5, taper=0.15)
+        else:
+            builder.box(at, across, -0.2, (0.12, 0.1, 1.2), (float(rng.uniform(0.5, 0.9)), 0.3, 0.0))
+
+
+def cabinet(builder: Builder, along: float, across: float) -> None:
+    """A switch cabinet, a post box, a hydrant's hood, a grit box, several side by side."""
+    rng = builder.rng
+    size = (float(rng.uniform(0.25, 1.6)), float(rng.uniform(0.2, 0.7)), float(rng.uniform(0.6, 2.0)))
+    yaw = float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.1))
+    for i in range(int(rng.choice([1, 1, 1, 2, 3]))):
+        at = along + i * (max(size[:2]) + 0.1)
+        if builder.claim(at, across, max(size[:2]), max(size[:2])):
+            height = size[2] * float(rng.uniform(0.7, 1.1))
+            builder.box(at, across, -0.2, (size[0], size[1], height + 0.2), material(builder), yaw=yaw)
+
+
+def bins(builder: Builder, along: float, across: float) -> None:
+    """Wheeled bins in a row, small ones or those for many households."""
+    rng = builder.rng
+    size = (1.3, 0.95, 1.35) if rng.random() < 0.25 else (0.52, 0.6, 1.05)
+    for i in range(int(rng.integers(1, 7))):
+        at, beside = along + i * (size[0] + float(rng.uniform(0.03, 0.3))), across + float(rng.normal(0, 0.08))
+        if builder.claim(at, beside, size[0], size[1]):
+            yaw = float(rng.normal(0, 0.15))
+            builder.box(at, beside, 0.08, (size[0], size[1], size[2] - 0.15), material(builder), yaw=yaw)
+            builder.box(at, beside, size[2] - 0.07, (size[0], 1.08 * size[1], 0.07), (0.1, 0.4, 0.0), yaw=yaw)
+
+
+def bench(builder: Builder, along: float, across: float) -> None:
+    """A bench, or two with a table between."""
+    rng = builder.rng
+    table = rng.random() < 0.3
+    if not builder.claim(along, across, 1.8, 1.7 if table else 0.7):
+        return
+    plank = material(builder)
+    if table:
+        builder.box(along, across, 0.7, (1.7, 0.75, 0.06), plank)
+    for beside in (-0.6, 0.6) if table else (0.0,):
+        builder.box(along, across + beside, 0.40, (1.7, 0.4, 0.06), plank)
+        for leg in (-0.7, 0.7):
+            builder.box(along + leg, across + beside, -0.1, (0.08, 0.35, 0.5), plank)
+    if not table and rng.random() < 0.7:
+        builder.box(along, across + (0.22 if across > 0 else -0.22), 0.5, (1.7, 0.05, 0.4), plank)
+
+
+def planter(builder: Builder, along: float, across: float) -> None:
+    """A tub with something green in it."""
+    rng = builder.rng
+    size = (float(rng.uniform(0.5, 2.0)), float(rng.uniform(0.5, 1.0)), float(rng.uniform(0.3, 0.8)))
+    if builder.claim(along, across, *size[:2]):
+        builder.box(along, across, -0.1, (size[0], size[1], size[2] + 0.1), material(builder))
+        wide, tall = 0.5 * min(size[:2]), float(rng.uniform(0.15, 0.7))
+        crown(builder, along, across, size[2] + tall, (wide, tall), float(rng.uniform(1.5, 6.0)), cross=False)
+
+
+def shelter(builder: Builder, along: float, across: float) -> None:
+    """A roof on posts with glass behind, at a stop; or a kiosk, or a telephone box."""
+    rng = builder.rng
+    booth = rng.random() < 0.4
+    size = (0.9, 0.9, 2.3) if booth else (float(rng.uniform(2.5, 5.0)), 1.5, 2.5)
+    if not builder.claim(along, across, *size[:2]):
+        return
+    glass = (0.06, 2.0, 0.0 if booth and rng.random() < 0.4 else float(rng.uniform(0.6, 0.95)))
+    back = across + 0.7 * (1.0 if across > 0 else -1.0)
+    builder.box(along, across, size[2], (size[0], size[1], 0.12), material(builder))
+    if booth:
+        builder.box(along, across, 0.0, size, glass)
+    else:
+        builder.box(along, back, 0.15, (size[0], 0.03, 2.1), glass)
+        builder.box(along + size[0] / 2, across, 0.15, (0.06, 1.2, 2.0), (0.4, 0.4, float(rng.choice([0.0, 0.8]))))
+        builder.box(along, back - (0.35 if across > 0 else -0.35), 0.42, (0.6 * size[0], 0.35, 0.06), (0.3, 0.4, 0.0))
+    for at in (-0.45, 0.45):
+        builder.post(along + at * size[0], back if not booth else across, -0.1, size[2] + 0.1, 0.05, 0.3)
+
+
+def billboard(builder: Builder, along: float, across: float) -> None:
+    """A board on legs, a board on the ground, a round pillar for posters."""
+    rng = builder.rng
+    if rng.random() < 0.25:
+        radius = float(rng.uniform(0.45, 0.75))
+        if builder.claim(along, across, 2 * radius, 2 * radius):
+            builder.post(along, across, -0.2, float(rng.uniform(2.4, 3.8)), radius, float(rng.uniform(0.2, 0.6)))
+        return
+    wide = float(rng.choice([0.6, 1.3, 1.3, 3.6]))
+    yaw = float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.15))
+    if builder.claim(along, across, wide, wide if yaw > 0.8 else 0.5):
+        foot = float(rng.choice([0.0, 0.3, 0.8, 2.0]))
+        builder.box(along, across, foot, (wide, 0.12, float(rng.uniform(0.9, 2.6))), material(builder), yaw=yaw)
+        builder.post(along, across, -0.2, foot + 0.3, 0.06, 0.3)
+
+
+def barrier_boards(builder: Builder, along: float, across: float) -> None:
+    """Red and white boards or mesh on feet around works, with a heap inside."""
+    rng = builder.rng
+    mesh = rng.random() < 0.4
+    step, height = (3.4, 2.0) if mesh else (float(rng.uniform(1.2, 2.2)), 1.0)
+    board: Material = (0.35, 0.4, 0.88) if mesh else (float(rng.uniform(0.4, 0.8)), 0.4, 0.0)
+    for i in range(int(rng.integers(1, 7))):
+        at, beside = along + i * step, across + float(rng.normal(0, 0.1))
+        if builder.near_junction(at, at) or not builder.claim(at, beside, step - 0.1, 0.3):
+            continue
+        builder.box(at - step / 2, beside, -0.05, (0.25, 0.6, 0.15), (0.1, 0.3, 0.0))
+        builder.post(at - step / 2, beside, 0.0, height + 0.1, 0.025, 0.4)
+        builder.box(at, beside, 0.15 if mesh else height - 0.3, (step, 0.03, height - 0.15 if mesh else 0.25), board)
+
+
+def low_stones(builder: Builder, along: float, across: float) -> None:
+    """Kerb stones, wheel stops, steps, speed cushions: short bars low over the ground."""
+    rng = builder.rng
+    length, yaw = float(rng.uniform(0.8, 3.0)), float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.1))
+    height, step = float(rng.uniform(0.06, 0.35)), length + float(rng.uniform(0.0, 0.8))
+    stone = (float(rng.uniform(0.15, 0.5)), 0.3, 0.0)
+    for i in range(int(rng.integers(1, 6))):
+        if builder.claim(along + i * step, across, length, length if yaw > 0.8 else 0.3):
+            builder.box(
+                along + i * step,
+                across,
+                -0.1,
+                (length, float(0.15 + rng.uniform(0, 0.2)), height + 0.1),
+                stone,
+                yaw=yaw,
+            )
+
+
+def island(builder: Builder, along: float, across: float) -> None:
+    """A traffic island with its posts and signs, in the middle of the road before a junction."""
+    rng = builder.rng
+    length, width = float(rng.uniform(2.0, 6.0)), float(rng.uniform(0.8, 1.8))
+    if not builder.claim(along, across, length, width):
+        return
+    builder.box(along, across, -0.2, (length, width, 0.2 + float(rng.uniform(0.06, 0.16))), (0.35, 0.3, 0.0))
+    for end in (-0.4, 0.4):
+        at, size = along + end * length, float(rng.uniform(0.3, 0.7))
+        builder.post(at, across, 0.0, float(rng.uniform(0.9, 3.0)), float(rng.uniform(0.03, 0.09)), 0.4)
+        if rng.random() < 0.6:
+            builder.box(at, across, float(rng.uniform(0.5, 2.0)), (0.05, size, size), (0.8, 0.4, 0.0))

@@ -1,0 +1,160 @@
+"""One random street: its ground, its objects, its background, its camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from asca_pillars.data.kitti import Calibration
+from asca_pillars.sim.bodies import cycles, heavy, people, styles, vehicles
+from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
+from asca_pillars.sim.casting.raycast import Bodies
+from asca_pillars.sim.scene_config import SceneConfig
+from asca_pillars.sim.world.builder import Builder
+from asca_pillars.sim.world.clutter import scatter
+from asca_pillars.sim.world.ground import Ground
+from asca_pillars.sim.world.placement import Occupied, Placer, Target
+from asca_pillars.sim.world.roadside import line_streets
+from asca_pillars.sim.world.streets import draw_ground, draw_kind
+
+# Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
+EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 4.0
+# Of cars, of people on foot and of cyclists.
+RATE_FACTORS = {
+    "residential": (1.15, 0.75, 0.9),
+    "urban": (1.0, 1.5, 1.2),
+    "rural": (0.7, 0.25, 0.7),
+    "campus": (0.8, 1.9, 1.4),
+}
+HABITS_OF = {"road": "rural", "alley": "residential"}  # whose habits of traffic a kind of street shares
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A street before it is scanned. LiDAR frame, metres."""
+
+    ground: Ground
+    targets: tuple[Target, ...]
+    background: Primitives
+    calibration: Calibration
+
+
+def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
+    """A random street with everything on it."""
+    kind = draw_kind(config, rng)
+    habits = HABITS_OF.get(kind, kind)
+    ground = draw_ground(config, rng, kind)
+    occupied = Occupied()
+    occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
+    placer = Placer(rng, config, ground, occupied, habits)
+    if rng.random() >= config.empty_share:
+        for name, rate in _rates(config, habits):
+            crowds = name in ("Pedestrian", "Person_sitting")
+            dispersion = config.people_dispersion if crowds else config.dispersion
+            for ahead in (True, False):
+                # A gamma-distributed rate makes the counts negative binomial.
+                for _ in range(rng.poisson(rate * rng.gamma(dispersion) / dispersion)):
+                    placer.place(name, ahead)
+        for _ in range(rng.poisson(config.beyond)):
+            placer.place_beyond()
+    builder = Builder(rng, config, ground, occupied, kind)
+    line_streets(builder)
+    scatter(builder)
+    return Scene(ground, tuple(placer.targets), builder.primitives(), draw_calibration(rng))
+
+
+def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
+    """Mean numbers ahead for a kind of street; large objects come first, while there is room for them."""
+    car, walkers, bike = RATE_FACTORS[kind]
+    return (
+        ("Tram", config.trams * (3.0 if kind == "urban" else 0.2)),
+        ("Truck", config.trucks),
+        ("Van", config.vans),
+        ("Misc", config.misc),
+        ("Car", config.cars * car),
+        ("Cyclist", config.cyclists * bike),
+        ("Pedestrian", config.pedestrians * walkers),
+        ("Person_sitting", config.sitting * walkers),
+    )
+
+
+def draw_calibration(rng: np.random.Generator) -> Calibration:
+    """A camera like one of KITTI's four recording days, a little shaken."""
+    f, cx, cy, shift, pitch = (
+        (707.05, 604.08, 180.51, (-0.025, -0.061, -0.332), -0.001),
+        (721.54, 609.56, 172.85, (-0.004, -0.076, -0.272), 0.0148),
+        (718.34, 600.39, 181.51, (-0.007, -0.063, -0.267), 0.008),
+        (718.86, 607.19, 185.22, (-0.014, -0.055, -0.292), 0.008),
+    )[int(rng.choice(4, p=(0.12, 0.76, 0.07, 0.05)))]
+    p2 = np.array([[f, 0, cx, 44.9], [0, f, cy, 0.2], [0, 0, 1, 0.003]], float)
+    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)
+    tilt = np.array([rng.normal(pitch, 0.002), rng.normal(0.0, 0.004), rng.normal(0.0, 0.003)])
+    rotation = _rotation(tilt) @ axes
+    r0_rect = _rotation(np.array([-0.0043, -0.0074, -0.0099]))
+    return Calibration(p2, r0_rect, np.column_stack([rotation, shift]))
+
+
+def _rotation(turns: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Rotation about the camera's x, y and z axes, in this order."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(turns), np.sin(turns)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Primitives:
+    """The body of an object, placed: a little smaller than its label box, as KITTI's labels are loose."""
+    x, y, z, length, width, height, yaw = target.box
+    name = target.type
+    if name in ("Car", "Van"):
+        # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
+        slack = rng.uniform((0.0, 0.0, -0.03), (0.16, 0.10, 0.09))
+        profile = styles.draw_style(rng, length, height, van=name == "Van")
+        dark = config.dark_paint_share if name == "Car" else 0.1
+        body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
+    elif name == "Truck":
+        bus = rng.random() < 0.15
+        body = (heavy.bus_body if bus else heavy.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
+    elif name == "Tram":
+        body = heavy.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
+    elif name == "Misc" and width < 1.0 and 1.4 < length < 2.5 and height > 1.35:
+        body = cycles.motorcyclist_body(rng, height - 0.08, length - 0.06)
+    elif name == "Misc":
+        body = heavy.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
+    elif name == "Pedestrian":
+        body = people.pedestrian_body(rng, height - 0.05, width, length)
+    elif name == "Person_sitting":
+        body = people.sitting_body(rng, height - 0.05)
+    else:
+        body = people.cyclist_body(rng, height - 0.08, width, length - 0.04)
+    dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
+    return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
+
+
+def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: float) -> Bodies:
+    """Primitives of a scene. Objects whose azimuth is beyond `within_rad` of straight ahead are left out;
+    the chance of the others does not change by that."""
+    parts, owners, salts, blob_owners, blob_salts = [scene.background], [], [], [], []
+    background = scene.background
+    owners.append(np.full(len(background.triangles), BACKGROUND))
+    salts.append(np.arange(len(background.triangles)))
+    blob_owners.append(np.full(len(background.centers), BACKGROUND))
+    blob_salts.append(len(background.triangles) + np.arange(len(background.centers)))
+    for index, target in enumerate(scene.targets):
+        distance = float(np.hypot(*target.box[:2]))
+        reach = np.pi if distance < target.box[3] else np.arctan(0.6 * target.box[3] / distance)
+        if abs(np.arctan2(target.box[1], target.box[0])) > within_rad + reach:
+            continue
+        body = body_of(target, config, np.random.default_rng([*seed, 1, index]))
+        first = 10_000_000 + index * 10_000
+        parts.append(body)
+        owners.append(np.full(len(body.triangles), index))
+        salts.append(first + np.arange(len(body.triangles)))
+        blob_owners.append(np.full(len(body.centers), index))
+        blob_salts.append(first + 8000 + np.arange(len(body.centers)))
+    return Bodies(
+        Primitives.join(parts),
+        np.concatenate(owners).astype(np.int64), np.concatenate(salts).astype(np.int64),
+        np.concatenate(blob_owners).astype(np.int64), np.concatenate(blob_salts).astype(np.int64),
+    )  # fmt: skip

@@ -1,0 +1,119 @@
+"""Where the milliseconds go, stage by stage, and on what; warm frames apart from the cold first one."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.benchmark.resident_memory import peak_memory_mib
+from asca_deploy.benchmark.timing import Percentiles, Track, run_frame, silently
+from asca_deploy.detector import Detector
+from asca_deploy.frame import GRAPHS, FrameReport
+from asca_pillars.system import cpu_model, package_versions
+
+
+@dataclass(frozen=True)
+class BenchmarkReport:
+    """Result of `benchmark`."""
+
+    fps: float
+    """1 / p50 of the whole chain, points in, detections out; files are not read and pictures not drawn."""
+    total_ms: Percentiles
+    stages_ms: dict[str, Percentiles]
+    outside_ms: Percentiles
+    """What is not spent in the two graphs: input check, pillars, scatter, decoding and suppression."""
+    outside_share: float
+    """Median over frames of outside / total."""
+    cold_ms: float | None
+    """The detector's very first scan; None if it had run before."""
+    load_s: float
+    """Opening the bundle: checksums, sessions, canvas."""
+    frames: int
+    """Measured warm frames."""
+    scans: int
+    points: tuple[int, ...]
+    """Points of each scan."""
+    pillars: tuple[int, ...]
+    """Pillars of each scan after the limits."""
+    detections: tuple[int, ...]
+    provider: str
+    precision: str
+    """float32 or reduced, see `asca_deploy.providers`."""
+    threads: int
+    cpu: str
+    peak_memory_mib: float | None
+    """Largest resident memory of the process so far; None where the system does not say."""
+    versions: dict[str, str]
+    bundle: str
+    graphs_sha256: dict[str, str]
+    input_sha256: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return asdict(self)
+
+
+def benchmark(
+    detector: Detector,
+    scans: Sequence[NDArray[np.float32]],
+    rounds: int = 30,
+    warmup: int = 3,
+    track: Track = silently,
+) -> BenchmarkReport:
+    """Time `rounds` passes over `scans` after `warmup` passes that are not counted.
+
+    Args:
+        detector: a fresh one, so that its first scan shows the cold start.
+        scans: (N, 4) each, as for the detector.
+
+    Raises:
+        ValueError: there is no scan or no round.
+    """
+    if not scans or rounds < 1:
+        raise ValueError(f"{len(scans)} scans, {rounds} rounds: at least one of each is needed")
+    cold_ms = run_frame(detector, scans[0]).total_ms if detector.last_frame is None else None
+    for _ in range(warmup):
+        for scan in scans:
+            detector(scan)
+    passes = [[run_frame(detector, scan) for scan in scans] for _ in track(rounds, "stages")]
+    frames = [frame for one_pass in passes for frame in one_pass]
+    total_ms = Percentiles.of([frame.total_ms for frame in frames])
+    outside_ms = [_outside_ms(frame) for frame in frames]
+    graphs = detector.bundle.graphs
+    return BenchmarkReport(
+        fps=1e3 / total_ms.p50,
+        total_ms=total_ms,
+        stages_ms={s: Percentiles.of([f.times_ms[s] for f in frames]) for s in frames[0].times_ms},
+        outside_ms=Percentiles.of(outside_ms),
+        outside_share=float(np.median([o / f.total_ms for o, f in zip(outside_ms, frames, strict=True)])),
+        cold_ms=cold_ms,
+        load_s=detector.load_s,
+        frames=len(frames),
+        scans=len(scans),
+        points=tuple(len(scan) for scan in scans),
+        pillars=tuple(frame.counts.pillars for frame in passes[0]),
+        detections=tuple(len(detector(scan)) for scan in scans),
+        provider=detector.provider,
+        precision=detector.precision,
+        threads=detector.threads,
+        cpu=cpu_model(),
+        peak_memory_mib=peak_memory_mib(),
+        versions=package_versions(),
+        bundle=detector.bundle.name,
+        graphs_sha256={"encoder": graphs.encoder.sha256, "backbone": graphs.backbone.sha256},
+        input_sha256=_sha256(scans),
+    )
+
+
+def _outside_ms(frame: FrameReport) -> float:
+    return frame.total_ms - sum(frame.times_ms[stage] for stage in GRAPHS)
+
+
+def _sha256(scans: Sequence[NDArray[np.float32]]) -> str:
+    digest = hashlib.sha256()
+    for scan in scans:
+        digest.update(np.ascontiguousarray(scan, "<f4").tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,76 @@
+"""The ablation's runs: real commands on a few made-up frames, resumable and repeatable."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+
+from asca_pillars.ablation.variants import VARIANTS, Variant, runs, train_runs
+from asca_pillars.commands import ablate
+from asca_pillars.config import load_config, shipped_configs
+from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.schema import to_dict
+from tests.scenes import write_dataset
+from tests.training.test_loop import CONFIG
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> str:
+    path = tmp_path / "tiny.yaml"
+    one_epoch = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1))
+    path.write_text(yaml.safe_dump(to_dict(one_epoch)))
+    return str(path)
+
+
+@pytest.mark.parametrize("variant", VARIANTS.values(), ids=lambda variant: variant.name)
+def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
+    config = load_config(shipped_configs()["ablation_small"], variant.overrides)
+    assert config.detector.grid.zones == variant.zones and config.network.cpa == variant.cpa
+    assert config.augment.insert.method == variant.insert
+    assert config.detector.grid.v_max_m == (0.16 if variant.zones == 1 else 0.32)
+
+
+def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.CaptureFixture[str]) -> None:
+    data = write_dataset(tmp_path / "data", 14, val_frames=8)
+    out = tmp_path / "out"
+    ablate.run(config, data, out, ["train.learning_rate=0.002"], "0", "baseline,asp_k2", jobs=2)
+    text = (out / "results.md").read_text()
+    assert "6 frames for training, 8 for validation" in text and "2 runs" in text
+    assert sum(line.startswith("| K=2 | - | - |") for line in text.splitlines()) == 2
+    trained = load_config(out / "baseline" / "seed0" / "config.yaml")
+    assert (trained.train.learning_rate, trained.detector.grid.zones) == (2e-3, 1)
+    weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
+
+    ablate.run(
+        config, data, out, ["train.learning_rate=0.002"], "0", "baseline,asp_k2", jobs=1
+    )  # nothing is trained twice
+    assert all(path.stat().st_mtime_ns == before for path, before in weights.items())
+    again = (out / "results.md").read_text()
+    assert _accuracies(again) == _accuracies(text)
+
+    with pytest.raises(TrainingError, match="another base configuration or data"):
+        ablate.run(config, data, out, [], "0", "baseline", jobs=1)
+
+
+def test_a_failed_run_names_its_log(tmp_path: Path, config: str) -> None:
+    todo = runs(tmp_path / "out", [0], [VARIANTS["baseline"]])
+    with pytest.raises(TrainingError, match=r"train\.log: `asca train` of baseline, seed 0 failed: .*nowhere"):
+        train_runs(todo, config, tmp_path / "nowhere", jobs=1)
+    assert not todo[0].trained.exists()
+
+
+def test_runs_of_a_seed_come_before_the_next_seed(tmp_path: Path) -> None:
+    order = [(run.seed, run.variant.name) for run in runs(tmp_path, [3, 1], [VARIANTS["rs_aug"], VARIANTS["baseline"]])]
+    assert order == [(3, "rs_aug"), (3, "baseline"), (1, "rs_aug"), (1, "baseline")]
+
+
+@pytest.mark.parametrize(("seeds", "variants"), [("zero", "all"), ("0", "asp_k9")])
+def test_what_does_not_exist_is_one_line(tmp_path: Path, config: str, seeds: str, variants: str) -> None:
+    with pytest.raises(ConfigError, match=f"{seeds}: whole numbers|{variants}: no such variant"):
+        ablate.run(config, tmp_path, tmp_path / "out", [], seeds, variants, jobs=1)
+
+
+def _accuracies(text: str) -> list[str]:
+    """The tables without parameters, speed and time, which depend on the machine's mood."""
+    return [" | ".join(line.split(" | ")[:9]) for line in text.splitlines() if line.startswith("|")]

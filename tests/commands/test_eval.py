@@ -1,0 +1,226 @@
+"""`asca eval` as a whole: text folders, a bundle and a checkpoint, what is written, and what is refused in one line."""
+
+import json
+import logging
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from numpy.testing import assert_allclose
+
+from asca_deploy import default_bundle_path, load_bundle
+from asca_pillars.commands.eval import run
+from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
+from asca_pillars.errors import AscaError
+from asca_pillars.models.pillar.pillar_detector import build_detector
+from asca_pillars.schema import to_dict
+from tests.scenes import write_dataset
+from tests.training.test_loop import CONFIG
+
+BASE_INSTALL = """
+import sys
+from importlib.machinery import PathFinder
+from pathlib import Path
+
+class BaseInstall(PathFinder):
+    @classmethod
+    def find_spec(cls, name, *rest):
+        if name.split(".")[0] in ("torch", "lightning", "numba", "sklearn", "scipy", "matplotlib", "pandas"):
+            return None
+        return super().find_spec(name, *rest)
+
+sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
+from asca_pillars.commands.eval import run
+run(None, None, "val", Path("det"), Path("gt"), Path("out"), None, None, None, 0.05, "cpu", None, None)
+"""
+
+
+@pytest.fixture(autouse=True)
+def log_level() -> Iterator[None]:
+    """The command silences the runtime's log for the rest of its process, which here goes on with other tests."""
+    log = logging.getLogger("asca_deploy")
+    before = log.level
+    yield
+    log.setLevel(before)
+
+
+def evaluate(
+    model: Path | None = None,
+    *,
+    data: Path | None = None,
+    predictions: Path | None = None,
+    labels: Path | None = None,
+    out: Path,
+    json_path: Path | None = None,
+    gallery: int | None = 0,
+    score: float | None = None,
+    min_score: float = 0.05,
+    provider: str = "cpu",
+    precision: str | None = None,
+    threads: int | None = 1,
+) -> dict:
+    """Run the command; what it wrote as report.json."""
+    where = provider, precision, threads
+    run(model, data, "val", predictions, labels, out, json_path, gallery, score, min_score, *where)
+    return json.loads((out / "report.json").read_text())
+
+
+def refusal(tmp_path: Path, **arguments) -> str:
+    with pytest.raises(AscaError) as caught:
+        evaluate(**({"out": tmp_path / "out"} | arguments))
+    message = str(caught.value)
+    assert "\n" not in message and not (tmp_path / "out" / "report.json").exists()
+    return message.replace(f"{tmp_path}/", "")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_dataset(tmp_path / "kitti", 3, val_frames=2)
+
+
+@pytest.fixture
+def texts(root: Path) -> dict[str, Path]:
+    """The labels of all three frames, and as predictions the labels themselves."""
+    labels = root / "training" / "label_2"
+    for frame_id in KittiSplit(root).frame_ids:
+        scored = [KittiObject(**(vars(item) | {"score": 0.9})) for item in KittiSplit(root).objects(frame_id)]
+        write_labels(root.parent / "det" / f"{frame_id}.txt", scored)
+    return {"predictions": root.parent / "det", "labels": labels}
+
+
+def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    report = evaluate(**texts, out=tmp_path / "out", json_path=tmp_path / "deep" / "results.json", gallery=None)
+    assert json.loads((tmp_path / "deep" / "results.json").read_text()) == report
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.md", "curves.png"}
+    # Six cars, all found: the protocol's cap.
+    assert report["results"]["Car"]["3d"]["R40"] == pytest.approx([12.5] * 3)
+    assert report["frames"] == 3 and report["shortage"] is None and report["environment"]["packages"]["numpy"]
+    printed = capsys.readouterr().out
+    assert f"{texts['predictions']} against {texts['labels']}: 3 frames" in printed
+    assert "Car easy: only 6 counted objects; a perfect detector gets at most 12.5 R40, 18.2 R11" in printed
+
+
+def test_a_missing_prediction_file_is_said_everywhere(
+    tmp_path: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (texts["predictions"] / "000001.txt").unlink()
+    report = evaluate(**texts, out=tmp_path / "out")
+    sentence = (
+        "evaluated on 2 of 3 frames: no prediction file for 000001; a frame without detections needs an empty file"
+    )
+    assert report["shortage"] == sentence and report["frames_without_predictions"] == ["000001"]
+    assert any(line.endswith(sentence) for line in capsys.readouterr().out.splitlines())
+    assert sentence in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_the_base_install_is_enough_for_everything_but_the_curves(tmp_path: Path, texts: dict[str, Path]) -> None:
+    shutil.copytree(texts["labels"], tmp_path / "gt")
+    command = [sys.executable, "-c", BASE_INSTALL]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0 and not result.stderr, result.stderr
+    assert "No curves.png without matplotlib: pip install 'asca-pillars[eval]'" in result.stdout.splitlines()
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.md"}
+
+
+def test_predictions_with_a_dataset_are_scored_on_its_split_and_drawn(
+    tmp_path: Path, root: Path, texts: dict[str, Path]
+) -> None:
+    (texts["predictions"] / "000002.txt").write_text("")
+    report = evaluate(predictions=texts["predictions"], data=root, out=tmp_path / "out", gallery=None, score=0.95)
+    assert report["frames"] == 2  # of three, because `val` lists two
+    names = {path.name for path in (tmp_path / "out" / "gallery").iterdir()}
+    assert names == {"001_000001.png", "002_000002.png", "index.md"}  # nothing reaches 0.95: four misses each
+    assert {point["score"] for point in report["operating_points"]} == {0.95}
+    evaluate(**texts, data=root, out=tmp_path / "out", gallery=None)
+    assert {path.name for path in (tmp_path / "out" / "gallery").iterdir()} == {"001_000002.png", "index.md"}
+
+
+def test_the_shipped_bundle_and_its_predictions_score_the_same(
+    tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    report = evaluate(data=root, out=out, gallery=1)
+    assert "asca_small_sim_int8 on" in report["subject"] and report["frames"] == 2
+    assert report["model"]["min_score"] == 0.05 and len(report["model"]["sha256"]["encoder"]) == 64
+    own = {spec.name: spec.score_threshold for spec in load_bundle(default_bundle_path()).spec.classes}
+    assert {point["class_name"]: point["score"] for point in report["operating_points"]} == own
+    names = {path.name for path in (out / "predictions").iterdir()}
+    assert names == {"000001.txt", "000002.txt", "made_by.json"}
+    lines = "".join((out / "predictions" / f"00000{frame}.txt").read_text() for frame in (1, 2)).splitlines()
+    assert lines and all(float(line.split()[15]) >= 0.05 for line in lines)
+    assert len(list((out / "gallery").glob("*.png"))) == 1
+    # Made-up scenes have a tenth of a scan's points: the bundle says that it has never seen such.
+    assert "2 of 2 scans are unlike those that asca_small_sim_int8 was trained on" in capsys.readouterr().out
+    again = evaluate(predictions=out / "predictions", data=root, out=tmp_path / "again")
+    for key in ("results", "bands", "best_scores"):  # text has no thresholds of its own
+        assert again[key] == report[key]
+
+
+def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
+    torch.manual_seed(0)
+    network = build_detector(CONFIG)
+    weights = {f"detector.{name}": value for name, value in network.state_dict().items()}
+    content = {"hyper_parameters": {"config": to_dict(CONFIG)}, "state_dict": weights, "global_step": 7}
+    torch.save(content, tmp_path / "last.ckpt")
+    report = evaluate(tmp_path / "last.ckpt", data=root, out=tmp_path / "out", min_score=0.001, threads=None)
+    assert report["model"]["steps"] == 7 and report["model"]["provider"] == "torch cpu"
+    assert sorted(path.name for path in (tmp_path / "out" / "predictions").glob("*.txt")) == [
+        "000001.txt",
+        "000002.txt",
+    ]
+    assert "choose cpu, cuda or auto" in refusal(
+        tmp_path / "other", model=tmp_path / "last.ckpt", data=root, provider="x"
+    )
+    assert "precision reduced does not go with checkpoints" in refusal(
+        tmp_path / "other", model=tmp_path / "last.ckpt", data=root, precision="reduced"
+    )
+    assert "no such checkpoint" in refusal(tmp_path / "other", model=tmp_path / "none.ckpt", data=root)
+    assert (
+        refusal(tmp_path / "other", model=tmp_path / "last.ckpt", data=root, threads=0)
+        == "threads 0 must be at least 1"
+    )
+
+
+def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
+    det, gt = texts["predictions"], texts["labels"]
+    assert refusal(tmp_path) == "nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR"
+    assert refusal(tmp_path, predictions=det) == (
+        "--predictions det needs --labels DIR, or --data ROOT that has the labels"
+    )
+    assert refusal(tmp_path, labels=gt, data=root) == (
+        "--labels kitti/training/label_2 goes with --predictions DIR; a model is run on --data ROOT"
+    )
+    assert refusal(tmp_path, model=tmp_path / "b", predictions=det, labels=gt) == (
+        "b and --predictions det: give a model or its predictions, not both"
+    )
+    assert refusal(tmp_path, **texts, gallery=3) == "--gallery 3 draws scans: give --data ROOT that has them"
+    assert refusal(tmp_path, **texts, score=float("nan")) == "--score nan must be a number"
+    assert refusal(tmp_path, data=root, score=0.04) == (
+        "score 0.04 of Car is below --min-score 0.05, the lowest that asca_small_sim_int8 is run with; "
+        "lower --min-score"
+    )
+    assert "bundle.json" in refusal(tmp_path, model=tmp_path, data=root)
+    assert "velodyne" in refusal(tmp_path, data=tmp_path)
+    (gt / "000002.txt").unlink()
+    assert "label_2/000002.txt: cannot read the labels" in refusal(tmp_path, data=root)
+    assert not (tmp_path / "out").exists()
+
+
+def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
+    theirs = tmp_path / "out" / "predictions"
+    shutil.copytree(texts["predictions"], theirs)
+    assert refusal(tmp_path, data=root) == (
+        "out/predictions: holds files that `asca eval` did not write; choose another --out, or move them"
+    )
+    assert len(list(theirs.glob("*.txt"))) == 3
+
+
+def test_labels_against_themselves_reach_the_cap(tmp_path: Path, texts: dict[str, Path]) -> None:
+    report = evaluate(**texts, out=tmp_path / "out")
+    for name, objects in (("Car", 6), ("Pedestrian", 3), ("Cyclist", 3)):
+        for metric in ("bbox", "bev", "3d", "aos"):
+            assert_allclose(report["results"][name][metric]["R40"], 100 * (objects - 1) / 40)

@@ -1,0 +1,103 @@
+"""Free ground on made-up streets, where it is known what stands and what is hidden."""
+
+import numpy as np
+import pytest
+from shapely.geometry import MultiPoint, Point, Polygon
+
+from asca_pillars.data.insertion.clusters import cluster_boxes
+from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace, find_free_space
+from asca_pillars.data.insertion.ground_fit import fit_ground
+from asca_pillars.geometry.boxes import footprints, points_in_boxes
+from tests.data.insertion.simple_streets import AZIMUTHS_RAD, LEVEL, cast, stand, street
+
+BOXES = np.array(
+    [stand("Car", 10, 3, 0.3), stand("Car", 15, -4, 1.2), stand("Pedestrian", 9, -1), stand("Cyclist", 20, 1, 2.0)]
+)
+
+
+def middles(space: FreeSpace) -> np.ndarray:
+    return space.cells[0].T
+
+
+def test_ground_is_free_where_it_is_seen_and_nothing_stands() -> None:
+    points = cast(LEVEL, BOXES)
+    space = find_free_space(points)
+    free = middles(space)
+    # The lowest returns of a side may pass for ground: its own cell, no more, may be free.
+    outlines = [Polygon(outline).buffer(-CELL_M) for outline in footprints(BOXES.astype(float))]
+    assert not any(outline.contains(Point(xy)) for xy in free for outline in outlines)
+
+    # A sight line to the ground between a box and the end of its shadow passes through the box.
+    ground = np.column_stack([free, np.full(len(free), LEVEL[2])])
+    along = np.linspace(0.02, 0.98, 100)[:, None, None] * ground[None]
+    hidden = points_in_boxes(along.reshape(-1, 3), BOXES, margin_m=-0.15).any(axis=1).reshape(100, -1).any(axis=0)
+    assert hidden.mean() < 0.01
+
+    # Nearly everything else within 20 m, cell by cell, is free, although the rings there are metres apart.
+    every = np.stack(np.meshgrid(np.arange(6, 20, CELL_M), np.arange(-6, 6, CELL_M), indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
+    seen = np.abs(np.arctan2(every[:, 1], every[:, 0])) < AZIMUTHS_RAD.max() - 0.02
+    along = np.linspace(0.02, 1, 100)[:, None, None] * np.column_stack([every, np.full(len(every), LEVEL[2])])[None]
+    clear = ~points_in_boxes(along.reshape(-1, 3), BOXES, margin_m=0.4).any(axis=1).reshape(100, -1).any(axis=0)
+    assert (seen & clear).sum() > 1000
+    assert space.is_free(every[seen & clear]).mean() > 0.97
+
+
+def test_what_is_beside_the_view_is_not_free() -> None:
+    free = middles(find_free_space(cast(LEVEL, BOXES)))
+    assert len(free) > 5000
+    assert np.abs(np.arctan2(free[:, 1], free[:, 0])).max() < AZIMUTHS_RAD.max() + 0.05
+    space = find_free_space(cast(LEVEL, BOXES))
+    assert not space.is_free(np.array([[-5.0, 0.0], [1e6, 0.0], [10.0, 30.0]])).any()
+
+
+@pytest.mark.parametrize(("slope", "some"), [(0.03, True), (0.12, False)])
+def test_steep_ground_is_not_free(slope: float, some: bool) -> None:
+    space = find_free_space(cast((0.0, slope, -1.73), BOXES[:0]))
+    assert space.ground is not None and space.free.any() == some
+
+
+def test_every_object_is_in_a_cluster_of_its_own() -> None:
+    space = find_free_space(cast(LEVEL, BOXES))
+    outlines = [Polygon(outline) for outline in footprints(BOXES.astype(float))]
+    clusters = [Polygon(outline) for outline in footprints(space.clusters.astype(float))]
+    assert len(clusters) == len(BOXES)
+    for outline in outlines:
+        assert sum(outline.intersects(cluster) for cluster in clusters) == 1
+
+
+def test_rectangles_are_the_smallest_as_shapely_finds_them() -> None:
+    points = cast(LEVEL, BOXES)
+    ground = fit_ground(points)
+    assert ground is not None
+    standing = points[points_in_boxes(points, BOXES).any(axis=1) & (points[:, 2] > LEVEL[2] + 0.25)].astype(float)
+    found = cluster_boxes(standing, ground)
+    inside = points_in_boxes(standing, found, margin_m=1e-3)
+    assert inside.any(axis=1).all()
+    for box, own in zip(found, inside.T, strict=True):
+        smallest = MultiPoint(standing[own, :2]).minimum_rotated_rectangle
+        assert box[3] * box[4] == pytest.approx(smallest.area, rel=0.01, abs=0.01)
+        assert box[2] - box[5] / 2 == pytest.approx(LEVEL[2], abs=0.1)
+
+
+def test_two_walls_that_meet_do_not_take_the_yard() -> None:
+    """A cluster of 20 m by 20 m; its one rectangle would hold everything in the corner."""
+    walls = np.array([[30.0, 0.0, -0.5, 0.3, 20.0, 2.5, 0.0], [20.0, -10.0, -0.5, 20.0, 0.3, 2.5, 0.0]], np.float32)
+    space = find_free_space(cast(LEVEL, walls))
+    assert space.clusters[:, 3:5].max() < 8
+    assert space.is_free(np.array([[20.0, 0.0], [25.0, -5.0]])).all()
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 4), np.float32), np.full((50, 4), 5, np.float32)])
+def test_nothing_is_free_without_ground(points: np.ndarray) -> None:
+    space = find_free_space(points)
+    assert space.ground is None and not len(middles(space)) and space.clusters.shape == (0, 7)
+    assert not space.is_free(np.zeros((3, 2))).any()
+
+
+def test_cells_agree_with_lookups() -> None:
+    space = find_free_space(street(3)[0])
+    assert len(middles(space)) == space.free.sum() > 0 and space.is_free(middles(space)).all()
+    x, y = middles(space).T
+    assert np.array_equal(space.cells[1], np.hypot(x, y))

@@ -1,0 +1,65 @@
+"""The fitted ground against grounds that are known."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.data.insertion.ground_fit import fit_ground, fit_plane, plane_heights
+from tests.data.insertion.simple_streets import cast, stand
+
+SLOPES = st.floats(-0.06, 0.06)
+
+
+@settings(max_examples=10)
+@given(SLOPES, SLOPES, st.floats(-2.2, -1.4), st.integers(0, 9))
+def test_a_tilted_plane_is_found_among_clutter(a: float, b: float, c: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    plane = (a, b, c)
+    cars = np.array([stand("Car", x, y, plane=plane) for x, y in ((9, 4), (14, -4), (20, 3), (26, -2))])
+    points = cast(plane, cars)
+    points[:, 2] += rng.normal(0, 0.02, len(points))
+    leaves = rng.uniform((10, 8, -1), (30, 15, 3), (len(points) // 2, 3))
+    found = fit_plane(np.concatenate([points[:, :3], leaves]))
+    assert found is not None
+    assert (np.abs(found - plane) < (0.004, 0.004, 0.05)).all()
+
+
+def test_the_same_points_give_the_same_plane() -> None:
+    points = cast((0.02, 0.01, -1.7), np.array([stand("Car", 10, 0)]))
+    assert np.array_equal(fit_plane(points), fit_plane(points.copy()))
+
+
+def test_hills_are_followed_where_a_plane_is_far_off() -> None:
+    """Returns spread over waves of 40 m; a wall and a car stand on them and hide what is under them."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((4, -25), (60, 25), (30_000, 2))
+
+    def height(xy: np.ndarray) -> np.ndarray:
+        return -1.7 + 0.01 * xy[:, 0] + 0.4 * np.sin(xy[:, 0] / 40 * 2 * np.pi) + 0.1 * np.cos(xy[:, 1] / 8)
+
+    z = height(xy) + rng.normal(0, 0.02, len(xy))
+    car = (np.abs(xy - (20, 3)) < (2.2, 1)).all(axis=1)
+    wall = np.abs(xy[:, 1] + 15) < 0.4
+    z[car] += rng.uniform(0.3, 1.5, car.sum())
+    z[wall] += rng.uniform(0.0, 3.0, wall.sum())
+    ground = fit_ground(np.column_stack([xy, z]))
+    assert ground is not None
+    where = rng.uniform((6, -22), (58, 22), (500, 2))
+    error = np.abs(ground.heights(where) - height(where))
+    assert np.percentile(error, 95) < 0.08 and error.max() < 0.25
+    assert np.abs(height(where) - plane_heights(ground.plane, where)).max() > 0.3
+    assert abs(float(ground.heights(np.array([[20.0, 3.0]]))[0] - height(np.array([[20.0, 3.0]]))[0])) < 0.15
+
+
+@pytest.mark.parametrize("count", [0, 3, 200])
+def test_no_ground(count: int) -> None:
+    """No points, or a post: nothing to stand on."""
+    post = np.column_stack([np.full(count, 10.0), np.zeros(count), np.linspace(-1, 2, count)])
+    assert fit_plane(post) is None and fit_ground(post) is None
+
+
+def test_a_steep_wall_is_no_ground() -> None:
+    rng = np.random.default_rng(1)
+    yz = rng.uniform((-20, -1), (20, 5), (4000, 2))
+    assert fit_ground(np.column_stack([10 + 0.5 * (yz[:, 1] + 1), yz])) is None

@@ -1,0 +1,131 @@
+"""The object database: what it holds, when it is built, and that nothing half built is ever used."""
+
+import dataclasses
+import os
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asca_pillars.data.frames import read_frame
+from asca_pillars.data.insertion import gt_database
+from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
+from asca_pillars.data.kitti import KittiObject, KittiSplit, read_labels, write_labels
+from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.boxes import points_in_boxes
+from tests.data.insertion.simple_streets import TYPES, write_streets
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> KittiSplit:
+    return KittiSplit(write_streets(tmp_path / "data", 3), "train")
+
+
+def prepare(
+    split: KittiSplit, prepared: Path, names: tuple[str, ...] = TYPES, camera_view: bool = True
+) -> ObjectDatabase:
+    return prepare_database(split, names, prepared, camera_view=camera_view)
+
+
+def rename(split: KittiSplit, frame_id: str, index: int, name: str) -> None:
+    objects: list[KittiObject] = read_labels(split.label_path(frame_id))
+    objects[index] = dataclasses.replace(objects[index], type=name)
+    write_labels(split.label_path(frame_id), objects)
+
+
+def test_it_holds_every_labelled_object_with_its_points(split: KittiSplit, tmp_path: Path) -> None:
+    rename(split, "000001", 0, "Van")  # no class, but a neighbour of one: not in it
+    rename(split, "000002", 0, "Truck")
+    database = prepare(split, tmp_path)
+    frames = [read_frame(split, frame_id, TYPES, min_points=0) for frame_id in split.frame_ids]
+    kept = [frame.labels >= 0 for frame in frames]
+    assert len(database) == 10 and sum(mask.sum() for mask in kept) == 10
+    assert np.array_equal(database.boxes, np.concatenate([f.boxes[k] for f, k in zip(frames, kept, strict=True)]))
+    assert np.array_equal(database.labels, np.concatenate([f.labels[k] for f, k in zip(frames, kept, strict=True)]))
+    assert database.frames.tolist() == [0] * 4 + [1] * 3 + [2] * 3
+    for index in range(len(database)):
+        item, frame = database[index], frames[database.frames[index]]
+        own = frame.points[points_in_boxes(frame.points, item.box[None])[:, 0]]
+        assert np.array_equal(item.points, own) and item.points.dtype == np.float32
+        assert item.label == database.labels[index] and len(own) == database.point_counts[index]
+    assert database.point_counts.sum() > 100
+
+
+def test_what_is_taken_out_is_a_copy(split: KittiSplit, tmp_path: Path) -> None:
+    database = prepare(split, tmp_path)
+    before = database[0].points.copy()
+    database[0].points[:] = 0
+    database[0].box[:] = 0
+    assert np.array_equal(database[0].points, before) and database.boxes[0].any()
+
+
+def test_it_is_built_once_and_again_when_something_changed(
+    split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    builds = []
+    build = gt_database._build
+    monkeypatch.setattr(gt_database, "_build", lambda path, *args: (builds.append(path), build(path, *args)))
+    first = prepare(split, tmp_path)
+    assert prepare(split, tmp_path).path == first.path and len(builds) == 1
+    prepare(split, tmp_path, names=("Pedestrian", "Car"))
+    prepare(split, tmp_path, camera_view=False)
+    prepare(KittiSplit(split.root, "val"), tmp_path)
+    assert len(set(builds)) == len(builds) == 4
+    os.utime(split.scan_path("000001"), ns=(1, 1))
+    prepare(split, tmp_path)
+    rename(split, "000001", 0, "Pedestrian")
+    assert prepare(split, tmp_path).labels.tolist().count(1) == 4
+    assert len(set(builds)) == len(builds) == 6
+    assert first.labels.tolist().count(1) == 3  # what a run uses stays
+
+
+def test_it_is_the_same_everywhere(split: KittiSplit, tmp_path: Path) -> None:
+    one, other = (prepare(split, tmp_path / name).path for name in ("a", "b"))
+    assert one.name == other.name
+    for suffix in (".json", ".npy", ".npz"):
+        assert one.with_suffix(suffix).read_bytes() == other.with_suffix(suffix).read_bytes()
+
+
+def test_a_build_that_fails_leaves_nothing_to_be_used(split: KittiSplit, tmp_path: Path) -> None:
+    text = split.label_path("000002").read_text()
+    split.label_path("000002").write_text("Car 1 2\n")
+    with pytest.raises(DatasetError, match="000002"):
+        prepare(split, tmp_path / "prepared")
+    assert not list((tmp_path / "prepared").rglob("*.json")) and not list((tmp_path / "prepared").rglob(".*"))
+    split.label_path("000002").write_text(text)
+    assert len(prepare(split, tmp_path / "prepared")) == 12
+
+
+def test_builders_at_the_same_time_do_not_meet(split: KittiSplit, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: prepare(split, tmp_path)[5], range(4)))
+    for item in found[1:]:
+        assert np.array_equal(item.points, found[0].points) and np.array_equal(item.box, found[0].box)
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_what_goes_to_a_worker_is_the_path(split: KittiSplit, tmp_path: Path) -> None:
+    database = prepare(split, tmp_path)
+    box = database[3].box
+    assert len(pickle.dumps(database)) < 1000
+    rebuild, arguments = database.__reduce__()  # what the other process does with it
+    assert np.array_equal(rebuild(*arguments)[3].box, box)
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_the_work(
+    split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setattr(gt_database, "read_frame", lambda *_, **__: pytest.fail("read"))
+    with pytest.raises(DatasetError, match=r"file/prepared/.*: cannot be written.*data\.prepared") as caught:
+        prepare(split, tmp_path / "file" / "prepared")
+    assert "\n" not in str(caught.value)
+
+
+def test_frames_without_objects(split: KittiSplit, tmp_path: Path) -> None:
+    for frame_id in split.frame_ids:
+        split.label_path(frame_id).write_text("")
+    database = prepare(split, tmp_path)
+    assert len(database) == 0 and database.boxes.shape == (0, 7) and database.point_counts.shape == (0,)

@@ -1,0 +1,260 @@
+"""Insertion as a whole: which classes, how many, the same for the same seed, and nothing else changed."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import Polygon
+from torch.utils.data import DataLoader
+
+from asca_pillars.commands.prepare import run
+from asca_pillars.config import Config, DataConfig, InsertConfig
+from asca_pillars.data.augment import augment
+from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
+from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares, prepare_inserter
+from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_labels, write_labels
+from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.geometry.boxes import footprints, points_in_boxes
+from asca_pillars.training.dataset import Batch, KittiDataset
+from tests.data.insertion.simple_streets import TYPES, write_streets
+from tests.scenes import SPEC
+
+FRAMES = 6
+METHODS = ("gt_aug", "rs_aug")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_streets(tmp_path_factory.mktemp("streets"), FRAMES)
+
+
+def config(method: str, **insert: object) -> Config:
+    base = Config(detector=SPEC, data=DataConfig(workers=0))
+    changed = InsertConfig(method=method, **insert)  # type: ignore[arg-type]
+    return dataclasses.replace(base, augment=dataclasses.replace(base.augment, insert=changed))
+
+
+def inserter_of(root: Path, method: str, **insert: object) -> Inserter:
+    return prepare_inserter(KittiSplit(root, "train"), config(method, **insert))
+
+
+def frame_of(root: Path, number: int) -> LabeledFrame:
+    return read_frame(KittiSplit(root, "train"), f"{number:06d}", TYPES)
+
+
+def augmented(inserter: Inserter, root: Path, number: int, seed: int = 0) -> tuple[LabeledFrame, LabeledFrame]:
+    before = frame_of(root, number)
+    return before, insert_objects(before, inserter, np.random.default_rng((seed, number)))
+
+
+def polygons(boxes: np.ndarray) -> list[Polygon]:
+    return [Polygon(outline) for outline in footprints(boxes.astype(float))]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(0, 20), st.one_of(st.just(0.0), st.floats(0.05, 3))), min_size=1, max_size=5).filter(
+        lambda pairs: any(wanted for _, wanted in pairs)
+    ),
+    st.integers(1, 30),
+)
+def test_shares_fill_the_classes_up_to_one_level(pairs: list[tuple[float, float]], objects: int) -> None:
+    there, wanted = np.array(pairs).T
+    shares = insertion_shares(there, wanted, objects)
+    assert shares.sum() == pytest.approx(1) and (shares >= -1e-12).all() and not shares[wanted == 0].any()
+    asked = wanted > 0
+    after = (there + objects * shares)[asked] / wanted[asked]
+    filled = shares[asked] > 1e-9
+    assert np.ptp(after[filled]) < 1e-6 * max(after.max(), 1)
+    assert (after[~filled] >= after[filled].min() - 1e-6 * after.max()).all()
+
+
+def test_shares_by_hand() -> None:
+    # 4 + 1 + 0 objects and 6 more make 11; the car's 4 exceed a third: the others share 7, 3.5 each.
+    assert insertion_shares(np.array([4.0, 1.0, 0.0]), np.ones(3), 6) * 6 == pytest.approx([0, 2.5, 3.5])
+    # Twice as many pedestrians as of the others: 11 = 2.75 + 5.5 + 2.75, but there are 4 cars; 7 = 4.67 + 2.33.
+    assert insertion_shares(np.array([4.0, 1.0, 0.0]), np.array([1, 2, 1.0]), 6) * 6 == pytest.approx(
+        [0, 11 / 3, 7 / 3]
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_is_inserted_touches_nothing(root: Path, method: str) -> None:
+    inserter = inserter_of(root, method, objects=8)
+    inserted = 0
+    for number in range(FRAMES):
+        for seed in range(5):
+            before, after = augmented(inserter, root, number, seed)
+            new = polygons(after.boxes[len(before.boxes) :])
+            others = polygons(before.boxes)
+            if method == "rs_aug":
+                others += polygons(inserter.free_space(before.frame_id).clusters)
+            assert not any(one.intersection(other).area > 1e-6 for one in new for other in others)
+            assert not any(a.intersection(b).area > 1e-6 for i, a in enumerate(new) for b in new[:i])
+            inserted += len(new)
+    assert inserted > 2 * FRAMES * 5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_rest_of_the_frame_stays(root: Path, method: str) -> None:
+    inserter = inserter_of(root, method)
+    before, after = augmented(inserter, root, 2)
+    copy = frame_of(root, 2)
+    assert np.array_equal(before.points, copy.points) and np.array_equal(before.labels, copy.labels)
+    count = len(before.boxes)
+    assert len(after.boxes) > count and np.array_equal(after.boxes[:count], before.boxes)
+    assert after.points.dtype == after.boxes.dtype == np.float32 and after.labels.dtype == np.int64
+    assert after.frame_id == before.frame_id and len(after.boxes) == len(after.labels)
+    kept = {tuple(row) for row in before.points.tolist()}
+    new = np.array([tuple(row) not in kept for row in after.points.tolist()])
+    within, deep_within = (
+        points_in_boxes(after.points, after.boxes[count:], margin_m=margin_m).any(axis=1) for margin_m in (1e-3, -1e-3)
+    )
+    assert new.any() and within[new].all()
+    assert not deep_within[~new].any()  # of the frame, nothing is left in the new boxes
+
+
+def test_objects_of_gt_aug_stand_where_they_stood(root: Path) -> None:
+    inserter = inserter_of(root, "gt_aug")
+    stored = {tuple(box) for box in inserter.database.boxes.tolist()}
+    before, after = augmented(inserter, root, 1)
+    new = after.boxes[len(before.boxes) :]
+    assert len(new) and all(tuple(box) in stored for box in new.tolist())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_other_types_are_in_the_way_too(root: Path, tmp_path: Path, method: str) -> None:
+    """A lorry, which is no class, stands over the whole street: there is no room for anything."""
+    split = KittiSplit(write_streets(tmp_path, 2), "train")
+    inserter = prepare_inserter(split, config(method))
+    car = objects_3d(read_labels(split.label_path("000000")))[0]
+    lorry = dataclasses.replace(car, type="Truck", length_m=100.0, width_m=100.0)
+    write_labels(split.label_path("000000"), [lorry])
+    before, after = augmented(inserter, tmp_path, 0)
+    assert len(boxes_from_objects([lorry], split.calibration("000000"))) == 1 and len(before.boxes) == 0
+    assert np.array_equal(before.points, after.points) and len(after.boxes) == 0
+
+
+@pytest.mark.parametrize(
+    ("proportions", "expected"),
+    [({}, (1, 1, 1)), ({"Pedestrian": 1, "Car": 1, "Cyclist": 1.5}, (1, 1, 1.5)), ({"Cyclist": 1, "Car": 1}, None)],
+)
+def test_counts_approach_the_proportions(
+    root: Path, proportions: dict[str, float], expected: tuple[float, ...] | None
+) -> None:
+    inserter = inserter_of(root, "rs_aug", objects=4, proportions=proportions)
+    before, after = np.zeros(3), np.zeros(3)
+    for number in range(FRAMES):
+        for seed in range(8):
+            for counts, frame in zip((before, after), augmented(inserter, root, number, seed), strict=True):
+                counts += np.bincount(frame.labels[frame.labels >= 0], minlength=3)
+    if expected is None:  # the class that was not asked for stays as it is
+        assert after[1] == before[1] and after[2] > 1.5 * before[2]
+        return
+    ratio = after / np.array(expected)
+    assert np.abs(ratio / ratio.mean() - 1).max() < 0.2, ratio
+    assert np.ptp(before / np.array(expected) / before.mean()) > 0.3
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_samples_depend_on_seed_epoch_and_frame_alone(root: Path, method: str) -> None:
+    frames = KittiDataset(root, config(method), training=True)
+    again = KittiDataset(root, config(method), training=True)
+    late = [again[epoch, number].frame for epoch, number in ((1, 3), (0, 3), (0, 2))][1:]
+    for sample, number in zip(late, (3, 2), strict=True):
+        expected = frames[0, number].frame
+        assert np.array_equal(sample.points, expected.points) and np.array_equal(sample.boxes, expected.boxes)
+    first, second = frames[0, 3].frame, frames[1, 3].frame
+    assert len(first.points) != len(second.points) or not np.array_equal(first.points, second.points)
+
+
+def test_any_number_of_workers_gives_the_same(root: Path) -> None:
+    frames = KittiDataset(root, config("rs_aug"), training=True)
+    batches = [[(0, number), (1, number)] for number in range(FRAMES)]
+    loader = DataLoader(
+        frames, batch_sampler=batches, num_workers=2, collate_fn=Batch, multiprocessing_context="forkserver"
+    )
+    for batch, indices in zip(loader, batches, strict=True):
+        for boxes, labels, index in zip(batch.boxes, batch.labels, indices, strict=True):
+            expected = frames[index].frame
+            assert np.array_equal(boxes, expected.boxes) and np.array_equal(labels, expected.labels)
+
+
+def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -> None:
+    """Neither method `none` nor 0 objects changes what else is drawn, and no folder is made for `none`."""
+    plain = config("none")
+    folder = tmp_path / "prepared"
+    plain = dataclasses.replace(plain, data=dataclasses.replace(plain.data, prepared=str(folder)))
+    rng = np.random.default_rng((plain.train.seed, 2, 4))
+    frame = within_grid(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid)
+    pillars = SPEC.pillarize(frame.points, rng)
+    for settings_ in (plain, config("rs_aug", objects=0), config("gt_aug", objects=0)):
+        sample = KittiDataset(root, settings_, training=True)[2, 4]
+        assert np.array_equal(sample.frame.points, frame.points) and np.array_equal(sample.frame.boxes, frame.boxes)
+        assert np.array_equal(sample.pillars.features, pillars.features)
+    assert not folder.exists()
+
+
+def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("asca_pillars.training.dataset.prepare_inserter", lambda *_: pytest.fail("built"))
+    sample = KittiDataset(root, config("rs_aug"), training=False)[0, 0]
+    assert np.array_equal(sample.frame.points, frame_of(root, 0).points)
+
+
+def test_a_frame_without_ground_or_points_stays_as_it_is(tmp_path: Path) -> None:
+    split = KittiSplit(write_streets(tmp_path, 3), "train")
+    inserter = prepare_inserter(split, config("rs_aug"))
+    write_scan(split.scan_path("000000"), np.array([[9, 0, 0, 0.5]], np.float32))
+    write_scan(split.scan_path("000001"), np.array([[-9, 0, 0, 0.5]], np.float32))
+    for number in (0, 1):
+        before, after = augmented(inserter, tmp_path, number)
+        assert np.array_equal(before.points, after.points) and np.array_equal(before.boxes, after.boxes)
+
+
+def test_a_class_without_objects_is_named(tmp_path: Path) -> None:
+    split = KittiSplit(write_streets(tmp_path, 2), "train")
+    for frame_id in split.frame_ids:
+        text = split.label_path(frame_id).read_text()
+        split.label_path(frame_id).write_text(text.replace("Cyclist", "Misc"))
+    with pytest.raises(DatasetError, match=r"list `train` has no Cyclist with 5 .*proportions") as caught:
+        KittiDataset(tmp_path, config("rs_aug"), training=True)
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+    without = inserter_of(tmp_path, "rs_aug", proportions={"Car": 1, "Pedestrian": 1})
+    assert without.shares[2] == 0
+    with pytest.raises(DatasetError, match="has no Car with 1000000 or more points"):
+        inserter_of(tmp_path, "gt_aug", min_points=1_000_000, proportions={"Car": 1})
+
+
+@pytest.mark.parametrize(
+    ("proportions", "message"),
+    [({"Bus": 1.0}, r"proportions\.Bus: no such class; there are Car, "), ({"Car": 0.0}, "all are 0")],
+)
+def test_impossible_proportions_are_refused(proportions: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        config("rs_aug", proportions=proportions)
+
+
+def test_prepare_leaves_nothing_for_training_to_compute(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text("augment: {insert: {method: rs_aug}}")
+    overrides = [f"data.prepared={tmp_path / 'prepared'}"]
+    run(path, root, overrides, workers=1)
+    assert f"{4 * FRAMES} objects of {FRAMES} frames" in capsys.readouterr().out
+    made = {file: file.stat().st_mtime_ns for file in (tmp_path / "prepared").rglob("*.n*")}
+    assert len(made) == FRAMES + 2
+    find = "asca_pillars.data.insertion.free_maps.find_free_space"
+    monkeypatch.setattr(find, lambda _: pytest.fail("computed again"))
+    monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
+    settings_ = config("rs_aug")
+    settings_ = dataclasses.replace(
+        settings_, data=dataclasses.replace(settings_.data, prepared=str(tmp_path / "prepared"))
+    )
+    frames = KittiDataset(root, settings_, training=True)
+    assert all(len(frames[0, number].frame.boxes) for number in range(FRAMES))
+    assert {file: file.stat().st_mtime_ns for file in made} == made

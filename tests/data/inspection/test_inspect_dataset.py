@@ -1,0 +1,365 @@
+"""What `asca inspect` measures, against plain loops and the training loader; and what it says of data gone wrong."""
+
+import dataclasses
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from asca_pillars.commands.inspect import run
+from asca_pillars.config import Config, DataConfig
+from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.data.inspection.findings import Finding, findings
+from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
+from asca_pillars.data.inspection.measurements import Fate, match, measure_frame, measure_scan
+from asca_pillars.data.kitti import KittiSplit, read_labels
+from asca_pillars.data.scans.scan_reader import read_scan, stored_points
+from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.geometry.overlap import aligned_bev_iou
+from asca_pillars.pillars.pillarize import PillarLimits
+from asca_pillars.schema import to_dict
+from asca_pillars.training.dataset import KittiDataset
+from tests.scenes import GRID, SIZES, SPEC, make_scene, write_dataset
+
+Points = NDArray[np.float32]
+FRAMES = 12
+CONFIG = Config(name="tiny", detector=SPEC, data=DataConfig(train_set="training", val_set="training"))
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_dataset(tmp_path_factory.mktemp("clean"), FRAMES)
+
+
+@pytest.fixture
+def data(clean: Path, tmp_path: Path) -> Path:
+    """A copy to spoil."""
+    return shutil.copytree(clean, tmp_path / "data")
+
+
+def with_data(**changes: int | bool) -> Config:
+    return dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, **changes))
+
+
+def with_detector(**changes: object) -> Config:
+    return dataclasses.replace(CONFIG, detector=dataclasses.replace(SPEC, **changes))
+
+
+def with_grid(**changes: object) -> Config:
+    return with_detector(grid=dataclasses.replace(GRID, **changes))
+
+
+def found(root: Path, config: Config = CONFIG) -> list[Finding]:
+    return findings(inspect_dataset(root, config), config)
+
+
+def change_scans(root: Path, change: Callable[[Points], None], every: int = 1) -> None:
+    for path in sorted((root / "training" / "velodyne").iterdir())[::every]:
+        points = stored_points(path)
+        change(points)
+        points.tofile(path)
+
+
+def change_files(root: Path, folder: str, change: Callable[[str], str]) -> None:
+    for path in (root / "training" / folder).iterdir():
+        path.write_text(change(path.read_text()))
+
+
+def raise_sensor(root: Path, height_m: float) -> None:
+    """Everything lies lower in the LiDAR's frame, the camera's frame stays where it was."""
+    change_scans(root, lambda points: np.subtract(points[:, 2], height_m, out=points[:, 2]))
+    # CALIBRATION: y of the camera is -z of the LiDAR - 0.08 m.
+    change_files(root, "calib", lambda text: text.replace(f"{-0.08:.12e}", f"{-0.08 - height_m:.12e}"))
+
+
+def test_clean_data_gives_nothing_to_warn_of(clean: Path) -> None:
+    assert found(clean) == []
+
+
+def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
+    inspection = inspect_dataset(clean, CONFIG)
+    assert inspection.types == {"Car": 2 * FRAMES, "Pedestrian": FRAMES, "Cyclist": FRAMES}
+    cars = [box for seed in range(FRAMES) for box, name in zip(*make_scene(seed)[1:], strict=True) if name == "Car"]
+    facts = inspection.classes[0]
+    assert (facts.name, facts.boxes, facts.no_points, facts.few_points) == ("Car", 2 * FRAMES, 0, 0)
+    # Labels are written with two decimals.
+    assert facts.size_m == pytest.approx(np.mean(cars, axis=0)[3:6], abs=0.005)
+    assert facts.size_std_m == pytest.approx(np.std(cars, axis=0)[3:6], abs=0.005)
+    assert facts.z_m == pytest.approx(np.mean(cars, axis=0)[2], abs=0.01)
+    assert facts.reach_m is not None
+    assert facts.reach_m[0] == pytest.approx((min(box[0] for box in cars), max(box[0] for box in cars)), abs=0.01)
+    assert inspection.frames_without_objects == 0 and not inspection.sampled
+
+
+def test_points_of_a_box_by_a_plain_loop(clean: Path) -> None:
+    split = KittiSplit(clean)
+    measure = measure_frame(split, "000000", CONFIG)
+    counts = [0] * len(measure.boxes)
+    for x, y, z, _ in read_scan(split.scan_path("000000")).points.tolist():  # the camera sees all of the boxes
+        for row, (bx, by, bz, length, width, height, yaw) in enumerate(measure.boxes.tolist()):
+            along = math.cos(yaw) * (x - bx) + math.sin(yaw) * (y - by)
+            across = math.cos(yaw) * (y - by) - math.sin(yaw) * (x - bx)
+            counts[row] += abs(along) <= length / 2 and abs(across) <= width / 2 and abs(z - bz) <= height / 2
+    assert measure.points.tolist() == counts and min(counts) > 20
+    assert measure.labels.tolist() == [0, 0, 1, 2]
+
+
+def test_positives_are_those_of_the_training_loader(clean: Path) -> None:
+    config = with_data(min_points=110)  # some objects are to be ignored
+    config = dataclasses.replace(config, detector=dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1)))
+    samples = [KittiDataset(clean, config, training=False)[0, number] for number in range(FRAMES)]
+    inspection = inspect_dataset(clean, config)
+    for index, facts in enumerate(inspection.classes):
+        states = [sample.targets.state[..., 2 * index : 2 * index + 2] for sample in samples]
+        assert facts.positives == sum((state == 1).sum() for state in states) > 0
+        to_find = sum((sample.frame.labels == index).sum() for sample in samples)
+        assert facts.overlapped + facts.forced + facts.missed == to_find < facts.boxes
+        assert facts.few_points == facts.boxes - to_find
+    points = [sample.pillars.stats.points for sample in samples]
+    assert inspection.scans.points.largest == max(points)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2), st.floats(6.5, 23), st.floats(-4.5, 5.5), st.floats(0.5, 1.8), st.floats(-3.1, 3.1))
+def test_an_objects_fate_by_its_overlap_with_every_anchor(
+    label: int, x: float, y: float, stretch: float, yaw: float
+) -> None:
+    length, width, height = SIZES[SPEC.class_names[label]]
+    box = np.array([[x, y, -0.9, length * stretch, width, height, yaw]], np.float32)
+    fates, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), box, np.array([label])), SPEC)
+    own = SPEC.anchors[:, :, 2 * label : 2 * label + 2].reshape(-1, 7)
+    best = aligned_bev_iou(own, box).max()
+    assert fates.tolist() == [Fate.OVERLAPPED if best >= SPEC.classes[label].positive_iou else Fate.FORCED]
+    assert positives[label] >= 1 and positives.sum() == positives[label]
+
+
+def test_fates_by_hand() -> None:
+    x, y = SPEC.anchors[20, 15, 0, :2]
+    car = [x, y, -1.0, 3.9, 1.6, 1.56, 0.0]
+    short = [x, y + 5, -1.0, 2.0, 1.6, 1.56, 0.0]  # overlap at most 2.0 / 3.9 = 0.51
+    person = [x + 6, y, -0.6, 0.8, 0.6, 1.73, 0.0]
+    beside = [4.79, y, -1.0, 3.9, 1.6, 1.56, 0.0]
+    boxes = np.array([car, short, person, person, beside, car], np.float32)
+    labels = np.array([0, 0, 1, 1, 0, IGNORED])
+    fates, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), boxes, labels), SPEC)
+    # Of two equal boxes the later has the best anchors, the earlier what else reaches positive_iou.
+    assert fates[[0, 1, 3, 4, 5]].tolist() == [
+        Fate.OVERLAPPED,
+        Fate.FORCED,
+        Fate.OVERLAPPED,
+        Fate.LEFT_OUT,
+        Fate.LEFT_OUT,
+    ]
+    assert positives[2] == 0
+    tiny = np.array([[x, y, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2, np.float32)
+    fates, _ = match(LabeledFrame("0", np.empty((0, 4), np.float32), tiny, np.array([1, 1])), SPEC)
+    assert fates.tolist() == [Fate.MISSED, Fate.FORCED]
+
+
+def test_pillars_before_the_limits_agree_with_what_pillarize_drops(clean: Path) -> None:
+    spec = dataclasses.replace(SPEC, limits=PillarLimits(max_pillars=5000, max_points=3))
+    points = read_scan(KittiSplit(clean).scan_path("000000")).points
+    measure, stats = measure_scan(points, points, spec), spec.pillarize(points).stats
+    assert (measure.points, measure.inside) == (stats.points, stats.points - stats.points_outside)
+    assert measure.pillars == stats.pillars and measure.cut == stats.points_over_limit > 0
+    per_pillar = dataclasses.replace(spec, limits=PillarLimits(5000, 5000)).pillarize(points).point_counts
+    assert (measure.fullest, measure.crowded) == (per_pillar.max(), (per_pillar > 3).sum())
+    few = dataclasses.replace(spec, limits=PillarLimits(max_pillars=100, max_points=3)).pillarize(points).stats
+    assert measure.pillars == few.pillars + few.pillars_over_limit
+
+
+def test_evenly_spaced_frames(clean: Path) -> None:
+    inspection = inspect_dataset(clean, CONFIG, frames=4)
+    assert (inspection.frames, inspection.frames_in_split, inspection.sampled) == (4, FRAMES, True)
+    chosen = [
+        measure_frame(KittiSplit(clean), frame_id, CONFIG) for frame_id in ("000000", "000003", "000006", "000009")
+    ]
+    assert inspection.scans.points.largest == max(frame.scan.points for frame in chosen)
+    assert inspection.classes[1].positives == sum(frame.positives[1] for frame in chosen)
+    assert inspect_dataset(clean, CONFIG, frames=99, split="val").frames == 1
+
+
+@pytest.mark.parametrize(
+    ("scale", "every", "message"),
+    [
+        (255, 1, r"divided by 255 when read: training sees 0 to 0\.\d+; divide it by its full scale"),
+        (100, 1, r"training sees 0 to 0\.3\d; divide it by its full scale"),
+        (255, 2, r"in 6 of 12 scans, which are divided by 255; .* store all of them as 0\.\.1"),
+        (65535, 1, r"cut off at 255; divide it by its full scale, such as 65535"),
+        (1.5, 1, r"taken as 0\.\.255 and divided by 255; cut it off at 1"),
+        (0, 1, r"0 everywhere; check what exported"),
+        (1 / 255, 1, r"reaches 0\.00\d+ only; store it as 0\.\.1"),
+        (-1, 1, r"goes down to -0\.\d+ and is cut off at 0"),
+    ],
+)
+def test_reflectance_on_another_scale(data: Path, scale: float, every: int, message: str) -> None:
+    change_scans(data, lambda points: np.multiply(points[:, 3], scale, out=points[:, 3]), every)
+    finding = found(data)[0]
+    assert finding.level == "warning" and finding.about == "reflectance" and re.search(message, finding.text)
+
+
+@pytest.mark.parametrize("height_m", [-1.73, 1.0])
+def test_another_sensor_height_and_its_remedy(data: Path, height_m: float) -> None:
+    raise_sensor(data, height_m)
+    warnings = found(data)
+    assert {warning.about for warning in warnings} == {"Car", "Pedestrian", "Cyclist", "height"}
+    (ground,) = [warning.text for warning in warnings if warning.about == "height"]
+    moved_m = float(ground.split("by about ")[1].split(" m")[0])
+    assert moved_m == pytest.approx(-height_m, abs=0.3)
+    new_z = {item.about: item.text.split("set its z_m to ")[1] for item in warnings if "set its z_m" in item.text}
+    classes = tuple(dataclasses.replace(spec, z_m=float(new_z[spec.name])) for spec in SPEC.classes)
+    grid = dataclasses.replace(GRID, z_range_m=(-3 + moved_m, 1 + moved_m))
+    assert found(data, with_detector(classes=classes, grid=grid)) == []  # the advice works
+
+
+def test_scans_that_were_raised_without_their_labels(data: Path) -> None:
+    change_scans(data, lambda points: np.subtract(points[:, 2], 0.6, out=points[:, 2]))
+    assert [item.about for item in found(data)] == ["height"]
+    assert "z = -2.33 m, the boxes stand +0.6" in found(data)[0].text
+    assert found(data)[0].text.endswith("calib and labels must belong to the scans")
+
+
+@pytest.mark.parametrize(
+    ("config", "about", "message"),
+    [
+        (with_grid(x_range_m=(4.8, 15.04)), "Car", r"\d+ % in x and 0 % in y, .* widen detector.grid.x_range_m \[4.8"),
+        (with_grid(y_range_m=(-1.28, 7.68)), "Car", r"0 % in x and \d+ % in y, .* widen detector.grid.y_range_m \[-1"),
+        (with_grid(z_range_m=(-1.0, 1.0)), "Car", r"100 % of the boxes reach beyond detector.grid.z_range_m \[-1"),
+        (with_data(min_points=110), "Car", r"fewer points than data.min_points = 110 and are ignored; lower it"),
+        (with_detector(limits=PillarLimits(500, 24)), "points", r"100 % of the scans have more pillars .* raise it to"),
+        (with_detector(limits=PillarLimits(9000, 1)), "points", r"max_points = 1 takes away \d+ % of the points"),
+        (with_grid(x_range_m=(4.8, 9.92), y_range_m=(-1.28, 1.28)), "points", r"9\d % of the points lie outside"),
+    ],
+)
+def test_settings_that_do_not_fit_the_data(clean: Path, config: Config, about: str, message: str) -> None:
+    texts = [item.text for item in found(clean, config) if item.about == about]
+    assert any(re.search(message, text) for text in texts), texts
+
+
+def test_anchors_of_another_size(clean: Path) -> None:
+    (car, *others) = SPEC.classes
+    config = with_detector(classes=(dataclasses.replace(car, length_m=8.0), *others))
+    (warning,) = found(clean, config)
+    assert warning.text.startswith("Car: 100 % of the boxes differ too much in size from the anchor for positive_iou")
+    advised = float(warning.text.split("length_m ")[1].split(",")[0])
+    assert advised == pytest.approx(3.9, abs=0.2)
+    assert inspect_dataset(clean, config).classes[0].misfits == 2 * FRAMES
+
+
+def test_anchors_too_far_apart(clean: Path) -> None:
+    (warning, *_) = [item for item in found(clean, with_grid(v_max_m=1.28, v_y_m=1.76)) if item.about == "Pedestrian"]
+    assert "make detector.grid.v_max_m and v_y_m smaller" in warning.text
+
+
+def test_points_that_are_not_numbers_and_scans_that_see_nothing(data: Path) -> None:
+    def spoil(points: Points) -> None:
+        points[:5, 1] = np.nan
+
+    change_scans(data, spoil, every=6)
+    (warning,) = found(data)
+    assert warning.text.startswith("points with a value that is not finite: 10, in 2 of 12 scans; ")
+    change_scans(data, lambda points: np.multiply(points[:, 0], -1, out=points[:, 0]), every=12)
+    assert any(item.text.startswith("scans without a point inside the grid: 1 of 12; ") for item in found(data))
+
+
+def refusal(root: Path, config: Config, tmp_path: Path) -> str:
+    """The line that `asca inspect` fails with; the JSON is written all the same."""
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(to_dict(config)))
+    with pytest.raises(DatasetError) as error:
+        run(root, path, None, 500, tmp_path / "report.json")
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["findings"][0]["level"] == "error" and report["findings"][0]["text"] in str(error.value)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("folder", "change", "config", "message"),
+    [
+        ("label_2", lambda text: re.sub("Cyclist.*\n", "", text), CONFIG, r"no label is of this type \(there are: Car"),
+        ("label_2", lambda text: text.replace("Cyclist", "cyclist"), CONFIG, r"spell it 'cyclist'; rename"),
+        ("label_2", lambda text: "", CONFIG, r"\(there are: none at all\)"),
+        ("label_2", lambda text: text, with_data(min_points=9999), r"data.min_points = 9999; lower it"),
+        ("label_2", lambda text: text, with_grid(x_range_m=(40, 60.48)), r"widen detector.grid.x_range_m \[40"),
+        ("calib", lambda text: text.replace(f"{-0.08:.12e}", "9.0"), CONFIG, r"labels and calib must belong"),
+    ],
+)
+def test_what_training_could_not_learn_from_is_refused(
+    data: Path, tmp_path: Path, folder: str, change: Callable[[str], str], config: Config, message: str
+) -> None:
+    change_files(data, folder, change)
+    assert re.search(message, refusal(data, config, tmp_path))
+
+
+def test_damaged_frames_are_counted_and_refused(data: Path, tmp_path: Path) -> None:
+    for frame_id in ("000003", "000004"):
+        KittiSplit(data).label_path(frame_id).write_text("Car 0 0\n")
+    message = refusal(data, CONFIG, tmp_path)
+    assert re.search(r"cannot be read: 2, the first: .*label_2.000003.txt:1: 3 fields", message)
+    inspection = inspect_dataset(data, CONFIG)
+    assert inspection.frames == FRAMES - 2 and not inspection.sampled
+    change_files(data, "label_2", lambda text: "Car 0 0\n")
+    with pytest.raises(DatasetError, match=r"000000.txt:1: 3 fields"):
+        inspect_dataset(data, CONFIG)
+
+
+def test_the_tables_come_before_the_refusal(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change_files(data, "label_2", lambda text: re.sub("Cyclist.*\n", "", text))
+    message = refusal(data, CONFIG, tmp_path)
+    assert "no anchor is positive for Cyclist in 12 of 12 frames of 'training'" in message
+    output = capsys.readouterr().out
+    for title in ("Labels", "Objects", "Sizes", "Matching", "Scans"):
+        assert title in output
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["types"] == {"Car": 2 * FRAMES, "Pedestrian": FRAMES}
+    assert [item["boxes"] for item in report["classes"]] == [2 * FRAMES, FRAMES, 0]
+
+
+def test_a_class_missing_in_a_sample_may_be_in_the_rest(data: Path) -> None:
+    for frame_id in ("000000", "000006"):
+        path = KittiSplit(data).label_path(frame_id)
+        path.write_text(re.sub("Cyclist.*\n", "", path.read_text()))
+    inspection = inspect_dataset(data, CONFIG, frames=2)
+    assert "look at all frames with --frames 12" in findings(inspection, CONFIG)[0].text
+
+
+def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path) -> None:
+    split = KittiSplit(data)
+    split.calib_path("000001").unlink()
+    split.label_path("000002").unlink()
+    with pytest.raises(DatasetError, match=r"calib.000001.txt: not there \(2 of 24 calibration and label files"):
+        inspect_dataset(data, CONFIG, frames=1)
+
+
+def test_neighbors_are_ignored_and_other_types_left_out(data: Path) -> None:
+    change_files(data, "label_2", lambda text: text.replace("Car", "Van", 1).replace("Cyclist", "Tram"))
+    inspection = inspect_dataset(data, CONFIG)
+    assert inspection.types == {"Van": FRAMES, "Car": FRAMES, "Pedestrian": FRAMES, "Tram": FRAMES}
+    assert [facts.boxes for facts in inspection.classes] == [FRAMES, FRAMES, 0]
+    assert read_labels(KittiSplit(data).label_path("000000"))[0].type == "Van"
+
+
+def test_runs_without_torch(clean: Path, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from pathlib import Path; from asca_pillars.commands.inspect import run\n"
+        "run(Path(sys.argv[1]), Path(sys.argv[2]), None, 2, None)"
+    )
+    command = [sys.executable, "-W", "error", "-c", code, str(clean), str(tmp_path / "config.yaml")]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "2 of 12 frames, evenly spaced" in " ".join(result.stdout.split())

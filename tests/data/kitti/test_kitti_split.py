@@ -1,0 +1,102 @@
+"""The folder layout, and real frames where there are some."""
+
+import math
+import os
+import struct
+
+import numpy as np
+import pytest
+
+from asca_pillars.data.kitti import (
+    DEFAULT_IMAGE_SIZE_WH,
+    KittiSplit,
+    boxes_from_objects,
+    in_image,
+    objects_3d,
+    objects_from_boxes,
+    write_image_set,
+    write_labels,
+)
+from asca_pillars.data.scans.scan_reader import read_scan
+from tests.cameras import assert_one_line
+
+BOX_FIELDS = ("height_m", "width_m", "length_m", "x_m", "y_m", "z_m", "rotation_y")
+
+
+@pytest.fixture
+def root(tmp_path):
+    for folder, frame_ids in (("training", ["000010", "000002", "000001"]), ("testing", ["000007"])):
+        (tmp_path / folder / "velodyne").mkdir(parents=True)
+        for frame_id in frame_ids:
+            (tmp_path / folder / "velodyne" / f"{frame_id}.bin").write_bytes(bytes(16))
+    return tmp_path
+
+
+def test_splits(root):
+    write_image_set(root, "val", ["000010", "000001"])
+    write_image_set(root, "test", ["000007"])
+    assert KittiSplit(root).frame_ids == ("000001", "000002", "000010")
+    assert KittiSplit(str(root), "val").frame_ids == ("000001", "000010")
+    assert KittiSplit(root, "testing").frame_ids == KittiSplit(root, "test").frame_ids == ("000007",)
+    assert KittiSplit(root, "val").scan_path("000010") == root / "training/velodyne/000010.bin"
+    assert KittiSplit(root, "test").calib_path("000007") == root / "testing/calib/000007.txt"
+
+
+def test_missing_parts_of_a_dataset_are_named(root, tmp_path):
+    split = KittiSplit(root)
+    assert_one_line(root / "training/label_2/000001.txt", ["empty file"], lambda: split.objects("000001"))
+    assert_one_line(root / "training/calib/000001.txt", ["calib"], lambda: split.calibration("000001"))
+    write_image_set(root, "val", ["000001", "000003", "000004"])
+    write_image_set(root, "none", [])
+    missing = root / "training/velodyne/000003.bin"
+    assert_one_line(missing, ["2 of 3", "val.txt"], lambda: KittiSplit(root, "val").frame_ids)
+    assert_one_line("none.txt", ["empty"], lambda: KittiSplit(root, "none").frame_ids)
+    assert_one_line("vall.txt", ["none, val", "'training'"], lambda: KittiSplit(root, "vall").frame_ids)
+    nowhere = root / "nowhere"
+    assert_one_line(nowhere / "training/velodyne", ["<root>"], lambda: KittiSplit(nowhere).frame_ids)
+
+
+def test_image_size_is_read_from_the_png_or_assumed(root):
+    split = KittiSplit(root)
+    assert split.image_size_wh("000001") == DEFAULT_IMAGE_SIZE_WH
+    split.image_path("000001").parent.mkdir()
+    start = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + struct.pack(">2I", 1224, 370)
+    split.image_path("000001").write_bytes(start + bytes(9))
+    assert split.image_size_wh("000001") == (1224, 370)
+
+
+# --- real frames, where there are some
+
+
+@pytest.fixture
+def kitti_mini():
+    folder = os.environ.get("ASCA_KITTI_MINI")
+    if not folder:
+        pytest.skip("ASCA_KITTI_MINI does not name a folder with real KITTI frames")
+    return KittiSplit(folder)
+
+
+def test_every_real_label_survives_the_round_trip(kitti_mini, tmp_path):
+    for frame_id in kitti_mini.frame_ids:
+        calib, labels = kitti_mini.calibration(frame_id), kitti_mini.objects(frame_id)
+        write_labels(tmp_path / "again.txt", labels)
+        assert (tmp_path / "again.txt").read_text() == kitti_mini.label_path(frame_id).read_text().strip() + "\n"
+        objects = objects_3d(labels)
+        types, size = [o.type for o in objects], kitti_mini.image_size_wh(frame_id)
+        boxes = boxes_from_objects(objects, calib)
+        for before, after in zip(objects, objects_from_boxes(boxes, types, calib, size), strict=True):
+            for name in BOX_FIELDS:
+                assert f"{getattr(after, name):z.2f}" == f"{getattr(before, name):z.2f}", (frame_id, name)
+            if before.type != "Pedestrian":  # their arms and legs leave the box
+                np.testing.assert_allclose(after.bbox, before.bbox, atol=2.0)
+                assert abs(math.remainder(after.alpha - before.alpha, 2 * math.pi)) < 0.05
+
+
+def test_real_scans_are_read_whole(kitti_mini):
+    frame_id = kitti_mini.frame_ids[0]
+    scan = read_scan(kitti_mini.scan_path(frame_id))
+    assert len(scan.points) > 100_000
+    assert scan.dropped_points == 0
+    assert 0.5 < scan.points[:, 3].max() <= 1
+    seen = in_image(scan.points, kitti_mini.calibration(frame_id), kitti_mini.image_size_wh(frame_id))
+    assert 0.1 < seen.mean() < 0.25

@@ -1,0 +1,66 @@
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from asca_pillars.cli import app
+from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.errors import BundleError, ConfigError
+
+Points = NDArray[np.float32]
+
+
+@pytest.fixture(autouse=True)
+def _fast_machine_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
+    monkeypatch.setenv("COLUMNS", "120")
+    logger = logging.getLogger("asca_deploy")
+    level = logger.level
+    yield
+    logger.setLevel(level)  # the command silences it for the rest of its process
+
+
+def test_all_parts_are_printed_and_written(tiny_bundle: Path, bundle_copy: Path, scan: Points, tmp_path: Path) -> None:
+    write_scan(tmp_path / "scan.bin", scan)
+    other = shutil.copytree(bundle_copy, tmp_path / "other")
+    command = ["bench", tmp_path / "scan.bin", "-b", tiny_bundle, "--compare", other, "--matrix", "--scaling"]
+    command += ["--stream", "--rounds", 1, "--json", tmp_path / "report.json"]
+    result = CliRunner().invoke(app, [str(part) for part in command], catch_exceptions=False)
+    assert result.exit_code == 0
+    for text in ("neck+head", "outside the graphs", "roofline", "times as fast", "precision", "stream", "pillars"):
+        assert text in result.output
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["fps"] == pytest.approx(1000 / report["total_ms"]["p50"])
+    assert 0 < report["outside_share"] < 1
+    assert report["roofline"]["gemm_gmac_s"] == {"float32": 100, "int8": 100}
+    assert [one["name"] for one in report["compare"]["contestants"]] == ["tiny", "other"]
+    assert {row["way"]["bundle"] for row in report["matrix"]} == {"tiny", "other"}
+    assert len(report["scaling"]) > 1 and report["stream"]["stream_fps"] > 0
+
+
+def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path) -> None:
+    with pytest.raises(ConfigError, match="compared with itself"):
+        CliRunner().invoke(
+            app, ["bench", "-b", str(tiny_bundle), "--compare", str(tiny_bundle)], catch_exceptions=False
+        )
+
+
+def test_a_bundle_to_compare_with_is_looked_at_first(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asca_pillars.commands.bench.benchmark", lambda *_, **__: pytest.fail("too late"))
+    with pytest.raises(BundleError, match="none: no such folder"):
+        CliRunner().invoke(
+            app, ["bench", "-b", str(tiny_bundle), "--compare", str(tmp_path / "none")], catch_exceptions=False
+        )
+
+
+def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:
+    with pytest.raises(ConfigError, match="compared with itself"):
+        CliRunner().invoke(app, ["bench", "--compare", "asca_small_sim_int8"], catch_exceptions=False)

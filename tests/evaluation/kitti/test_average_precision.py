@@ -1,0 +1,142 @@
+"""The KITTI protocol: against the official tool, against plain loops, and against itself."""
+
+import json
+import math
+import os
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.data.kitti import read_labels
+from asca_pillars.evaluation.kitti.average_precision import METRICS, Curve, evaluate
+from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
+from tests.evaluation.kitti.brute_force import brute_force
+from tests.evaluation.kitti.kitti_objects import CAR, as_frames, beside, random_frames
+
+CLASSES = ("Car", "Pedestrian", "Cyclist")
+CASES = os.environ.get("ASCA_KITTI_EVAL_CASES")
+CASE_FOLDERS = sorted(path.parent for path in Path(CASES).glob("*/expected.json")) if CASES else []
+assert CASE_FOLDERS or not CASES, f"{CASES}: no folder with an expected.json there"
+needs_cases = pytest.mark.skipif(
+    not CASES, reason="ASCA_KITTI_EVAL_CASES names no folder with results of the official evaluator"
+)
+
+# --- against the official tool -------------------------------------------------------------------------------------
+
+
+def read_case(folder: Path) -> tuple[list[FrameObjects], list[FrameObjects]]:
+    ids = sorted(path.stem for path in (folder / "det").glob("*.txt"))
+    truth, found = ([frame_objects(i, read_labels(folder / side / f"{i}.txt")) for i in ids] for side in ("gt", "det"))
+    return truth, found
+
+
+@needs_cases
+@pytest.mark.parametrize("case", CASE_FOLDERS)
+def test_reference_case(case: Path) -> None:
+    expected = json.loads((case / "expected.json").read_text())["results"]
+    mine = json.loads(json.dumps(evaluate(*read_case(case)).overall.to_json()))
+    assert mine.keys() == expected.keys()
+    for name, metric in product(expected, METRICS):
+        ours, theirs = mine[name][metric], expected[name][metric]
+        assert (ours is None) == (theirs is None), (name, metric)
+        if theirs is None:
+            continue
+        for key in ("R11", "R40"):
+            np.testing.assert_allclose(ours[key], theirs[key], rtol=0, atol=1e-6)
+        for difficulty, precision in theirs["precision"].items():
+            np.testing.assert_allclose(ours["precision"][difficulty], precision, rtol=0, atol=1e-9)
+        for difficulty, numbers in theirs.get("counts", {}).items():
+            assert ours["counts"][difficulty] == numbers, (name, metric, difficulty)
+
+
+@needs_cases
+@pytest.mark.parametrize("case", CASE_FOLDERS)
+def test_real_labels_find_themselves(case: Path) -> None:
+    """In 2D labels hide one another so closely that one takes the other's detection; on the ground none does."""
+    labels = read_case(case)[0]
+    found = [replace(frame, scores=np.linspace(1, 0, len(frame)) + i) for i, frame in enumerate(labels)]
+    for curve in evaluate(labels, found).overall.curves.values():
+        if curve.metric in ("bev", "3d"):
+            assert_perfect(curve)
+
+
+# --- against plain loops -------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=80)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 6),
+    st.integers(0, 25),
+    st.sampled_from([None, (0.0, 28.0), (19.0, 21.0), (30.0, 60.0), (80.0, 90.0)]),
+    st.sampled_from(["", "no heading", "no 2D box", "no 3D box", "no height"]),
+)
+def test_equals_plain_loops(
+    seed: int, frames: int, detections: int, band: tuple[float, float] | None, missing: str
+) -> None:
+    truth, found = random_frames(seed, frames, detections)
+    found = [without(frame, missing, np.random.default_rng(seed)) for frame in found]
+    evaluation = evaluate(truth, found, CLASSES, bands_m=[] if band is None else [band])
+    curves = (evaluation.overall if band is None else evaluation.bands[band]).curves
+    twins = brute_force(truth, found, CLASSES, band)
+    assert curves.keys() == twins.keys()
+    for key, twin in twins.items():
+        curve = curves[key]
+        assert (curve.counted, curve.matched, curve.thresholds.tolist()) == (
+            twin.counted,
+            twin.matched,
+            twin.thresholds,
+        )
+        assert [curve.tp.tolist(), curve.fp.tolist(), curve.fn.tolist()] == [twin.tp, twin.fp, twin.fn], key
+        np.testing.assert_allclose(curve.precision, twin.precision, rtol=0, atol=1e-12)
+
+
+def without(frame: FrameObjects, missing: str, rng: np.random.Generator) -> FrameObjects:
+    """The frame with something left out of a part of its detections, as detectors of less than all of it write."""
+    some = rng.random(len(frame)) < 0.3
+    if missing == "no heading":
+        return replace(frame, alpha=np.where(some, -10.0, frame.alpha))
+    if missing == "no 2D box":
+        return replace(frame, bbox=np.where(some[:, None], -1.0, frame.bbox))
+    if missing == "no 3D box":
+        sizes = np.where(some[:, None], -1.0, frame.dimensions_hwl)
+        return replace(frame, dimensions_hwl=sizes, locations=np.where(some[:, None], -1000.0, frame.locations))
+    if missing == "no height":
+        return replace(frame, locations=np.where(some[:, None] & [False, True, False], -1000.0, frame.locations))
+    return frame
+
+
+# --- against itself ------------------------------------------------------------------------------------------------
+
+
+def assert_perfect(curve: Curve) -> None:
+    assert (curve.r11, curve.r40) == pytest.approx((curve.r11_cap, curve.r40_cap), abs=1e-12), curve
+    assert not len(curve.fp) or (curve.fp[-1], curve.fn[-1]) == (0, 0)
+
+
+@pytest.mark.parametrize("objects", [0, 1, 2, 4, 5, 39, 40, 41, 42, 57, 79, 80, 81, 200, 333])
+@pytest.mark.parametrize("equal_scores", [False, True])
+def test_labels_find_themselves(objects: int, equal_scores: bool) -> None:
+    """Whoever finds everything gets the cap, which is below 100 for 40 objects or fewer; AOS is as good as 2D."""
+    places = [range(min(6, objects - first)) for first in range(0, objects, 6)] or [range(0)]
+    labels = [[beside(CAR, place, alpha=0.1 * place) for place in frame] for frame in places]
+    rng = np.random.default_rng(objects)
+    found = [[replace(item, score=0.5 if equal_scores else rng.random()) for item in frame] for frame in labels]
+    if not objects:
+        found = [[replace(CAR, score=0.5)]]
+    mine = evaluate(*as_frames(labels, found)).overall
+    assert {metric for _, metric, _ in mine.curves} == set(METRICS)
+    for curve in mine.curves.values():
+        assert curve.counted == objects
+        if objects:
+            assert_perfect(curve)
+    expected = (100.0, 100.0)
+    if objects <= 40:
+        expected = (100 * max(objects - 1, 0) / 40, 100 * math.ceil(objects / 4) / 11)
+    curve = mine.curves["Car", "3d", "moderate"]
+    assert (curve.r40_cap, curve.r11_cap) == pytest.approx(expected)

@@ -1,0 +1,152 @@
+"""From a checkpoint to a proven bundle: parity for every reading, and refusal when the graphs are not the model."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from asca_deploy import Detector, load_bundle
+from asca_export import graphs
+from asca_export.exporter import export_bundle
+from asca_export.fast_forms import FastBackbone
+from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import ExportError
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.pillars.spec import DetectorSpec
+from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.scenes import SPEC
+
+READINGS = ("none", "paper", "channel", "point")
+
+
+@pytest.mark.parametrize("cpa", READINGS)
+def test_bundle_is_the_same_detector(tmp_path: Path, cpa: str) -> None:
+    checkpoint = tiny_checkpoint(cpa)
+    bundle = export_bundle(checkpoint, tmp_path / "bundle", SCANS, trained_on="nothing", command="none")
+    assert load_bundle(tmp_path / "bundle") == bundle
+    assert bundle.spec == SPEC and bundle.cpa == cpa and bundle.provenance.steps == 0
+    parity = bundle.parity
+    assert parity is not None and parity.scans == len(SCANS)
+    assert 0 < parity.head_maps_max_abs_error <= MAP_TOLERANCE
+    assert parity.box_max_error_m <= BOX_TOLERANCE_M and parity.yaw_max_error_rad <= YAW_TOLERANCE_RAD
+
+
+def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
+    """Features of 1e5 differ by more than 1e-3 from rounding alone, and the network that follows divides it away."""
+    checkpoint = tiny_checkpoint("none")
+    encode, first = checkpoint.detector.encode, checkpoint.detector.neck.blocks[0][0]
+    with torch.no_grad():
+        encode.norm.weight.mul_(1e5)
+        encode.norm.bias.mul_(1e5)
+        first.weight.div_(1e5)
+    parity = export_bundle(checkpoint, tmp_path, SCANS).parity
+    assert parity is not None and parity.head_maps_max_abs_error <= MAP_TOLERANCE
+
+
+def test_graphs_carry_the_contract(tmp_path: Path) -> None:
+    export_bundle(tiny_checkpoint("channel"), tmp_path, SCANS)
+    for name in ("encoder.onnx", "backbone.onnx"):
+        model = onnx.load(tmp_path / name)
+        properties = {item.key: json.loads(item.value) for item in model.metadata_props}
+        assert properties["spec"]["grid"]["zones"] == SPEC.grid.zones
+        assert [spec["name"] for spec in properties["spec"]["classes"]] == list(SPEC.class_names)
+        assert b"site-packages" not in (tmp_path / name).read_bytes()  # nor any other folder of this machine
+    encoder = onnx.load(tmp_path / "encoder.onnx").graph
+    assert [node.name for node in encoder.input] == ["features", "pillar_index", "point_counts"]
+    assert encoder.input[0].type.tensor_type.shape.dim[0].dim_param  # the number of points is dynamic
+    backbone = onnx.load(tmp_path / "backbone.onnx").graph
+    assert [node.name for node in backbone.output] == ["scores", "boxes", "directions"]
+
+
+def test_encoder_gives_the_same_features_every_time(tmp_path: Path) -> None:
+    """onnxruntime's threads race for the repeated indices of ScatterND: the runtime has to keep them out."""
+    export_bundle(tiny_checkpoint("none"), tmp_path, SCANS)
+    detector = Detector(tmp_path, threads=2)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((5, -6, -2, 0), (25, 7, 0, 1), (12000, 4)).astype(np.float32)
+    pillars = detector.pillarize(points)
+    assert pillars.point_counts.max() > 4  # indices repeat
+    first = detector.encode(pillars).copy()
+    assert all(np.array_equal(detector.encode(pillars), first) for _ in range(300))
+
+
+def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = tiny_checkpoint("channel")
+    export_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    before = {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()}
+    other = tiny_checkpoint("channel").detector
+    with torch.no_grad():
+        other.head.boxes.bias.add_(0.01)
+    export_backbone = graphs.export_backbone
+    wrong = FastBackbone(other)
+    monkeypatch.setattr(graphs, "export_backbone", lambda _, grid, path: export_backbone(wrong, grid, path))
+    with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime part at stage head `boxes`: .* 0\.01"):
+        export_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["bundle"], "temporary files are left"
+
+
+def test_too_few_scans_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="7 scans given"):
+        export_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS[:7])
+
+
+def _maps(seed: int) -> HeadMaps:
+    rng = np.random.default_rng(seed)
+    height, width, count, _ = SPEC.anchors.shape
+    scores = rng.normal(-4, 1, (count, height, width))
+    return HeadMaps(
+        scores.astype(np.float32),
+        rng.normal(0, 0.1, (7 * count, height, width)).astype(np.float32),
+        rng.normal(0, 1, (2 * count, height, width)).astype(np.float32),
+    )
+
+
+def test_boxes_that_differ_are_noticed() -> None:
+    maps = _maps(0)
+    assert compare_boxes(maps, maps, SPEC).center_size_m == 0
+    moved = maps._replace(boxes=maps.boxes + np.float32(0.02))
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(maps, moved, SPEC)
+    turned = maps._replace(directions=-maps.directions)
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(maps, turned, SPEC)
+    fewer = maps._replace(scores=np.where(maps.scores == maps.scores.max(), -20, maps.scores))
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(maps, fewer, SPEC)
+
+
+def test_ties_are_no_differences() -> None:
+    """Two overlapping anchors of equal score: which one survives is nobody's fault."""
+    maps = _maps(0)
+    maps.scores[:] = -20
+    left, right = maps.scores.copy(), maps.scores.copy()
+    left[0, 10, 10], left[0, 10, 11] = 2.0, 2.0 - 1e-6
+    right[0, 10, 10], right[0, 10, 11] = 2.0 - 1e-6, 2.0
+    compare_boxes(maps._replace(scores=left), maps._replace(scores=right), SPEC)
+
+
+@pytest.mark.parametrize("cpa", READINGS)
+def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: str) -> None:
+    root = os.environ.get("ASCA_KITTI_MINI")
+    if not root:
+        pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")
+    split = KittiSplit(root)
+    scans = [read_scan(split.scan_path(frame_id)).points for frame_id in split.frame_ids]
+    parity = export_bundle(tiny_checkpoint(cpa, DetectorSpec()), tmp_path, scans).parity
+    assert parity is not None and parity.scans == len(scans)
+    assert parity.box_max_error_m <= 0.01 and parity.yaw_max_error_rad <= np.deg2rad(0.5)
+
+
+def test_onnxruntime_is_new_enough() -> None:
+    # 1.21 to 1.24 compute wrong int8 results on CPUs with AMX.
+    assert tuple(int(part) for part in onnxruntime.__version__.split(".")[:2]) >= (1, 25)

@@ -1,0 +1,34 @@
+"""Which points the report takes for ground."""
+
+import numpy as np
+import pytest
+
+from asca_pillars.sim.report.ground_points import fit_plane, ground_mask
+from tests.sim.report.made_up import GROUND_Z_M, rings
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.05, -0.05])
+def test_the_ground_of_a_made_up_scan_is_found(slope: float) -> None:
+    points, truth = rings(np.random.default_rng(0), slope)
+    found = ground_mask(points)
+    assert np.mean(found == truth) > 0.97
+    np.testing.assert_allclose(fit_plane(points[truth]), [slope, 0, GROUND_Z_M], atol=1e-3)
+
+
+def test_a_hill_is_followed_and_a_roof_is_not() -> None:
+    rng = np.random.default_rng(0)
+    radius, angle = 70 * np.sqrt(rng.random(60_000)), rng.uniform(-np.pi, np.pi, 60_000)
+    z = GROUND_Z_M + 0.06 * np.maximum(radius - 20, 0)  # three metres up at 70 m
+    on_roof = (np.abs(angle) < 0.2) & (radius > 30) & (radius < 40)
+    points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.where(on_roof, z + 2.5, z)])
+    found = ground_mask(points)
+    assert found[~on_roof].mean() > 0.95
+    assert not found[on_roof].any()
+
+
+def test_where_no_ground_is_to_be_seen_there_is_none() -> None:
+    rng = np.random.default_rng(0)
+    assert ground_mask(np.zeros((0, 4), np.float32)).shape == (0,)
+    assert not ground_mask(rng.random((50, 4))).any()
+    wall = np.column_stack([np.full(3000, 10.0), rng.uniform(-9, 9, 3000), rng.uniform(-2, 3, 3000)])
+    assert ground_mask(wall).mean() < 0.2

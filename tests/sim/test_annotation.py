@@ -1,0 +1,50 @@
+"""Labels follow what KITTI's annotators could see."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from asca_pillars.data.kitti import KittiObject
+from asca_pillars.sim.annotation import make_labels
+from asca_pillars.sim.scene_config import SceneConfig
+from asca_pillars.sim.world.placement import Target
+from asca_pillars.sim.world.scene import draw_calibration
+
+
+def labels_of(x_m: float, y_m: float, alone: int, visible: int, points: int) -> list[KittiObject]:
+    """Labels of one car of which `visible` of `alone` firings and `points` returns tell."""
+    box = np.array([x_m, y_m, -0.9, 4.0, 1.6, 1.5, 0.0])
+    hits = SimpleNamespace(alone=np.array([alone]), visible=np.array([visible]))
+    # All returns in the middle of the image.
+    cloud = np.tile(np.array([20.0, 0.0, -0.9, 0.2], np.float32), (points, 1))
+    returns = SimpleNamespace(points=cloud, owner=np.zeros(points, np.int64))
+    calibration = draw_calibration(np.random.default_rng(0))
+    return make_labels((Target("Car", box),), hits, returns, calibration, SceneConfig())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("visible", "state"), [(95, 0), (70, 1), (20, 2), (7, 3)])
+def test_the_share_of_visible_rays_is_the_occlusion_state(visible: int, state: int) -> None:
+    (label,) = labels_of(20.0, 0.0, 100, visible, 50)
+    assert (label.type, label.occluded, label.truncated) == ("Car", state, 0.0)
+
+
+def test_what_is_hardly_visible_or_hit_is_dont_care() -> None:
+    assert [o.type for o in labels_of(20.0, 0.0, 100, 2, 50)] == ["DontCare"]
+    assert [o.type for o in labels_of(90.0, 0.0, 40, 40, 0)] == ["DontCare"]
+    assert [o.type for o in labels_of(60.0, 0.0, 40, 40, 2)] == ["Car"]
+
+
+def test_what_is_hidden_or_outside_the_image_has_no_label() -> None:
+    assert labels_of(20.0, 0.0, 100, 0, 0) == []
+    assert labels_of(-20.0, 0.0, 100, 100, 50) == []
+
+
+def test_a_car_at_the_border_is_truncated_and_unknown_when_hardly_in_it() -> None:
+    states = {}
+    for y in np.arange(2.0, 9.0, 0.1):
+        for label in labels_of(5.0, float(y), 100, 100, 50):
+            states[label.truncated] = label.occluded
+    assert any(0.2 < cut <= 0.85 for cut in states)
+    assert all(state == (3 if cut > 0.85 else 0) for cut, state in states.items() if cut != 0.85)
+    assert 3 in states.values()
