@@ -7,12 +7,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import yaml
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import Strict, parse
 
 T = TypeVar("T")
@@ -40,8 +40,8 @@ class NetworkConfig(Strict):
     upsample_channels: int = 128
 
     def __post_init__(self) -> None:
-        _require("network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
-        _require("network", self, ("block_convs",), low=0)
+        _require("model.network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
+        _require("model.network", self, ("block_convs",), low=0)
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,28 @@ class LossConfig(Strict):
 
     def __post_init__(self) -> None:
         weights = ("box_weight", "class_weight", "direction_weight")
-        _require("loss", self, (*weights, "focal_gamma", "smooth_l1_beta"), low=0)
-        _require("loss", self, ("focal_alpha",), low=0, high=1)
+        _require("model.loss", self, (*weights, "focal_gamma", "smooth_l1_beta"), low=0)
+        _require("model.loss", self, ("focal_alpha",), low=0, high=1)
+
+
+@dataclass(frozen=True)
+class PillarModel(Strict):
+    """ASCA-PointPillars and PointPillars: one stage on pillars.
+
+    Attributes:
+        kind: tells the families of detectors apart.
+        spec: grid, limits, classes and post-processing, which training and the vehicle share.
+        network: widths and depths.
+        loss: weights of the loss.
+    """
+
+    kind: Literal["pillar"] = "pillar"
+    spec: PillarSpec = field(default_factory=PillarSpec)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+
+
+ModelConfig: TypeAlias = PillarModel  # families to come join by `|`, told apart by their `kind`
 
 
 @dataclass(frozen=True)
@@ -175,15 +195,13 @@ class Config(Strict):
     """One model a person would train: what it sees, what it is, how it learns."""
 
     name: str = "asca_pointpillars"
-    detector: DetectorSpec = field(default_factory=DetectorSpec)
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
+    model: ModelConfig = field(default_factory=PillarModel)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     data: DataConfig = field(default_factory=DataConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def __post_init__(self) -> None:
-        wanted, names = self.augment.insert.proportions, self.detector.class_names
+        wanted, names = self.augment.insert.proportions, self.model.spec.class_names
         if unknown := [name for name in wanted if name not in names]:
             raise ConfigError(f"augment.insert.proportions.{unknown[0]}: no such class; there are {', '.join(names)}")
         if wanted and not any(wanted.values()):

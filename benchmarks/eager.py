@@ -95,7 +95,7 @@ def main(
 
 
 def _forms(model: Checkpoint) -> dict[str, PaddedDetector]:
-    network, spec = model.detector, model.config.detector
+    network, spec = model.detector, model.config.model.spec
     reordered = copy.deepcopy(network).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return {
         "eager, padded": PaddedDetector(network, spec),

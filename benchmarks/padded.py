@@ -15,8 +15,8 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES, Pillars
-from asca_pillars.pillars.spec import DetectorSpec
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class PaddedDetector:
     """
 
     network: PillarDetector
-    spec: DetectorSpec
+    spec: PillarSpec
     all_pillars: bool = True
     channels_last: bool = False
 

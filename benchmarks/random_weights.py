@@ -21,7 +21,7 @@ from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.config import load_config
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_detector
+from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_pillar_detector
 
 
 def main(
@@ -49,12 +49,12 @@ def random_weights(config: str, points: NDArray[np.float32]) -> Checkpoint:
     """A network with random weights, normalized on a scan (N, 4), so that its maps depend on the points."""
     torch.manual_seed(0)
     resolved = load_config(config)
-    network = build_detector(resolved).train()
+    network = build_pillar_detector(resolved.model).train()
     norms = [module for module in network.modules() if isinstance(module, (nn.BatchNorm1d, nn.BatchNorm2d))]
     for norm in norms:
         norm.momentum = 1.0  # the running statistics become those of this scan
     with torch.no_grad():
-        network(batch_pillars([resolved.detector.pillarize(points)]))
+        network(batch_pillars([resolved.model.spec.pillarize(points)]))
     return Checkpoint(resolved, network.eval(), 0)
 
 

@@ -33,7 +33,7 @@ from rich.table import Table
 from shapely.geometry import MultiPoint, Polygon
 
 from asca_pillars.config import Config, load_config
-from asca_pillars.data.frames import LabeledFrame, in_grid, read_frame
+from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.insertion.free_space import FreeSpace
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
@@ -85,7 +85,7 @@ def main(
     for method, title in METHODS.items():
         inserter = prepare_inserter(split, _with_method(settings, method))
         tallies[method], milliseconds[method] = Tally(), []
-        counts[method] = np.zeros((2, len(settings.detector.classes)), np.int64)
+        counts[method] = np.zeros((2, len(settings.model.spec.classes)), np.int64)
         for number, frame_id in enumerate(track(split.frame_ids[:limit], title, console=console)):
             frame = _read(split, frame_id, settings)
             space = inserter.free_space(frame_id)
@@ -110,13 +110,13 @@ def _with_method(settings: Config, method: str) -> Config:
 
 def _read(split: KittiSplit, frame_id: str, settings: Config) -> LabeledFrame:
     data = settings.data
-    names = settings.detector.class_names
+    names = settings.model.spec.class_names
     return read_frame(split, frame_id, names, camera_view=data.camera_view, min_points=data.min_points)
 
 
 def _class_counts(frame: LabeledFrame, settings: Config) -> NDArray[np.int64]:
-    counted = (frame.labels >= 0) & in_grid(frame.boxes, settings.detector.grid)
-    return np.bincount(frame.labels[counted], minlength=len(settings.detector.classes))
+    counted = (frame.labels >= 0) & settings.model.spec.ranges.hold_centers(frame.boxes)
+    return np.bincount(frame.labels[counted], minlength=len(settings.model.spec.classes))
 
 
 def _check(
@@ -232,7 +232,7 @@ def _placement_table(tallies: dict[str, Tally], milliseconds: dict[str, list[flo
 
 
 def _balance_table(counts: dict[str, NDArray[np.int64]], settings: Config, frames: int) -> Table:
-    names = settings.detector.class_names
+    names = settings.model.spec.class_names
     wanted = np.array([settings.augment.insert.proportions.get(name, 0.0) for name in names])
     if not settings.augment.insert.proportions:
         wanted[:] = 1
@@ -259,10 +259,10 @@ def _draw(path: Path, split: KittiSplit, settings: Config, frame_id: str) -> Non
         boxes, labels = shown.boxes[len(frame.boxes) :], shown.labels[len(frame.boxes) :]
         layers = [
             BoxLayer(name, boxes[labels == label], class_color(name))
-            for label, name in enumerate(settings.detector.class_names)
+            for label, name in enumerate(settings.model.spec.class_names)
         ]
         layers.append(BoxLayer("labelled", frame.boxes, (255, 255, 255), thickness_px=2))
-        panel = draw_layers(shown.points, layers, settings.detector.grid, width_px=700)
+        panel = draw_layers(shown.points, layers, settings.model.spec.ranges, width_px=700)
         panel = cv2.copyMakeBorder(panel, 40, 0, 0, 8, cv2.BORDER_CONSTANT, value=BACKGROUND)
         title = METHODS.get(method, "Original")
         cv2.putText(panel, title, (16, 30), cv2.FONT_HERSHEY_DUPLEX, 0.8, (255, 255, 255), 1, cv2.LINE_AA)

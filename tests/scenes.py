@@ -9,12 +9,12 @@ from asca_pillars.data.kitti import Calibration, KittiSplit, objects_from_boxes,
 from asca_pillars.data.kitti import write_labels as write_label_file
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import PillarLimits
-from asca_pillars.pillars.spec import DetectorSpec
 
 # Rectangular, asymmetric, with a positive minimum.
 GRID = PillarGrid(x_range_m=(4.8, 25.28), y_range_m=(-6.4, 7.68), v_max_m=0.32, zones=2)
-SPEC = DetectorSpec(grid=GRID, limits=PillarLimits(max_pillars=2000, max_points=24))
+SPEC = PillarSpec(grid=GRID, limits=PillarLimits(max_pillars=2000, max_points=24))
 SIZES = {"Car": (3.9, 1.6, 1.56), "Pedestrian": (0.8, 0.6, 1.73), "Cyclist": (1.76, 0.6, 1.73)}
 GROUND_Z_M = -1.73
 

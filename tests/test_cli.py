@@ -203,7 +203,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     assert "parity on 8 scans" in exported.stdout
     manifest = json.loads((bundle / "bundle.json").read_text())
     assert manifest["provenance"]["command"].startswith("-c train")
-    before = {spec.name: spec.score_threshold for spec in CONFIG.detector.classes}
+    before = {spec.name: spec.score_threshold for spec in CONFIG.model.spec.classes}
     after = {spec["name"]: spec["score_threshold"] for spec in manifest["spec"]["classes"]}
     assert after == before | {"Pedestrian": 0.21}
     assert "add --int8" in refusal(full(*export, "--calibrate", scans))

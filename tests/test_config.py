@@ -16,13 +16,14 @@ from asca_pillars.config import (
     Config,
     LossConfig,
     NetworkConfig,
+    PillarModel,
     TrainConfig,
     load_config,
     shipped_configs,
 )
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ClassSpec
-from asca_pillars.models.pillar.pillar_detector import build_detector
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.schema import parse, to_dict
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
@@ -45,7 +46,7 @@ def refusal(path: Path, *overrides: str) -> str:
 def test_defaults_are_the_paper_s() -> None:
     """DESIGN's reading of section 3 and 4.1: grid, limits, anchors, widths of Table 1, losses, recipe."""
     config = Config()
-    spec = config.detector
+    spec = config.model.spec
     assert (spec.grid.x_range_m, spec.grid.y_range_m, spec.grid.z_range_m) == ((0, 69.12), (-39.68, 39.68), (-3, 1))
     assert (spec.grid.v_max_m, spec.grid.v_y_m, spec.grid.zones) == (0.32, 0.16, 3)
     assert (spec.grid.nx, spec.grid.ny) == (72 + 144 + 288, 496)
@@ -55,10 +56,10 @@ def test_defaults_are_the_paper_s() -> None:
         ("Pedestrian", 0.8, 0.6, 1.73, -0.6, 0.5, 0.35),
         ("Cyclist", 1.76, 0.6, 1.73, -0.6, 0.5, 0.35),
     ]
-    network = config.network
+    network = config.model.network
     assert (network.pillar_channels, network.block_channels, network.block_convs) == (64, (64, 128, 256), (3, 3, 3))
     assert 3 * network.upsample_channels == 384
-    loss = config.loss
+    loss = config.model.loss
     assert (loss.box_weight, loss.class_weight, loss.direction_weight) == (2, 1, 0.2)
     assert (loss.focal_alpha, loss.focal_gamma, loss.smooth_l1_beta) == (0.25, 2, 1 / 9)
     train = config.train
@@ -75,10 +76,10 @@ def test_configs_that_ship_load_and_build(path: Path) -> None:
     config = load_config(path)
     assert load_config(path.stem) == config, "found by its name too"
     with torch.device("meta"):  # layers and shapes, without the time that random weights take
-        detector = build_detector(config)
-    assert detector.grid == config.detector.grid
+        detector = build_pillar_detector(config.model)
+    assert detector.grid == config.model.spec.grid
     scores = detector.head.scores.weight
-    assert scores.shape == (2 * len(config.detector.classes), 3 * config.network.upsample_channels, 1, 1)
+    assert scores.shape == (2 * len(config.model.spec.classes), 3 * config.model.network.upsample_channels, 1, 1)
 
 
 def test_there_are_configs() -> None:
@@ -89,7 +90,7 @@ def test_there_are_configs() -> None:
 def test_the_baseline_is_pointpillars() -> None:
     """DESIGN 4.1: K = 1 and V_max = 0.16 m are PointPillars, 432 x 496 pillars without attention."""
     config = load_config(next(path for path in CONFIGS if path.stem == "pointpillars_kitti"))
-    assert (config.detector.grid.nx, config.detector.grid.ny, config.network.cpa) == (432, 496, "none")
+    assert (config.model.spec.grid.nx, config.model.spec.grid.ny, config.model.network.cpa) == (432, 496, "none")
 
 
 def sections(settings: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], object]]:
@@ -111,9 +112,10 @@ SECTIONS = dict(sections(Config()))
 def test_every_level_is_tested_below() -> None:
     names = {".".join(map(str, path)) for path in SECTIONS}
     assert names == {
-        *("", "detector", "detector.grid", "detector.limits", "detector.post", "network", "loss", "augment"),
+        *("", "model", "model.spec", "model.spec.grid", "model.spec.limits", "model.spec.post"),
+        *("model.network", "model.loss", "augment"),
         *("augment.insert", "data"),
-        *("detector.classes.0", "detector.classes.1", "detector.classes.2", "train"),
+        *("model.spec.classes.0", "model.spec.classes.1", "model.spec.classes.2", "train"),
     }
 
 
@@ -149,7 +151,7 @@ def test_values_of_the_wrong_type_at_every_level_name_their_key(path: tuple[str 
 def test_round_trip_through_yaml() -> None:
     config = dataclasses.replace(
         Config(name="small"),
-        network=NetworkConfig(cpa="point", block_channels=(8, 16, 32)),
+        model=PillarModel(network=NetworkConfig(cpa="point", block_channels=(8, 16, 32))),
         augment=AugmentConfig(scale=(0.9, 1.2)),
         train=TrainConfig(learning_rate=1e-3, schedule="one_cycle"),
     )
@@ -157,21 +159,24 @@ def test_round_trip_through_yaml() -> None:
 
 
 def test_a_file_holds_what_differs(tmp_path: Path) -> None:
-    config = load_config(write(tmp_path, "train: {epochs: 3, learning_rate: 1e-3}\ndetector:\n  grid: {zones: 1}\n"))
-    assert config.train == TrainConfig(epochs=3, learning_rate=1e-3) and config.detector.grid.zones == 1
-    assert config.loss == LossConfig() and config.detector.classes == Config().detector.classes
+    config = load_config(
+        write(tmp_path, "train: {epochs: 3, learning_rate: 1e-3}\nmodel:\n  spec: {grid: {zones: 1}}\n")
+    )
+    assert config.train == TrainConfig(epochs=3, learning_rate=1e-3) and config.model.spec.grid.zones == 1
+    assert config.model.loss == LossConfig() and config.model.spec.classes == Config().model.spec.classes
     assert load_config(write(tmp_path, "# only a comment\n")) == Config()
 
 
 def test_classes_of_one_s_own(tmp_path: Path) -> None:
     text = """
-detector:
-  classes:
-    - {name: Truck, length_m: 9, width_m: 2.5, height_m: 3.2, z_m: -0.2, positive_iou: 0.6, negative_iou: 0.45}
+model:
+  spec:
+    classes:
+      - {name: Truck, length_m: 9, width_m: 2.5, height_m: 3.2, z_m: -0.2, positive_iou: 0.6, negative_iou: 0.45}
 """
     config = load_config(write(tmp_path, text))
-    assert config.detector.classes == (ClassSpec("Truck", 9, 2.5, 3.2, -0.2, 0.6, 0.45),)
-    assert "`detector.classes.0.lengthm`; did you mean `length_m`" in refusal(
+    assert config.model.spec.classes == (ClassSpec("Truck", 9, 2.5, 3.2, -0.2, 0.6, 0.45),)
+    assert "`model.spec.classes.0.lengthm`; did you mean `length_m`" in refusal(
         write(tmp_path, text.replace("length_m", "lengthm"))
     )
 
@@ -180,9 +185,9 @@ def test_overrides_win(tmp_path: Path) -> None:
     path = write(tmp_path, "train: {epochs: 3, batch_size: 2}\n")
     overrides = (
         "train.epochs=5",
-        "network.cpa=none",
-        "detector.grid.zones = 1",
-        "detector.grid.v_max_m=0.16",
+        "model.network.cpa=none",
+        "model.spec.grid.zones = 1",
+        "model.spec.grid.v_max_m=0.16",
         "augment.scale=[0.9, 1.1]",
         "data.camera_view=false",
         "name=a=b",
@@ -190,8 +195,8 @@ def test_overrides_win(tmp_path: Path) -> None:
     )
     config = load_config(path, overrides)
     assert (config.train.epochs, config.train.batch_size) == (7, 2)  # the last of two wins, the others stay
-    assert (config.network.cpa, config.augment.scale, config.data.camera_view) == ("none", (0.9, 1.1), False)
-    assert (config.detector.grid.nx, config.name) == (432, "a=b")
+    assert (config.model.network.cpa, config.augment.scale, config.data.camera_view) == ("none", (0.9, 1.1), False)
+    assert (config.model.spec.grid.nx, config.name) == (432, "a=b")
 
 
 @pytest.mark.parametrize(
@@ -199,8 +204,8 @@ def test_overrides_win(tmp_path: Path) -> None:
     [
         ("train.epoch=3", "unknown key `train.epoch`; did you mean `epochs`?"),
         ("trian.epochs=3", "unknown key `trian`; did you mean `train`?"),
-        ("detector.grid.zone=2", "unknown key `detector.grid.zone`; did you mean `zones`?"),
-        ("epochs=3", "unknown key `epochs`; known keys: name, detector"),
+        ("model.spec.grid.zone=2", "unknown key `model.spec.grid.zone`; did you mean `zones`?"),
+        ("epochs=3", "unknown key `epochs`; known keys: name, model"),
         ("train.epochs", "`train.epochs`: an override is written key.subkey=value, such as train.epochs=20"),
         ("=3", "an override is written key.subkey=value"),
         ("train.seed.first=3", "`seed` is a value, it has no keys"),
@@ -210,11 +215,11 @@ def test_overrides_win(tmp_path: Path) -> None:
         ("name=2026-99-99", "`name=2026-99-99`: the value is not valid YAML"),
         ("train.epochs=0", "train.epochs = 0: must be at least 1"),
         ("train.precision=64", "`train.precision` = 64: input should be 'fp32' or 'bf16'"),
-        ("detector.grid.zones=9", "zones 9 must lie between 1 and 5"),
+        ("model.spec.grid.zones=9", "zones 9 must lie between 1 and 5"),
     ],
 )
 def test_overrides_that_cannot_be(tmp_path: Path, override: str, message: str) -> None:
-    line = refusal(write(tmp_path, "train: {seed: 1}\n"), "loss.box_weight=1", override)
+    line = refusal(write(tmp_path, "train: {seed: 1}\n"), "model.loss.box_weight=1", override)
     assert message in line and override in line
 
 
@@ -224,15 +229,18 @@ def test_overrides_that_cannot_be(tmp_path: Path, override: str, message: str) -
         ("train: {epochs: [", "not valid YAML: "),
         ("train:\n\tepochs: 3\n", "not valid YAML: "),
         ("name: 2026-99-99\n", "not valid YAML: "),
-        ("- train\n- detector\n", "expected `key: value` lines, found a list"),
+        ("- train\n- model\n", "expected `key: value` lines, found a list"),
         ("just words\n", "expected `key: value` lines, found a str"),
         ("train:\n", "`train` = None: input should be a dictionary"),
         ("train: {epochs: many}\n", "`train.epochs` = 'many': input should be a valid integer"),
-        ("network: {block_channels: [64, 128]}\n", "missing key `network.block_channels.2`"),
-        ("network: {cpa: chanel}\n", "`network.cpa` = 'chanel': input should be 'none', 'paper', 'channel' or 'point'"),
-        ("detector: {grid: {zones: 9}}\n", "zones 9 must lie between 1 and 5"),
-        ("detector: {grid: {x_range_m: [0, 70]}}\n", "x_range_m [0, 70] must be a multiple of 7.68 m"),
-        ("detector: {classes: []}\n", "classes is empty"),
+        ("model: {network: {block_channels: [64, 128]}}\n", "missing key `model.network.block_channels.2`"),
+        (
+            "model: {network: {cpa: chanel}}\n",
+            "`model.network.cpa` = 'chanel': input should be 'none'",
+        ),
+        ("model: {spec: {grid: {zones: 9}}}\n", "zones 9 must lie between 1 and 5"),
+        ("model: {spec: {grid: {x_range_m: [0, 70]}}}\n", "x_range_m [0, 70] must be a multiple of 7.68 m"),
+        ("model: {spec: {classes: []}}\n", "classes is empty"),
     ],
 )
 def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
@@ -243,12 +251,12 @@ def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("network.pillar_channels", "0", "must be at least 1"),
-        ("network.block_channels", "[64, 0, 256]", "must be at least 1"),
-        ("network.block_convs", "[3, -1, 3]", "must be at least 0"),
-        ("loss.box_weight", "-1", "must be at least 0"),
-        ("loss.focal_alpha", "1.5", "must lie between 0 and 1"),
-        ("loss.smooth_l1_beta", "-0.1", "must be at least 0"),
+        ("model.network.pillar_channels", "0", "must be at least 1"),
+        ("model.network.block_channels", "[64, 0, 256]", "must be at least 1"),
+        ("model.network.block_convs", "[3, -1, 3]", "must be at least 0"),
+        ("model.loss.box_weight", "-1", "must be at least 0"),
+        ("model.loss.focal_alpha", "1.5", "must lie between 0 and 1"),
+        ("model.loss.smooth_l1_beta", "-0.1", "must be at least 0"),
         ("augment.flip_probability", "2", "must lie between 0 and 1"),
         ("augment.point_dropout", "-0.1", "must lie between 0 and 1"),
         ("augment.insert.objects", "-1", "must be at least 0"),

@@ -34,9 +34,9 @@ class Variant:
     def overrides(self) -> tuple[str, ...]:
         """For `asca train -s`. One zone means PointPillars' pillars of 0.16 m, several start at the paper's 0.32 m."""
         return (
-            f"detector.grid.zones={self.zones}",
-            f"detector.grid.v_max_m={0.16 if self.zones == 1 else 0.32}",
-            f"network.cpa={self.cpa}",
+            f"model.spec.grid.zones={self.zones}",
+            f"model.spec.grid.v_max_m={0.16 if self.zones == 1 else 0.32}",
+            f"model.network.cpa={self.cpa}",
             f"augment.insert.method={self.insert}",
         )
 

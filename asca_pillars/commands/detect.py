@@ -62,7 +62,7 @@ def _write(out: Path, path: Path, points: NDArray[np.float32], detections: Detec
     """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
     with atomic_path(out / f"{path.stem}.json") as temporary:
         temporary.write_text(json.dumps(_to_json(path, detections, _report(detector)), indent=1), encoding="utf-8")
-    write_png(out / f"{path.stem}_bev.png", draw_bev(points, detections, detector.spec.grid))
+    write_png(out / f"{path.stem}_bev.png", draw_bev(points, detections, detector.spec.ranges))
     calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
     if path.parent.name != "velodyne" or not calib_path.exists():
         return

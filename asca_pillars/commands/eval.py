@@ -22,6 +22,7 @@ from asca_pillars.evaluation.operating_point import best_scores, operating_point
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
 from asca_pillars.files import atomic_directory, atomic_path
+from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.system import describe_environment
 
@@ -38,7 +39,7 @@ class Task:
     predictions: Path
     labels: Path
     split: KittiSplit | None
-    grid: PillarGrid
+    ranges: Ranges
     scores: dict[str, float]
     about: dict[str, Any]
 
@@ -69,7 +70,7 @@ def run(
     if predictions is not None:
         scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE if score is None else score)
         about = {"predictions": str(predictions), "labels": str(labels)}
-        task = Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid(), scores, about)
+        task = Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid().ranges, scores, about)
     else:
         assert split is not None, "checked with the arguments"
         opened = open_model(model, min_score, provider, precision, threads)
@@ -136,7 +137,7 @@ def _run_model(
             soft_wrap=True,
         )
     subject = f"{model.name} on {split.root}, {split.name}"
-    return Task(subject, out / "predictions", labels, split, model.spec.grid, scores, about)
+    return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
 
 
 def _report(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
@@ -167,7 +168,7 @@ def _draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None
     worst = gallery.worst_frames(judged, count)
     folders = task.split, task.labels, task.predictions
     with _replacing(out / "gallery", gallery.INDEX) as folder:
-        gallery.write_gallery(folder, worst, *folders, task.grid, task.subject, console=console)
+        gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)
 
 
 @contextmanager

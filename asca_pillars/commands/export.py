@@ -38,8 +38,8 @@ def run(
 
     console = Console(markup=False)
     loaded = load_checkpoint(checkpoint)
-    spec = loaded.config.detector.with_score_threshold(dict(_score(text) for text in scores))
-    loaded = loaded._replace(config=replace(loaded.config, detector=spec))
+    spec = loaded.config.model.spec.with_score_threshold(dict(_score(text) for text in scores))
+    loaded = loaded._replace(config=replace(loaded.config, model=replace(loaded.config.model, spec=spec)))
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
     points = _scans(scans, console, PARITY_SCANS, PARITY_SEED)

@@ -49,7 +49,7 @@ def run(data: Path, config: Path, split: str | None, frames: int, report_path: P
 
 
 def _types(inspection: Inspection, config: Config) -> Table:
-    names = config.detector.class_names
+    names = config.model.spec.class_names
     neighbors = {NEIGHBOR_TYPES[name]: name for name in names if name in NEIGHBOR_TYPES}
     table = _table("Labels", "type", "count", "per frame", "in training")
     for kind, count in inspection.types.items():
@@ -100,7 +100,7 @@ def _matching(inspection: Inspection) -> Table:
 
 
 def _scans(inspection: Inspection, config: Config) -> Table:
-    scans, limits = inspection.scans, config.detector.limits
+    scans, limits = inspection.scans, config.model.spec.limits
     low, high = scans.reflectance_stored
     ground = "not seen" if scans.ground_z_m is None else _spread(scans.ground_z_m, 2)
     bottoms = " to ".join(f"{bottom:.2f}" for bottom in scans.anchor_bottoms_m)

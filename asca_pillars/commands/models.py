@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asca_deploy import Detections, Detector
 from asca_pillars.commands.extras import require
 from asca_pillars.errors import ConfigError
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Model:
 
     name: str
     detect: Callable[[NDArray[np.float32]], Detections]
-    spec: DetectorSpec
+    spec: PillarSpec
     camera_view: bool
     about: dict[str, Any]
     unlike: list[str] = field(default_factory=list)
@@ -80,7 +80,7 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
     import torch
 
     from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.models.scan_detector import ScanDetector
+    from asca_pillars.models.pillar.scan_detector import ScanDetector
 
     if threads is not None and threads < 1:
         raise ConfigError(f"threads {threads} must be at least 1")
@@ -102,5 +102,5 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
         "threads": torch.get_num_threads(),
         "min_score": min_score,
     }
-    detect = ScanDetector(network.to(device), config.detector.with_score_threshold(min_score))
-    return Model(config.name, detect, config.detector, config.data.camera_view, about)
+    detect = ScanDetector(network.to(device), config.model.spec.with_score_threshold(min_score))
+    return Model(config.name, detect, config.model.spec, config.data.camera_view, about)

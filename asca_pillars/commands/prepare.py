@@ -28,6 +28,6 @@ def run(config: Path, data: Path, overrides: list[str], workers: int) -> None:
     if settings.augment.insert.method == "rs_aug":
         prepare_free_spaces(split, inserter.prepared, camera_view=settings.data.camera_view, workers=workers)
     lines = [f"{inserter.database.path}: {len(inserter.database)} objects of {len(split.frame_ids)} frames"]
-    for name, objects, share in zip(settings.detector.class_names, inserter.candidates, inserter.shares, strict=True):
+    for name, objects, share in zip(settings.model.spec.class_names, inserter.candidates, inserter.shares, strict=True):
         lines.append(f"  {name}: {len(objects)} with {insert.min_points} or more points, drawn {share:.0%} of the time")
     Console(markup=False).print("\n".join(lines), soft_wrap=True, highlight=False)

@@ -11,7 +11,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.geometry.ranges import Ranges
 
 # What KITTI's protocol treats as neither right nor wrong for a class.
 NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
@@ -70,14 +70,7 @@ def read_frame(
     return LabeledFrame(frame_id, points, boxes, labels)
 
 
-def within_grid(frame: LabeledFrame, grid: PillarGrid) -> LabeledFrame:
-    """The frame without the boxes whose centre lies beside the grid: no anchor stands where they are."""
-    inside = in_grid(frame.boxes, grid)
+def within_ranges(frame: LabeledFrame, ranges: Ranges) -> LabeledFrame:
+    """The frame without the boxes whose center lies outside `ranges`: no anchor stands where they are."""
+    inside = ranges.hold_centers(frame.boxes)
     return replace(frame, boxes=frame.boxes[inside], labels=frame.labels[inside])
-
-
-def in_grid(boxes: NDArray[np.floating], grid: PillarGrid) -> NDArray[np.bool_]:
-    """Which boxes (N, 7) have their centre over the grid: (N,)."""
-    x, y = boxes[:, 0], boxes[:, 1]
-    (x_min, x_max), (y_min, y_max) = grid.x_range_m, grid.y_range_m
-    return np.asarray((x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max))

@@ -14,9 +14,9 @@ from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.kitti.verdicts import Verdict
 from asca_pillars.files import atomic_path
+from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.drawing import Color, Image
 from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, write_png
-from asca_pillars.pillars.grid import PillarGrid
 
 INDEX = "index.md"
 _INTRODUCTION = """# {title}: worst frames
@@ -58,7 +58,7 @@ def write_gallery(
     split: KittiSplit,
     labels: str | Path,
     predictions: str | Path,
-    grid: PillarGrid,
+    ranges: Ranges,
     title: str,
     *,
     console: Console | None = None,
@@ -70,7 +70,7 @@ def write_gallery(
         verdicts: of the frames, in the order in which they are numbered.
         split: the scans, calibrations and images.
         labels, predictions: the folders of KITTI text that were judged.
-        grid: whose range the pictures show.
+        ranges: what the pictures show.
         title: what was evaluated, for index.md.
         console: shows the progress.
 
@@ -81,13 +81,13 @@ def write_gallery(
     bar = track(verdicts, "Drawing", console=console, disable=console is None)
     for rank, verdict in enumerate(bar, start=1):
         name = f"{rank:03d}_{verdict.frame_id}.png"
-        write_png(Path(folder) / name, _draw(verdict, split, Path(labels), Path(predictions), grid))
+        write_png(Path(folder) / name, _draw(verdict, split, Path(labels), Path(predictions), ranges))
         rows.append(f"| [{verdict.frame_id}]({name}) | {verdict.missed.sum()} | {verdict.false.sum()} |")
     with atomic_path(Path(folder) / INDEX) as temporary:
         temporary.write_text("\n".join([*rows, ""]), encoding="utf-8")
 
 
-def _draw(verdict: Verdict, split: KittiSplit, labels: Path, predictions: Path, grid: PillarGrid) -> Image:
+def _draw(verdict: Verdict, split: KittiSplit, labels: Path, predictions: Path, ranges: Ranges) -> Image:
     frame_id = verdict.frame_id
     calibration = split.calibration(frame_id)
     points = read_scan(split.scan_path(frame_id)).points
@@ -101,7 +101,7 @@ def _draw(verdict: Verdict, split: KittiSplit, labels: Path, predictions: Path, 
         _layer(_UNCOUNTED, truth, verdict.uncounted, calibration),
         _layer(_EXCUSED, found, verdict.excused, calibration),
     ]
-    picture = draw_layers(points, layers, grid)
+    picture = draw_layers(points, layers, ranges)
     image_path = split.image_path(frame_id)
     image = cv2.imread(str(image_path)) if image_path.is_file() else None
     return picture if image is None else _below(picture, _draw_on(image, layers, calibration))

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.pillars.grid import PillarGrid
 
 ANCHOR_YAWS_RAD = (0.0, math.pi / 2)
 
@@ -38,7 +37,7 @@ class ClassSpec:
     width_m: float
     height_m: float
     z_m: float
-    """z of the anchor's centre, LiDAR frame."""
+    """z of the anchor's center, LiDAR frame."""
     positive_iou: float
     """An anchor that overlaps a box at least this much is to find it."""
     negative_iou: float
@@ -72,20 +71,25 @@ KITTI_CLASSES = (
 )
 
 
-def make_anchors(grid: PillarGrid, classes: tuple[ClassSpec, ...]) -> NDArray[np.float32]:
+def make_anchors(
+    x_m: NDArray[np.float64], y_m: NDArray[np.float64], classes: tuple[ClassSpec, ...]
+) -> NDArray[np.float32]:
     """One box per head cell, class and anchor yaw: (H, W, A, 7) float32, metres, LiDAR frame.
 
     A = 2 * len(classes), class-major: anchor a belongs to class a // 2 and has yaw ANCHOR_YAWS_RAD[a % 2].
-    Anchors stand at the metric centres of the head's cells, which are not evenly spaced in x.
+
+    Args:
+        x_m: (W,) centers of the head map's columns in metres, LiDAR frame; they need not be evenly spaced.
+        y_m: (H,) centers of its rows.
+        classes: what the anchors look for.
     """
-    x_m, y_m = grid.head_centres_m()
-    anchors = np.empty((*grid.head_shape, len(classes), len(ANCHOR_YAWS_RAD), 7), np.float32)
+    anchors = np.empty((len(y_m), len(x_m), len(classes), len(ANCHOR_YAWS_RAD), 7), np.float32)
     anchors[..., 0] = x_m[None, :, None, None]
     anchors[..., 1] = y_m[:, None, None, None]
     for index, spec in enumerate(classes):
         anchors[:, :, index, :, 2:6] = (spec.z_m, spec.length_m, spec.width_m, spec.height_m)
     anchors[..., 6] = ANCHOR_YAWS_RAD
-    return anchors.reshape(*grid.head_shape, -1, 7)
+    return anchors.reshape(len(y_m), len(x_m), -1, 7)
 
 
 def encode_boxes(
@@ -127,11 +131,11 @@ def decode_boxes(
     """
     residual, anchor = residuals.astype(np.float64), anchors.astype(np.float64)
     diagonal = np.hypot(anchor[..., 3], anchor[..., 4])[..., None]
-    centre = anchor[..., :2] + residual[..., :2] * diagonal
+    center = anchor[..., :2] + residual[..., :2] * diagonal
     z = anchor[..., 2:3] + residual[..., 2:3] * anchor[..., 5:6]
     size = anchor[..., 3:6] * np.exp(np.clip(residual[..., 3:6], -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
     into_bin = np.mod(residual[..., 6] + anchor[..., 6] - _BIN_START_RAD, math.pi)
     yaw = _BIN_START_RAD + math.pi * direction + into_bin
-    boxes = np.concatenate([centre, z, size, yaw[..., None]], axis=-1).astype(np.float32)
+    boxes = np.concatenate([center, z, size, yaw[..., None]], axis=-1).astype(np.float32)
     boxes[..., 6] = wrap_angle(yaw.astype(np.float32))
     return boxes

@@ -11,7 +11,7 @@ Frame: LiDAR, metres. x forward, y left, z up; yaw counter-clockwise about +z fr
           (left) <--------|------o      | length     A footprint lists its corners 0, 1, 2, 3:
                           |             |            counter-clockwise, the front-left one first.
                           |             |
-                        1 +-------------+ 2          o = (x, y, z), the geometric centre.
+                        1 +-------------+ 2          o = (x, y, z), the geometric center.
                     rear-left  width  rear-right
 
 Box: (x, y, z, length, width, height, yaw), one row of an (N, 7) array.
@@ -86,7 +86,7 @@ def points_in_boxes(
         reach = math.hypot(length / 2 + margin_m, width / 2 + margin_m)
         # A quick look along x first, with some slack for float32; few points are near any one box.
         near = np.flatnonzero(np.abs(xyz[0] - x) <= reach + 1e-3)
-        dx, dy, dz = (xyz[axis, near].astype(np.float64) - centre for axis, centre in enumerate((x, y, z)))
+        dx, dy, dz = (xyz[axis, near].astype(np.float64) - center for axis, center in enumerate((x, y, z)))
         along = math.cos(yaw) * dx + math.sin(yaw) * dy
         across = math.cos(yaw) * dy - math.sin(yaw) * dx
         row[near] = (

@@ -49,5 +49,5 @@ class Detections:
 
     @property
     def distances_m(self) -> NDArray[np.float32]:
-        """(N,) horizontal distance from the LiDAR to each box's centre."""
+        """(N,) horizontal distance from the LiDAR to each box's center."""
         return np.hypot(self.boxes[:, 0], self.boxes[:, 1])

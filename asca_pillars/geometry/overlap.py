@@ -163,9 +163,9 @@ def _share(part: _Doubles, whole: _Doubles) -> _Doubles:
 
 
 def _shared_length(a: _Boxes, a_size: _Boxes, b: _Boxes, b_size: _Boxes) -> NDArray[Any]:
-    """Length shared by intervals given by centre and size: (N,), (N,), (M,), (M,) -> (N, M).
+    """Length shared by intervals given by center and size: (N,), (N,), (M,), (M,) -> (N, M).
 
-    Written so that equal intervals share exactly their size, whatever the centre's rounding.
+    Written so that equal intervals share exactly their size, whatever the center's rounding.
     """
     shared = np.abs(a[:, None] - b[None, :])
     np.subtract((a_size[:, None] + b_size[None, :]) / 2, shared, out=shared)

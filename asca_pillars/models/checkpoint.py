@@ -7,7 +7,7 @@ import torch
 
 from asca_pillars.config import Config
 from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_detector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.schema import parse
 
 
@@ -31,7 +31,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     try:
         content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         config = parse(Config, content["hyper_parameters"]["config"], str(path))
-        detector = build_detector(config)
+        detector = build_pillar_detector(config.model)
         weights = {
             name.removeprefix("detector."): value
             for name, value in content["state_dict"].items()

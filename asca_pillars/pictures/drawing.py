@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.geometry.ranges import Ranges
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
@@ -32,9 +32,9 @@ class View:
     height_px: int
 
     @classmethod
-    def around(cls, content_xy: NDArray[np.floating], grid: PillarGrid, width_px: int) -> "View":
-        """The part of the grid's range that holds the content (N, 2), and the sensor if it is in the range."""
-        low, high = np.array([grid.x_range_m, grid.y_range_m]).T
+    def around(cls, content_xy: NDArray[np.floating], ranges: Ranges, width_px: int) -> "View":
+        """The part of the ranges that holds the content (N, 2), and the sensor if it is in the range."""
+        low, high = np.array([ranges.x_m, ranges.y_m]).T
         has_sensor = bool((low <= 0).all() and (high >= 0).all())
         if len(content_xy):
             content_xy = np.clip(content_xy, low, high)

@@ -14,8 +14,8 @@ from asca_pillars.data.kitti.calibration import Calibration, project_edges
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.drawing import BACKGROUND, OVERSAMPLING, SUBPIXEL_BITS, Color, Image, Texts, View, subpixels
-from asca_pillars.pillars.grid import PillarGrid
 
 _CLASS_COLORS: dict[str, Color] = {
     "Car": (40, 165, 255),
@@ -58,7 +58,7 @@ class BoxLayer:
 def draw_bev(
     points: NDArray[np.floating],
     detections: Detections | None,
-    grid: PillarGrid,
+    ranges: Ranges,
     *,
     labels: NDArray[np.floating] | None = None,
     width_px: int = 1000,
@@ -66,11 +66,11 @@ def draw_bev(
     """A scan from above: (H, width_px, 3), the LiDAR's x upwards and y to the left.
 
     Args:
-        points: (N, >=3) metres; those in the grid's x and y range are drawn, the higher the brighter.
+        points: (N, >=3) metres; those in the x and y range are drawn, the higher the brighter.
         detections: drawn in their class's color with their score; a line leads from the center to the front.
         labels: ground truth boxes (M, 7), drawn thin and white.
 
-    The picture shows the part of the grid's range in which there is something.
+    The picture shows the part of the ranges in which there is something.
     """
     layers = []
     found = Detections.empty(()) if detections is None else detections
@@ -79,16 +79,16 @@ def draw_bev(
         layers.append(BoxLayer(name, own.boxes, class_color(name), [f"{score:.2f}" for score in own.scores]))
     if labels is not None and len(labels):
         layers.append(BoxLayer("ground truth", labels, _WHITE, thickness_px=2))
-    return draw_layers(points, layers, grid, width_px=width_px)
+    return draw_layers(points, layers, ranges, width_px=width_px)
 
 
 def draw_layers(
-    points: NDArray[np.floating], layers: Sequence[BoxLayer], grid: PillarGrid, *, width_px: int = 1000
+    points: NDArray[np.floating], layers: Sequence[BoxLayer], ranges: Ranges, *, width_px: int = 1000
 ) -> Image:
     """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend."""
-    points = points[_in_range(points, grid)]
+    points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
-    view = View.around(np.concatenate([points[:, :2], *(o.reshape(-1, 2) for o in outlines)]), grid, width_px)
+    view = View.around(np.concatenate([points[:, :2], *(o.reshape(-1, 2) for o in outlines)]), ranges, width_px)
 
     canvas = np.full((view.height_px, view.width_px, 3), BACKGROUND, np.uint8)
     texts = Texts(canvas, 0.42 * OVERSAMPLING)
@@ -147,8 +147,8 @@ def draw_on_image(
     return np.asarray(canvas, dtype=np.uint8)
 
 
-def _in_range(points: NDArray[np.floating], grid: PillarGrid) -> NDArray[np.bool_]:
-    (x_min, x_max), (y_min, y_max) = grid.x_range_m, grid.y_range_m
+def _in_range(points: NDArray[np.floating], ranges: Ranges) -> NDArray[np.bool_]:
+    (x_min, x_max), (y_min, y_max) = ranges.x_m, ranges.y_m
     x, y = points[:, 0], points[:, 1]
     return (x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max)
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.fitting import HEAD_STRIDE, MAX_ZONES, NECK_STRIDE, fits, x_advice, y_advice
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
@@ -91,6 +92,11 @@ class PillarGrid:
         return round((self.y_range_m[1] - self.y_range_m[0]) / self.v_y_m)
 
     @property
+    def ranges(self) -> Ranges:
+        """The three ranges, for what needs no pillars."""
+        return Ranges(self.x_range_m, self.y_range_m, self.z_range_m)
+
+    @property
     def head_shape(self) -> tuple[int, int]:
         """(H, W) of the map that the head reads."""
         return self.ny // HEAD_STRIDE, self.nx // HEAD_STRIDE
@@ -131,13 +137,13 @@ class PillarGrid:
         cells[chosen] = rows * self.nx + self.tables.column_of_slice[slices]
         return cells
 
-    def cell_centres_m(self, cells: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Centres x, y of the pillars with these flat indices: (n,) -> (n, 2) float32, metres."""
+    def cell_centers_m(self, cells: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Centers x, y of the pillars with these flat indices: (n,) -> (n, 2) float32, metres."""
         rows, columns = np.divmod(cells, self.nx)
-        return np.stack([self.column_centres_m[columns], self.row_centres_m[rows]], axis=-1)
+        return np.stack([self.column_centers_m[columns], self.row_centers_m[rows]], axis=-1)
 
-    def head_centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Metric centres of the head map's cells: x of its columns (W,), y of its rows (H,).
+    def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Metric centers of the head map's cells: x of its columns (W,), y of its rows (H,).
 
         Zones hold a multiple of HEAD_STRIDE columns, so the two columns of a head cell are equally deep.
         """
@@ -173,13 +179,13 @@ class PillarGrid:
         )
 
     @cached_property
-    def column_centres_m(self) -> NDArray[np.float32]:
-        """x of the columns' centres, (nx,)."""
+    def column_centers_m(self) -> NDArray[np.float32]:
+        """x of the columns' centers, (nx,)."""
         return ((self.x_edges_m[:-1] + self.x_edges_m[1:]) / 2).astype(np.float32)
 
     @cached_property
-    def row_centres_m(self) -> NDArray[np.float32]:
-        """y of the rows' centres, (ny,)."""
+    def row_centers_m(self) -> NDArray[np.float32]:
+        """y of the rows' centers, (ny,)."""
         return ((self.y_edges_m[:-1] + self.y_edges_m[1:]) / 2).astype(np.float32)
 
 

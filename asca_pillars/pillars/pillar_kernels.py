@@ -119,8 +119,8 @@ def fill_pillars(
     pillar_index = np.empty(len(features), np.int64)
     stays, crowd, taken = np.ones(len(order), bool), np.empty((2, len(shuffled)), np.int64), np.zeros_like(counts)
     _keep_first(counts, kept, shuffled, max_points, crowd, taken, stays)
-    centres_m = grid.column_centres_m, grid.row_centres_m
-    _fill_pillars(points, order, cells, counts, kept, stays, *centres_m, features, pillar_index)
+    centers_m = grid.column_centers_m, grid.row_centers_m
+    _fill_pillars(points, order, cells, counts, kept, stays, *centers_m, features, pillar_index)
     return features, pillar_index, point_counts
 
 
@@ -164,8 +164,8 @@ def _fill_pillars(
     counts: _Integers,
     kept: _Bools,
     stays: _Bools,
-    column_centres_m: _Floats,
-    row_centres_m: _Floats,
+    column_centers_m: _Floats,
+    row_centers_m: _Floats,
     features: _Floats,
     pillar_index: _Integers,
 ) -> None:
@@ -188,14 +188,14 @@ def _fill_pillars(
                 row += 1
         count = row - first
         x_mean, y_mean, z_mean = np.float32(x_sum / count), np.float32(y_sum / count), np.float32(z_sum / count)
-        x_centre = column_centres_m[cells[pillar] % len(column_centres_m)]
-        y_centre = row_centres_m[cells[pillar] // len(column_centres_m)]
+        x_center = column_centers_m[cells[pillar] % len(column_centers_m)]
+        y_center = row_centers_m[cells[pillar] // len(column_centers_m)]
         for k in range(first, row):
             features[k, 4] = features[k, 0] - x_mean
             features[k, 5] = features[k, 1] - y_mean
             features[k, 6] = features[k, 2] - z_mean
-            features[k, 7] = features[k, 0] - x_centre
-            features[k, 8] = features[k, 1] - y_centre
+            features[k, 7] = features[k, 0] - x_center
+            features[k, 8] = features[k, 1] - y_center
             pillar_index[k] = place
         place += 1
         first = row

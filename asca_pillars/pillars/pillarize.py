@@ -17,7 +17,7 @@ from asca_pillars.pillars.grid import PillarGrid
 
 FEATURES = ("x", "y", "z", "reflectance", "x_mean", "y_mean", "z_mean", "x_center", "y_center")
 """Channels of a point (D = 9 of the paper): position in metres, LiDAR frame; reflectance; offsets in metres
-to the mean of the pillar's kept points and to the pillar's centre."""
+to the mean of the pillar's kept points and to the pillar's center."""
 
 
 @dataclass(frozen=True)
@@ -173,14 +173,14 @@ def _fill_pillars(
     stays[crowd[np.arange(len(crowd)) - first >= max_points]] = False
 
     point_counts = np.minimum(counts[kept], max_points)
-    features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centres_m(cells[kept]))
+    features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centers_m(cells[kept]))
     return features, np.repeat(np.arange(len(point_counts)), point_counts), point_counts
 
 
 def _features(
-    points: NDArray[np.float32], counts: NDArray[np.int64], centres_m: NDArray[np.float32]
+    points: NDArray[np.float32], counts: NDArray[np.int64], centers_m: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Points sorted by pillar (M, 4), points per pillar (P,) and pillar centres (P, 2) -> (M, 9)."""
+    """Points sorted by pillar (M, 4), points per pillar (P,) and pillar centers (P, 2) -> (M, 9)."""
     features = np.empty((len(points), len(FEATURES)), np.float32)
     pillar_index = np.repeat(np.arange(len(counts)), counts)
     # One channel at a time: NumPy is slow along an axis as short as the channels'.
@@ -191,5 +191,5 @@ def _features(
         means = np.bincount(pillar_index, weights=points[:, axis], minlength=len(counts)) / counts
         features[:, 4 + axis] = points[:, axis] - np.repeat(means.astype(np.float32), counts)
     for axis in range(2):
-        features[:, 7 + axis] = points[:, axis] - np.repeat(centres_m[:, axis], counts)
+        features[:, 7 + axis] = points[:, axis] - np.repeat(centers_m[:, axis], counts)
     return features

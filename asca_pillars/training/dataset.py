@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 
 from asca_pillars.config import Config
 from asca_pillars.data.augment import augment
-from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
+from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.geometry.targets import Targets, assign_targets
@@ -86,7 +86,7 @@ class KittiDataset(Dataset[Sample]):
     def __getitem__(self, index: tuple[int, int]) -> Sample:
         epoch, number = index
         rng = np.random.default_rng((self.config.train.seed, epoch, number)) if self.training else None
-        data, spec = self.config.data, self.config.detector
+        data, spec = self.config.data, self.config.model.spec
         frame = read_frame(
             self.split,
             self.frame_ids[number],
@@ -101,7 +101,7 @@ class KittiDataset(Dataset[Sample]):
             )
         if rng is not None:
             frame = augment(frame, self.config.augment, rng)
-        frame = within_grid(frame, spec.grid)
+        frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points, rng)
         return Sample(frame, pillars, assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels))
 

@@ -23,7 +23,7 @@ from asca_pillars.files import atomic_path
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.loss import LossTerms, detection_loss
-from asca_pillars.models.pillar.pillar_detector import build_detector
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.schema import to_dict
 from asca_pillars.system import describe_environment
 from asca_pillars.training.dataset import Batch, KittiDataset
@@ -94,8 +94,8 @@ class DetectionModule(L.LightningModule):
         super().__init__()
         self.save_hyperparameters({"config": to_dict(config)})
         self.config = config
-        self.detector = build_detector(config)
-        self.recall = RecallTally(config.detector.class_names)
+        self.detector = build_pillar_detector(config.model)
+        self.recall = RecallTally(config.model.spec.class_names)
 
     def training_step(self, batch: Batch, _: int) -> torch.Tensor:
         terms = self._loss(batch)
@@ -106,11 +106,11 @@ class DetectionModule(L.LightningModule):
 
     def validation_step(self, batch: Batch, _: int) -> None:
         maps = self.detector(batch.pillars)
-        terms = detection_loss(maps, batch.targets, self.config.loss)
+        terms = detection_loss(maps, batch.targets, self.config.model.loss)
         self.log_dict(self._named(terms, "val"), sync_dist=True, batch_size=len(batch.frame_ids))
         arrays = [part.float().cpu().numpy() for part in maps]
         for frame, (boxes, labels) in enumerate(zip(batch.boxes, batch.labels, strict=True)):
-            detections = self.config.detector.decode(HeadMaps(*(part[frame] for part in arrays)))
+            detections = self.config.model.spec.decode(HeadMaps(*(part[frame] for part in arrays)))
             self.recall.add(detections, boxes, labels)
 
     def on_validation_epoch_end(self) -> None:
@@ -121,7 +121,7 @@ class DetectionModule(L.LightningModule):
         if not self.trainer.sanity_checking:
             found = ", ".join(f"{name} {row.recall:.2f} ({row.false_per_frame:.2f})" for name, row in rows.items())
             self.print(f"epoch {self.current_epoch}: recall (false per frame): {found}")
-        self.recall = RecallTally(self.config.detector.class_names)
+        self.recall = RecallTally(self.config.model.spec.class_names)
 
     def configure_optimizers(self) -> Any:
         recipe = self.config.train
@@ -153,7 +153,7 @@ class DetectionModule(L.LightningModule):
         return len(data.training_set) // (self.config.train.batch_size * self.trainer.world_size)
 
     def _loss(self, batch: Batch) -> LossTerms:
-        return detection_loss(self.detector(batch.pillars), batch.targets, self.config.loss)
+        return detection_loss(self.detector(batch.pillars), batch.targets, self.config.model.loss)
 
     def _named(self, terms: LossTerms, stage: str) -> dict[str, torch.Tensor]:
         named = {f"{stage}/{name}": value.detach() for name, value in terms._asdict().items()}

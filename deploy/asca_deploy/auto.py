@@ -12,7 +12,7 @@ from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 REFERENCE = ("cpu", "float32")
 
@@ -61,7 +61,7 @@ def choose(
     names: Iterable[tuple[str, str]],
     open_network: Callable[[str, str], Network],
     detect: Callable[[Network], Detections],
-    spec: DetectorSpec,
+    spec: PillarSpec,
     precision: str | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Choice[Network]:
@@ -108,7 +108,7 @@ def summary(provider: str, precision: str, candidates: Iterable[Candidate]) -> s
     return f"auto takes {provider} {precision}: {'; '.join(map(str, candidates))}"
 
 
-def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) -> str | None:
+def disagreement(expected: Detections, found: Detections, spec: PillarSpec) -> str | None:
     """The first box of either side without a partner on the other; None if every box has one.
 
     Partners have the same class and are as near as the limits above demand. A box whose score ties with its class's
@@ -135,7 +135,7 @@ def _try(
     open_network: Callable[[str, str], Network],
     detect: Callable[[Network], Detections],
     expected: Detections,
-    spec: DetectorSpec,
+    spec: PillarSpec,
     clock: Callable[[], float],
 ) -> _Trial[Network]:
     try:
@@ -176,6 +176,6 @@ def _have_partners(boxes: Detections, partners: Detections) -> NDArray[np.bool_]
     return (same & (iou_3d(boxes.boxes, partners.boxes) >= MIN_IOU)).any(axis=1)
 
 
-def _ties(boxes: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
+def _ties(boxes: Detections, spec: PillarSpec) -> NDArray[np.bool_]:
     thresholds = np.array([class_.score_threshold for class_ in spec.classes])
     return boxes.scores - thresholds[boxes.labels] <= MAX_SCORE_DIFFERENCE

@@ -19,7 +19,7 @@ from asca_deploy.input_check import ExpectedInput
 from asca_deploy.layout import difference, layout_of
 from asca_pillars.errors import AscaError, BundleError
 from asca_pillars.files import atomic_path
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import Strict, parse, to_dict
 
 SCHEMA_VERSION = 2
@@ -116,7 +116,7 @@ class Bundle(Strict):
     """The contents of bundle.json."""
 
     name: str
-    spec: DetectorSpec
+    spec: PillarSpec
     cpa: str
     """Reading of the correlative point attention in the encoder; the runtime need not know, people do."""
     channels: int

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES
-from asca_pillars.pillars.spec import DetectorSpec
 
 _SAME_M = 1e-6
 
 
-def layout_of(spec: DetectorSpec) -> dict[str, Any]:
+def layout_of(spec: PillarSpec) -> dict[str, Any]:
     """Plain values for bundle.json.
 
     x_zones, y_zones: runs of equally sized pillars, ascending: first edge, size and number of pillars.

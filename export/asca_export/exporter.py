@@ -72,18 +72,18 @@ def export_bundle(
         essentials = {
             "schema_version": SCHEMA_VERSION,
             "name": config.name,
-            "cpa": config.network.cpa,
+            "cpa": config.model.network.cpa,
             "license": LICENSE,
-            "spec": to_dict(config.detector),
-            "layout": layout_of(config.detector),
+            "spec": to_dict(config.model.spec),
+            "layout": layout_of(config.model.spec),
         }
         for name in (ENCODER, BACKBONE):
             graphs.stamp(folder / name, essentials)
         draft = Bundle(
             name=config.name,
-            spec=config.detector,
-            cpa=config.network.cpa,
-            channels=config.network.pillar_channels,
+            spec=config.model.spec,
+            cpa=config.model.network.cpa,
+            channels=config.model.network.pillar_channels,
             precision="float32",
             canvas=CanvasFormat(),
             backbone_gmac=graphs.multiply_accumulates(folder / BACKBONE) / 1e9,

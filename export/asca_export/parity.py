@@ -16,7 +16,7 @@ from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, batch_pillars
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
 BOX_TOLERANCE_M = 0.01
@@ -82,7 +82,7 @@ def _require_close(
     return error
 
 
-def compare_boxes(expected: Maps, found: Maps, spec: DetectorSpec, scan: int = 0) -> BoxDifference:
+def compare_boxes(expected: Maps, found: Maps, spec: PillarSpec, scan: int = 0) -> BoxDifference:
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
     Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
@@ -133,7 +133,7 @@ def _pair(boxes: Detections, partners: Detections) -> tuple[BoxDifference, NDArr
 
 
 def _require_ties(
-    our_lone: Detections, their_lone: Detections, ours: Detections, theirs: Detections, spec: DetectorSpec, scan: int
+    our_lone: Detections, their_lone: Detections, ours: Detections, theirs: Detections, spec: PillarSpec, scan: int
 ) -> None:
     """Raise ExportError unless ties between scores explain every box that one side alone has.
 
@@ -155,13 +155,13 @@ def _require_ties(
             )
 
 
-def _ties(lone: Detections, others: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
+def _ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.bool_]:
     thresholds = np.array([class_.score_threshold for class_ in spec.classes])
     tied = np.abs(thresholds[lone.labels] - lone.scores) <= MAP_TOLERANCE
     equal = np.abs(lone.scores[:, None] - others.scores[None]) <= MAP_TOLERANCE
     return tied | (_clash(lone, others, spec) & equal).any(axis=1)
 
 
-def _clash(a: Detections, b: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
+def _clash(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.bool_]:
     """(N, M): pairs that suppression does not keep side by side."""
     return (a.labels[:, None] == b.labels[None]) & (bev_iou(a.boxes, b.boxes) > spec.post.nms_iou)

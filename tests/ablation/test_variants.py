@@ -26,9 +26,9 @@ def config(tmp_path: Path) -> str:
 @pytest.mark.parametrize("variant", VARIANTS.values(), ids=lambda variant: variant.name)
 def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
     config = load_config(shipped_configs()["ablation_small"], variant.overrides)
-    assert config.detector.grid.zones == variant.zones and config.network.cpa == variant.cpa
+    assert config.model.spec.grid.zones == variant.zones and config.model.network.cpa == variant.cpa
     assert config.augment.insert.method == variant.insert
-    assert config.detector.grid.v_max_m == (0.16 if variant.zones == 1 else 0.32)
+    assert config.model.spec.grid.v_max_m == (0.16 if variant.zones == 1 else 0.32)
 
 
 def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from asca_deploy import default_bundle_path, load_bundle
 from asca_pillars.commands.eval import run
 from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
 from asca_pillars.errors import AscaError
-from asca_pillars.models.pillar.pillar_detector import build_detector
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.schema import to_dict
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
@@ -162,7 +162,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
 
 def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
     torch.manual_seed(0)
-    network = build_detector(CONFIG)
+    network = build_pillar_detector(CONFIG.model)
     weights = {f"detector.{name}": value for name, value in network.state_dict().items()}
     content = {"hyper_parameters": {"config": to_dict(CONFIG)}, "state_dict": weights, "global_step": 7}
     torch.save(content, tmp_path / "last.ckpt")

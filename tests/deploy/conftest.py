@@ -14,16 +14,16 @@ from asca_deploy.bundle import Bundle, Graphs, Provenance, write_bundle_manifest
 from asca_deploy.canvas import CanvasFormat
 from asca_deploy.input_check import ExpectedInput
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
-from asca_pillars.pillars.spec import DetectorSpec
 
 needs_openvino = pytest.mark.skipif(
     importlib.util.find_spec("openvino") is None, reason="needs pip install 'asca-pillars[openvino]'"
 )
 
 CHANNELS = 8
-# 8 + 16 + 32 columns of 0.32, 0.16 and 0.08 m by 24 rows: rectangular, off centre, with a positive minimum.
-SPEC = DetectorSpec(
+# 8 + 16 + 32 columns of 0.32, 0.16 and 0.08 m by 24 rows: rectangular, off center, with a positive minimum.
+SPEC = PillarSpec(
     grid=PillarGrid(x_range_m=(2.0, 9.68), y_range_m=(-1.28, 2.56), z_range_m=(-3.0, 1.0)),
     limits=PillarLimits(max_pillars=300, max_points=8),
 )

@@ -12,7 +12,7 @@ from asca_deploy import Detector, auto
 from asca_pillars.errors import BundleError, ProviderError
 from asca_pillars.geometry.anchors import KITTI_CLASSES
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from tests.deploy.conftest import SPEC
 
 BOXES = np.array(
@@ -24,7 +24,7 @@ BOXES = np.array(
     np.float32,
 )
 THRESHOLD = 0.3
-THRESHOLDS: DetectorSpec = replace(
+THRESHOLDS: PillarSpec = replace(
     SPEC, classes=tuple(replace(class_, score_threshold=THRESHOLD) for class_ in KITTI_CLASSES)
 )
 FOUND = Detections(

@@ -22,8 +22,8 @@ from asca_deploy.bundle import (
 )
 from asca_pillars.errors import BundleError
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES
-from asca_pillars.pillars.spec import DetectorSpec
 
 
 def edit(bundle: Path, change: Callable[[dict[str, Any]], object]) -> Path:
@@ -51,7 +51,7 @@ def test_round_trip(bundle_copy: Path) -> None:
 
 
 def test_layout_of_the_papers_grid(tiny_bundle: Path) -> None:
-    bundle = replace(load_bundle(tiny_bundle), spec=DetectorSpec())
+    bundle = replace(load_bundle(tiny_bundle), spec=PillarSpec())
     layout = bundle_to_json(bundle)["layout"]
     # 69.12 m in three zones of 23.04 m: 72 x 0.32, 144 x 0.16 and 288 x 0.08 (DESIGN 4.1).
     assert layout["x_zones"] == [
@@ -67,7 +67,7 @@ def test_layout_of_the_papers_grid(tiny_bundle: Path) -> None:
 
 def test_layout_of_a_uniform_grid_is_one_zone(tiny_bundle: Path) -> None:
     grid = PillarGrid(x_range_m=(3.0, 15.8), y_range_m=(-2.56, 1.28), v_max_m=0.16, zones=1)
-    layout = bundle_to_json(replace(load_bundle(tiny_bundle), spec=DetectorSpec(grid)))["layout"]
+    layout = bundle_to_json(replace(load_bundle(tiny_bundle), spec=PillarSpec(grid)))["layout"]
     assert layout["x_zones"] == [{"start_m": 3.0, "pillar_m": 0.16, "pillars": 80}]
 
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from asca_deploy.canvas import Canvas, CanvasFormat
 from asca_pillars.pillars.grid import PillarGrid
 
-# 8 + 16 + 32 columns by 16 rows, off centre.
+# 8 + 16 + 32 columns by 16 rows, off center.
 GRID = PillarGrid(x_range_m=(1.0, 8.68), y_range_m=(-0.64, 1.92))
 CHANNELS = 3
 FORMATS = (CanvasFormat(), CanvasFormat("uint8", (7, 0, 130)))

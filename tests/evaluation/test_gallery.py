@@ -45,7 +45,9 @@ def judge(root: Path) -> list[Verdict]:
 
 def draw(root: Path, worst: list[Verdict]) -> Path:
     folder = root.parent / "gallery"
-    write_gallery(folder, worst, KittiSplit(root), root / "training" / "label_2", root.parent / "det", GRID, "made up")
+    write_gallery(
+        folder, worst, KittiSplit(root), root / "training" / "label_2", root.parent / "det", GRID.ranges, "made up"
+    )
     return folder
 
 

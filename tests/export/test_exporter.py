@@ -19,7 +19,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.scenes import SPEC
 
@@ -142,7 +142,7 @@ def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: str) -> No
         pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")
     split = KittiSplit(root)
     scans = [read_scan(split.scan_path(frame_id)).points for frame_id in split.frame_ids]
-    parity = export_bundle(tiny_checkpoint(cpa, DetectorSpec()), tmp_path, scans).parity
+    parity = export_bundle(tiny_checkpoint(cpa, PillarSpec()), tmp_path, scans).parity
     assert parity is not None and parity.scans == len(scans)
     assert parity.box_max_error_m <= 0.01 and parity.yaw_max_error_rad <= np.deg2rad(0.5)
 

@@ -21,8 +21,10 @@ CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
 
 def export_int8(folder: Path) -> Bundle:
     checkpoint = tiny_checkpoint("channel")
-    spec = checkpoint.config.detector.with_score_threshold(0.02)  # random weights are never sure of anything
-    checkpoint = checkpoint._replace(config=replace(checkpoint.config, detector=spec))
+    spec = checkpoint.config.model.spec.with_score_threshold(0.02)  # random weights are never sure of anything
+    checkpoint = checkpoint._replace(
+        config=replace(checkpoint.config, model=replace(checkpoint.config.model, spec=spec))
+    )
     return export_bundle(checkpoint, folder, SCANS, calibration=CALIBRATION)
 
 

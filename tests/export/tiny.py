@@ -4,21 +4,21 @@ import dataclasses
 
 import torch
 
-from asca_pillars.config import Config, NetworkConfig
+from asca_pillars.config import Config, NetworkConfig, PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.pillar.pillar_detector import build_detector
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from tests.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
 SCANS = [make_scene(seed)[0] for seed in range(8)]
 
 
-def tiny_checkpoint(cpa: str, spec: DetectorSpec = SPEC) -> Checkpoint:
+def tiny_checkpoint(cpa: str, spec: PillarSpec = SPEC) -> Checkpoint:
     """Fresh random weights, with statistics and scores that differ from place to place."""
     torch.manual_seed(1)
-    config = Config(name="tiny", detector=spec, network=dataclasses.replace(NETWORK, cpa=cpa))
-    detector = build_detector(config)
+    config = Config(name="tiny", model=PillarModel(spec=spec, network=dataclasses.replace(NETWORK, cpa=cpa)))
+    detector = build_pillar_detector(config.model)
     with torch.no_grad():
         for name, buffer in detector.named_buffers():
             if name.endswith("running_mean"):

@@ -33,7 +33,7 @@ def assert_same_boxes(boxes: np.ndarray, expected: np.ndarray) -> None:
 
 
 def test_anchors_by_hand() -> None:
-    anchors = make_anchors(GRID, KITTI_CLASSES)
+    anchors = make_anchors(*GRID.head_centers_m(), KITTI_CLASSES)
     # 10.24 m / 0.16 m / 2 = 32 rows; 5.12 m per zone hold 16, 32 and 64 columns, halved 8 + 16 + 32 = 56.
     assert anchors.shape == (32, 56, 6, 7) and anchors.dtype == np.float32
     # The first cell is two columns of 0.32 m by two rows of 0.16 m; the ninth begins the second zone.
@@ -44,9 +44,9 @@ def test_anchors_by_hand() -> None:
     np.testing.assert_allclose(anchors[3, 5, :, 6], [0, math.pi / 2] * 3, rtol=1e-6)
 
 
-def test_anchors_stand_at_the_centres_of_head_cells() -> None:
-    anchors = make_anchors(GRID, KITTI_CLASSES[:1])
-    x_m, y_m = GRID.head_centres_m()
+def test_anchors_stand_at_the_centers_of_head_cells() -> None:
+    anchors = make_anchors(*GRID.head_centers_m(), KITTI_CLASSES[:1])
+    x_m, y_m = GRID.head_centers_m()
     np.testing.assert_allclose(anchors[..., 0], np.broadcast_to(x_m[None, :, None], anchors.shape[:3]), rtol=1e-6)
     np.testing.assert_allclose(anchors[..., 1], np.broadcast_to(y_m[:, None, None], anchors.shape[:3]), rtol=1e-6)
 
@@ -111,7 +111,7 @@ def test_only_the_direction_tells_front_from_back(turns: float) -> None:
 
 
 def test_many_dimensions() -> None:
-    anchors = make_anchors(GRID, KITTI_CLASSES)
+    anchors = make_anchors(*GRID.head_centers_m(), KITTI_CLASSES)
     boxes = anchors + np.array([0.3, -0.2, 0.1, 0.05, 0.05, 0.05, 0.1], np.float32)
     residuals, direction = encode_boxes(boxes, anchors)
     assert residuals.shape == anchors.shape and direction.shape == anchors.shape[:-1]

@@ -18,7 +18,7 @@ GRID = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.
 CLASSES = tuple(
     dataclasses.replace(spec, score_threshold=score) for spec, score in zip(KITTI_CLASSES, (0.5, 0.3, 0.4), strict=True)
 )
-ANCHORS = make_anchors(GRID, CLASSES)
+ANCHORS = make_anchors(*GRID.head_centers_m(), CLASSES)
 HEIGHT, WIDTH, COUNT, _ = ANCHORS.shape
 NAMES = ("Car", "Pedestrian", "Cyclist")
 

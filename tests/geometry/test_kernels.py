@@ -20,7 +20,7 @@ from asca_pillars.geometry.overlap import rotated_nms
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillarize import PillarLimits, Pillars, pillarize
 
-# Rectangular, off centre, with a positive minimum, and columns of one to three depths.
+# Rectangular, off center, with a positive minimum, and columns of one to three depths.
 GRIDS = tuple(
     PillarGrid(x_range_m=(2.0, far_m), y_range_m=(-1.28, 2.56), z_range_m=(-2.5, 1.5), zones=zones)
     for zones, far_m in ((1, 9.68), (2, 7.12), (3, 9.68))

@@ -17,7 +17,7 @@ from asca_pillars.pillars.grid import PillarGrid
 # Rectangular, asymmetric, both minima off zero. Head cells are 0.32 m along y and 0.64, 0.32, 0.16 m along x in
 # the zones that begin at 2.00, 4.56 and 7.12 m: 16 rows, 4 + 8 + 16 columns.
 GRID = PillarGrid(x_range_m=(2.0, 9.68), y_range_m=(-1.92, 3.2))
-ANCHORS = make_anchors(GRID, KITTI_CLASSES)
+ANCHORS = make_anchors(*GRID.head_centers_m(), KITTI_CLASSES)
 ROWS, COLUMNS, COUNT = 16, 28, 6
 CAR, PEDESTRIAN, CYCLIST = range(3)
 SIZES = {CAR: (3.9, 1.6, 1.56), PEDESTRIAN: (0.8, 0.6, 1.73), CYCLIST: (1.76, 0.6, 1.73)}
@@ -29,7 +29,7 @@ def assign(*labelled: tuple[int, list[float]]) -> Targets:
 
 
 def box_at(row: int, column: int, label: int = PEDESTRIAN, dx: float = 0.0, yaw: float = 0.0) -> list[float]:
-    """A box of its class's anchor size, `dx` beside the centre of a head cell."""
+    """A box of its class's anchor size, `dx` beside the center of a head cell."""
     x, y = ANCHORS[row, column, 0, :2]
     return [x + dx, y, -0.9, *SIZES[label], yaw]
 
@@ -74,8 +74,8 @@ def labelled_boxes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
     for label in labels:
         like = label if label != IGNORED else draw(st.sampled_from([CAR, PEDESTRIAN, CYCLIST]))
         stretch = [draw(st.floats(0.6, 1.8)) for _ in range(3)]
-        centre = draw(st.floats(-2.0, 14.0)), draw(st.floats(-5.0, 6.0)), draw(st.floats(-2.0, 0.5))
-        boxes.append([*centre, *np.multiply(SIZES[like], stretch), draw(st.floats(-math.pi, 3.14))])
+        center = draw(st.floats(-2.0, 14.0)), draw(st.floats(-5.0, 6.0)), draw(st.floats(-2.0, 0.5))
+        boxes.append([*center, *np.multiply(SIZES[like], stretch), draw(st.floats(-math.pi, 3.14))])
     return np.array(boxes, np.float32).reshape(-1, 7), np.array(labels, np.int64)
 
 
@@ -95,7 +95,7 @@ def test_equals_a_plain_loop_over_all_anchors(labelled: tuple[np.ndarray, np.nda
 
 
 def test_positives_by_hand_in_the_third_zone() -> None:
-    """A pedestrian on the centre of row 9, column 20: x = 7.12 + 8.5 * 0.16, y = -1.92 + 9.5 * 0.32.
+    """A pedestrian on the center of row 9, column 20: x = 7.12 + 8.5 * 0.16, y = -1.92 + 9.5 * 0.32.
 
     It has the anchor's size. The IoU of 0.8 x 0.6 with itself d further along x is (0.8 - d) / (0.8 + d): 0.667,
     0.429, 0.25 for d = 0.16, 0.32, 0.48. With the anchor turned by 90 degrees it shares s = min(0.6, 0.7 - d) * 0.6,
@@ -182,13 +182,13 @@ def test_the_better_box_gets_the_anchor() -> None:
 def test_boxes_outside_the_grid_change_nothing(x: float, y: float, label: int) -> None:
     """1.8 x 1.4 m: a car's anchor, 3.9 m long one way or the other, meets it within 2.85 m along x, 2.65 m along y.
 
-    The outermost centres are x = 2.32 and 9.60 m, y = -1.76 and 3.04 m.
+    The outermost centers are x = 2.32 and 9.60 m, y = -1.76 and 3.04 m.
     """
     assert not assign((label, [x, y, -1.0, 1.8, 1.4, 1.5, 0.0])).state.any()
 
 
 def test_a_box_across_the_border_is_found_from_inside() -> None:
-    """Its centre is 0.5 m before the grid; the nearest anchors, at 2.32 m, are those that overlap it most."""
+    """Its center is 0.5 m before the grid; the nearest anchors, at 2.32 m, are those that overlap it most."""
     targets = assign((CAR, [1.5, ANCHORS[6, 0, 0, 1], -1.0, 3.9, 1.6, 1.56, 0.0]))
     # (3.9 - 0.82) / (3.9 + 0.82) = 0.65, and 0.45 one cell further: (3.9 - 1.46) / 5.36 = 0.455. One row beside
     # it: 3.08 * 1.28 = 3.94 of 8.54 is 0.46.

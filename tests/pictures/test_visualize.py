@@ -6,11 +6,12 @@ import pytest
 
 from asca_pillars.data.kitti.calibration import Calibration
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_bev, draw_layers, draw_on_image, write_png
-from asca_pillars.pillars.grid import PillarGrid
 
-AHEAD = PillarGrid(x_range_m=(5.12, 25.6), y_range_m=(-10.24, 5.12), zones=1)
-AROUND = PillarGrid(x_range_m=(-10.24, 20.48), y_range_m=(-5.12, 10.24), zones=1)
+AHEAD = Ranges(x_m=(5.12, 25.6), y_m=(-10.24, 5.12), z_m=(-3.0, 1.0))
+AROUND = Ranges(x_m=(-10.24, 20.48), y_m=(-5.12, 10.24), z_m=(-3.0, 1.0))
+WHOLE = Ranges(x_m=(0.0, 69.12), y_m=(-39.68, 39.68), z_m=(-3.0, 1.0))
 NAMES = ("Car", "Pedestrian", "Cyclist")
 NO_POINTS = np.zeros((0, 4), np.float32)
 # The corners of AHEAD's range, so that nothing is cropped: 15.36 m wide, 20.48 m deep.
@@ -96,7 +97,7 @@ def test_the_legend_lists_every_class_of_the_detector():
     assert class_color("Car") != class_color("Truck") == class_color("Truck")
 
 
-@pytest.mark.parametrize("grid", [AHEAD, AROUND, PillarGrid()])
+@pytest.mark.parametrize("grid", [AHEAD, AROUND, WHOLE])
 @pytest.mark.parametrize(
     "found",
     [None, Detections.empty(NAMES), detections([500, 0, 0, 4, 2, 2, 0], [10, 1, 0, 0, 0, 0, 0])],
@@ -181,9 +182,8 @@ def test_the_first_layer_is_on_top():
 def test_every_layer_keeps_its_line_in_the_legend():
     """The texts of the rings keep clear of it: in this view one would stand on the fourth and fifth line."""
     layers = [BoxLayer(f"kind {number}", np.zeros((0, 7)), (10, 10, 10)) for number in range(8)]
-    grid = PillarGrid(x_range_m=(0, 69.12), y_range_m=(-39.68, 39.68), zones=1)
     corners = np.array([[x, y, 0, 0] for x in (0.1, 45) for y in (-1, 10)], np.float32)
-    image = draw_layers(corners, layers, grid)
+    image = draw_layers(corners, layers, WHOLE)
     for number in range(len(layers)):
         row = image[12 + 22 * number : 12 + 22 * (number + 1), 38:110]
         assert (row > 200).all(axis=-1).sum() > 40, number

@@ -80,21 +80,21 @@ def test_ranges_are_filled_exactly(grid: PillarGrid) -> None:
 def test_head_cells_are_two_equal_columns_wide(grid: PillarGrid) -> None:
     depths = np.diff(grid.x_edges_m).reshape(-1, HEAD_STRIDE)
     np.testing.assert_allclose(depths[:, 0], depths[:, 1])  # no zone border inside
-    x, y = grid.head_centres_m()
+    x, y = grid.head_centers_m()
     assert (len(y), len(x)) == grid.head_shape
     cells = np.arange(grid.nx * grid.ny).reshape(grid.ny, grid.nx)
-    centres = grid.cell_centres_m(cells.ravel()).reshape(*cells.shape, 2).astype(np.float64)
-    np.testing.assert_allclose(x, centres[0, :, 0].reshape(-1, 2).mean(axis=1), atol=1e-5)
-    np.testing.assert_allclose(y, centres[:, 0, 1].reshape(-1, 2).mean(axis=1), atol=1e-5)
+    centers = grid.cell_centers_m(cells.ravel()).reshape(*cells.shape, 2).astype(np.float64)
+    np.testing.assert_allclose(x, centers[0, :, 0].reshape(-1, 2).mean(axis=1), atol=1e-5)
+    np.testing.assert_allclose(y, centers[:, 0, 1].reshape(-1, 2).mean(axis=1), atol=1e-5)
 
 
 @given(grids())
-def test_a_pillars_centre_lies_in_the_pillar(grid: PillarGrid) -> None:
+def test_a_pillars_center_lies_in_the_pillar(grid: PillarGrid) -> None:
     cells = np.arange(grid.nx * grid.ny)
-    centres = grid.cell_centres_m(cells)
-    assert centres.dtype == np.float32
+    centers = grid.cell_centers_m(cells)
+    assert centers.dtype == np.float32
     z = np.full((len(cells), 1), -1.0, np.float32)
-    np.testing.assert_array_equal(grid.cells(np.hstack([centres, z])), cells)
+    np.testing.assert_array_equal(grid.cells(np.hstack([centers, z])), cells)
 
 
 def cells_twin(grid: PillarGrid, points: np.ndarray) -> list[int]:
@@ -151,7 +151,7 @@ def test_rows_run_along_y_and_columns_along_x() -> None:
 def test_cells_of_nothing() -> None:
     cells = SMALL.cells(np.empty((0, 4), np.float32))
     assert cells.shape == (0,) and cells.dtype == np.int64
-    assert SMALL.cell_centres_m(cells).shape == (0, 2)
+    assert SMALL.cell_centers_m(cells).shape == (0, 2)
 
 
 @pytest.mark.parametrize("shape", [(5,), (5, 2), (1, 5, 4)])

@@ -46,7 +46,7 @@ def assert_consistent(pillars: Pillars, points: np.ndarray, grid: PillarGrid) ->
     for pillar, cell in enumerate(pillars.cells):
         inside = features[pillars.pillar_index == pillar].astype(np.float64)
         np.testing.assert_allclose(inside[:, 4:7], inside[:, :3] - inside[:, :3].mean(axis=0), atol=1e-5)
-        np.testing.assert_allclose(inside[:, 7:], inside[:, :2] - grid.cell_centres_m(cell[None]), atol=1e-5)
+        np.testing.assert_allclose(inside[:, 7:], inside[:, :2] - grid.cell_centers_m(cell[None]), atol=1e-5)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 300), st.sampled_from([0.2, 2.0, 12.0]))
@@ -64,7 +64,7 @@ def test_equals_a_dictionary_of_lists(seed: int, count: int, spread_m: float) ->
 
 def test_features_by_hand() -> None:
     # x from 2 m in steps of 0.32 m, y from -3.2 m in steps of 0.16 m: both points are in column 1, row 2,
-    # whose centre is (2.48, -2.8); their mean is (2.5, -2.79, -1).
+    # whose center is (2.48, -2.8); their mean is (2.5, -2.79, -1).
     points = np.array([[2.4, -2.84, -1.5, 0.25], [2.6, -2.74, -0.5, 0.75]], np.float32)
     pillars = pillarize(points, GRID, PillarLimits())
     expected = [

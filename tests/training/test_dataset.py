@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig
+from asca_pillars.config import AugmentConfig, Config, DataConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.scans.scan_reader import write_scan
@@ -16,7 +16,7 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.training.dataset import Batch, KittiDataset, Sample
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
 
@@ -26,7 +26,7 @@ DONT_CARE = KittiObject("DontCare", -1, -1, -10, (500, 150, 540, 190), -1, -1, -
 
 def read(split: KittiSplit, config: Config, frame_id: str = "000000") -> LabeledFrame:
     data = config.data
-    names = config.detector.class_names
+    names = config.model.spec.class_names
     return read_frame(split, frame_id, names, camera_view=data.camera_view, min_points=data.min_points)
 
 
@@ -65,7 +65,7 @@ def test_types_that_are_classes_neighbors_and_others(tmp_path: Path) -> None:
 def test_labels_follow_the_classes_of_the_config(tmp_path: Path, classes: tuple[str, ...], expected: list[int]) -> None:
     split, _ = one_frame(tmp_path, ("Car", "Van", "Truck", "Pedestrian", "Person_sitting"))
     named = tuple(dataclasses.replace(SPEC.classes[0], name=name) for name in classes)
-    config = dataclasses.replace(CONFIG, detector=DetectorSpec(grid=GRID, classes=named))
+    config = dataclasses.replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=GRID, classes=named)))
     assert read(split, config).labels.tolist() == expected
 
 

@@ -13,13 +13,13 @@ import pytest
 import torch
 import yaml
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, TrainConfig
+from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, PillarModel, TrainConfig
 from asca_pillars.errors import TrainingError
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.loss import detection_loss
-from asca_pillars.models.pillar.pillar_detector import build_detector
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.schema import to_dict
 from asca_pillars.training.dataset import Batch, KittiDataset
 from asca_pillars.training.loop import DetectionModule, train
@@ -28,8 +28,7 @@ from tests.scenes import SPEC, write_dataset
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
 CONFIG = Config(
     name="tiny",
-    detector=SPEC,
-    network=NETWORK,
+    model=PillarModel(spec=SPEC, network=NETWORK),
     data=DataConfig(workers=0),
     train=TrainConfig(epochs=2, batch_size=2, learning_rate=1e-3, checkpoint_steps=1),
 )
@@ -38,16 +37,16 @@ CONFIG = Config(
 @pytest.mark.parametrize("cpa", ["none", "paper", "channel", "point"])
 def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: str) -> None:
     torch.manual_seed(0)
-    network = dataclasses.replace(NETWORK, cpa=cpa)
-    config = dataclasses.replace(CONFIG, network=network, data=DataConfig(train_set="val", workers=0))
+    model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa=cpa))
+    config = dataclasses.replace(CONFIG, model=model, data=DataConfig(train_set="val", workers=0))
     frames = KittiDataset(write_dataset(tmp_path, 2, val_frames=2), config, training=False)
     batch = Batch([frames[0, 0], frames[0, 1]])
     assert sum(len(boxes) for boxes in batch.boxes) == 8
-    detector = build_detector(config)
+    detector = build_pillar_detector(config.model)
     optimizer = torch.optim.Adam(detector.parameters(), lr=3e-3)
     for _ in range(150):
         optimizer.zero_grad()
-        detection_loss(detector(batch.pillars), batch.targets, config.loss).total.backward()
+        detection_loss(detector(batch.pillars), batch.targets, config.model.loss).total.backward()
         optimizer.step()
     tally = RecallTally(SPEC.class_names)
     # Running statistics of the normalization lag behind so few steps: judge with those of the batch.
@@ -99,7 +98,7 @@ def test_a_run_can_start_from_other_weights(tmp_path: Path) -> None:
         load_checkpoint(first).detector.named_parameters(), second.detector.parameters(), strict=True
     ):
         torch.testing.assert_close(found, expected, msg=name)
-    other = dataclasses.replace(CONFIG, network=dataclasses.replace(NETWORK, pillar_channels=8))
+    other = dataclasses.replace(CONFIG, model=PillarModel(network=dataclasses.replace(NETWORK, pillar_channels=8)))
     with pytest.raises(TrainingError, match="weights of another network"):
         train(other, data, tmp_path / "third", init=first)
 

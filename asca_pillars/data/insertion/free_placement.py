@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.frames import LabeledFrame, in_grid
+from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace
 from asca_pillars.data.insertion.gt_database import StoredObject
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import paired_bev_touch
-from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.geometry.ranges import Ranges
 
 PLACE_TRIES = 32  # places that are tried for one object
 CHECKED_PLACES = 4  # of those on free ground, looked at closely
@@ -127,17 +127,17 @@ def rays_entering(points: _Floats, boxes: _Floats) -> NDArray[np.bool_]:
     return Rays(points).entering(boxes)
 
 
-def is_clear(box: _Floats, obstacles: _Floats, grid: PillarGrid) -> bool:
-    """Whether a box (7,) stands over the grid and touches none of the others (K, 7)."""
+def is_clear(box: _Floats, obstacles: _Floats, ranges: Ranges) -> bool:
+    """Whether a box (7,) stands within the ranges and touches none of the others (K, 7)."""
     reach = (np.hypot(obstacles[:, 3], obstacles[:, 4]) + math.hypot(box[3], box[4])) / 2
     near = obstacles[np.hypot(obstacles[:, 0] - box[0], obstacles[:, 1] - box[1]) <= reach]
-    if not in_grid(box[None], grid)[0]:
+    if not ranges.hold_centers(box[None])[0]:
         return False
     return not paired_bev_touch(np.broadcast_to(box, near.shape).astype(np.float64), near.astype(np.float64)).any()
 
 
 def to_free_place(
-    item: StoredObject, space: FreeSpace, scene: Scene, grid: PillarGrid, rng: np.random.Generator
+    item: StoredObject, space: FreeSpace, scene: Scene, ranges: Ranges, rng: np.random.Generator
 ) -> StoredObject | None:
     """The object turned about the sensor's vertical axis to a free place, or None where none was found."""
     distance_m, azimuth_rad = math.hypot(*item.box[:2]), math.atan2(item.box[1], item.box[0])
@@ -156,7 +156,7 @@ def to_free_place(
     free = (place for place in possible if space.is_free(_placed(grid_points[4:], boxes[place, None])).all())
     for place in itertools.islice(free, CHECKED_PLACES):
         box = boxes[place].astype(np.float32)
-        if not is_clear(box, obstacles, grid):
+        if not is_clear(box, obstacles, ranges):
             continue
         box[2] = space.ground.heights(box[None, :2])[0] + box[5] / 2
         turned = _turned(item, box, float(azimuths[place]) - azimuth_rad)

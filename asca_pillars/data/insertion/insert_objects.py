@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import Config, InsertConfig
-from asca_pillars.data.frames import LabeledFrame, in_grid
+from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_maps import load_free_space
 from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
 from asca_pillars.data.insertion.free_space import FreeSpace
@@ -29,7 +29,7 @@ from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_data
 from asca_pillars.data.insertion.prepared import prepared_folder
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.errors import DatasetError
-from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.geometry.ranges import Ranges
 
 OBJECT_TRIES = 10  # objects of a class that are tried before one is given up
 
@@ -41,7 +41,7 @@ class Inserter:
     Attributes:
         split: the list.
         settings: how many, and by which method.
-        grid: objects are put where the detector looks.
+        ranges: objects are put where the detector looks.
         camera_view: whether frames are cut to what the camera sees.
         min_points: what loses so many points that fewer are left becomes IGNORED.
         prepared: folder of the free-space maps.
@@ -51,7 +51,7 @@ class Inserter:
 
     split: KittiSplit
     settings: InsertConfig
-    grid: PillarGrid
+    ranges: Ranges
     camera_view: bool
     min_points: int
     prepared: Path
@@ -75,17 +75,17 @@ def prepare_inserter(split: KittiSplit, config: Config) -> Inserter:
     Raises:
         DatasetError: a class is wanted of which no object may be inserted, or the database cannot be built.
     """
-    data, spec, insert = config.data, config.detector, config.augment.insert
+    data, spec, insert = config.data, config.model.spec, config.augment.insert
     prepared = prepared_folder(split.root, data)
     database = prepare_database(split, spec.class_names, prepared, camera_view=data.camera_view)
-    counted = (database.point_counts >= data.min_points) & in_grid(database.boxes, spec.grid)
+    counted = (database.point_counts >= data.min_points) & spec.ranges.hold_centers(database.boxes)
     counts = np.bincount(database.labels[counted], minlength=len(spec.class_names))
     wanted = np.array([insert.proportions.get(name, 0.0) for name in spec.class_names])
     if not insert.proportions:
         wanted[:] = 1.0
     shares = insertion_shares(counts / len(split.frame_ids), wanted, insert.objects)
     inserter = Inserter(
-        split, insert, spec.grid, data.camera_view, data.min_points, prepared, database, tuple(shares.tolist())
+        split, insert, spec.ranges, data.camera_view, data.min_points, prepared, database, tuple(shares.tolist())
     )
     for name, share, objects in zip(spec.class_names, shares, inserter.candidates, strict=True):
         if share > 0 and not len(objects):
@@ -135,9 +135,9 @@ def insert_objects(frame: LabeledFrame, inserter: Inserter, rng: np.random.Gener
         for _ in range(OBJECT_TRIES):
             item = inserter.database[int(rng.choice(inserter.candidates[label]))]
             if space is not None:
-                placed = to_free_place(item, space, scene, inserter.grid, rng)
+                placed = to_free_place(item, space, scene, inserter.ranges, rng)
             else:
-                placed = item if is_clear(item.box, scene.obstacles, inserter.grid) else None
+                placed = item if is_clear(item.box, scene.obstacles, inserter.ranges) else None
             if placed is not None:
                 scene.add(placed)
                 break

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 from asca_pillars.config import Config
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
 from asca_pillars.geometry.sensor_height import TOLERANCE_M
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 # From these shares on something is a mistake or costs recall; KITTI and the simulator stay well below all of them.
 BOXES_OUTSIDE = 0.05
@@ -48,7 +48,7 @@ def findings(inspection: Inspection, config: Config) -> list[Finding]:
     scans = inspection.scans
     found += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
     found += [Finding("warning", "height", text) for text in _of_height(inspection)]
-    found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, config.detector)]
+    found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, config.model.spec)]
     return found
 
 
@@ -60,8 +60,8 @@ def _why_none(facts: ClassFacts, inspection: Inspection, config: Config) -> str:
     if facts.few_points == facts.boxes:
         return f"all of its boxes have fewer points than data.min_points = {config.data.min_points}; lower it"
     if facts.missed == 0:
-        return f"its boxes with enough points lie outside the grid; {_widen(facts, config.detector)}"
-    return "the anchors stand too far apart to overlap its boxes; make detector.grid.v_max_m and v_y_m smaller"
+        return f"its boxes with enough points lie outside the grid; {_widen(facts, config.model.spec)}"
+    return "the anchors stand too far apart to overlap its boxes; make model.spec.grid.v_max_m and v_y_m smaller"
 
 
 def _why_no_boxes(name: str, inspection: Inspection) -> str:
@@ -77,7 +77,7 @@ def _why_no_boxes(name: str, inspection: Inspection) -> str:
 
 
 def _of_class(facts: ClassFacts, config: Config) -> Iterator[str]:
-    spec, boxes = config.detector, facts.boxes
+    spec, boxes = config.model.spec, facts.boxes
     if boxes < FEWEST_BOXES:
         number = "1 box" if boxes == 1 else f"{boxes} boxes"
         yield f"only {number}, too few to learn from or to compare with the anchors; inspect or add more frames"
@@ -94,7 +94,7 @@ def _of_class(facts: ClassFacts, config: Config) -> Iterator[str]:
         yield f"boxes lie outside the grid, {x} in x and {y} in y, and are left out; {_widen(facts, spec)}"
     if facts.cut_in_z > BOXES_CUT_IN_Z * boxes:
         share, z_range = _percent(facts.cut_in_z, boxes), list(spec.grid.z_range_m)
-        yield f"{share} of the boxes reach beyond detector.grid.z_range_m {z_range} and lose points; widen it"
+        yield f"{share} of the boxes reach beyond model.spec.grid.z_range_m {z_range} and lose points; widen it"
     if abs(facts.z_m - facts.anchor_z_m) > TOLERANCE_M:
         yield (
             f"the boxes' centers are at z = {facts.z_m:.2f} m on average, the anchor's at {facts.anchor_z_m:.2f} m; "
@@ -110,12 +110,12 @@ def _of_class(facts: ClassFacts, config: Config) -> Iterator[str]:
     if facts.missed > BOXES_MISSED * to_find:
         yield (
             f"{_percent(facts.missed, to_find)} of the objects have no positive anchor; "
-            "make detector.grid.v_max_m and v_y_m smaller, or look for labels that stand twice"
+            "make model.spec.grid.v_max_m and v_y_m smaller, or look for labels that stand twice"
         )
     if facts.forced > BOXES_FORCED * to_find >= facts.misfits:
         yield (
             f"{_percent(facts.forced, to_find)} of the objects have no anchor that overlaps them by positive_iou, only "
-            "the nearest; make detector.grid.v_max_m and v_y_m smaller, or lower positive_iou and negative_iou"
+            "the nearest; make model.spec.grid.v_max_m and v_y_m smaller, or lower positive_iou and negative_iou"
         )
 
 
@@ -167,7 +167,7 @@ def _of_height(inspection: Inspection) -> Iterator[str]:
         )
 
 
-def _of_points(scans: ScanFacts, frames: int, spec: DetectorSpec) -> Iterator[str]:
+def _of_points(scans: ScanFacts, frames: int, spec: PillarSpec) -> Iterator[str]:
     if scans.dropped_points:
         yield (
             f"points with a value that is not finite: {scans.dropped_points}, in {scans.scans_with_dropped} of "
@@ -195,12 +195,12 @@ def _of_points(scans: ScanFacts, frames: int, spec: DetectorSpec) -> Iterator[st
         )
 
 
-def _widen(facts: ClassFacts, spec: DetectorSpec) -> str:
+def _widen(facts: ClassFacts, spec: PillarSpec) -> str:
     """Where the boxes are, beside the range of x, of y or both that does not hold them."""
     assert facts.reach_m is not None, "there are boxes"
     ranges = (spec.grid.x_range_m, spec.grid.y_range_m)
     wrong = [
-        f"they reach from {axis} = {low:.1f} to {high:.1f} m: widen detector.grid.{axis}_range_m {list(span)}"
+        f"they reach from {axis} = {low:.1f} to {high:.1f} m: widen model.spec.grid.{axis}_range_m {list(span)}"
         for axis, (low, high), span, count in zip("xy", facts.reach_m, ranges, facts.outside_xyz, strict=False)
         if count
     ]

@@ -19,7 +19,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError, ScanError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
 class Spread(NamedTuple):
@@ -169,8 +169,8 @@ def inspect_dataset(
         frames_in_split=in_split,
         frames_without_objects=sum(not len(frame.boxes) for frame in measured),
         types=dict(types.most_common()),
-        classes=tuple(_class_facts(measured, index, config) for index in range(len(config.detector.classes))),
-        scans=_scan_facts([frame.scan for frame in measured], config.detector),
+        classes=tuple(_class_facts(measured, index, config) for index in range(len(config.model.spec.classes))),
+        scans=_scan_facts([frame.scan for frame in measured], config.model.spec),
         damaged=tuple(map(str, damaged)),
     )
 
@@ -186,7 +186,7 @@ def _require_files(split: KittiSplit) -> None:
 
 
 def _class_facts(frames: Sequence[FrameMeasure], index: int, config: Config) -> ClassFacts:
-    spec, grid = config.detector.classes[index], config.detector.grid
+    spec, grid = config.model.spec.classes[index], config.model.spec.grid
     own = np.concatenate([frame.labels for frame in frames]) == index
     boxes = np.concatenate([frame.boxes for frame in frames])[own].astype(np.float64)
     points = np.concatenate([frame.points for frame in frames])[own]
@@ -224,7 +224,7 @@ def _misfits(boxes: NDArray[np.float64], spec: ClassSpec) -> int:
     return int((aligned_bev_iou(anchor, in_place) < spec.positive_iou).sum())
 
 
-def _scan_facts(scans: Sequence[ScanMeasure], spec: DetectorSpec) -> ScanFacts:
+def _scan_facts(scans: Sequence[ScanMeasure], spec: PillarSpec) -> ScanFacts:
     column = dict(zip(ScanMeasure._fields, np.array(scans, dtype=np.float64).T, strict=True))
     points, inside, pillars = column["points"], column["inside"].sum(), column["pillars"]
     highest, ground = column["stored_reflectance_high"], column["ground_z_m"]

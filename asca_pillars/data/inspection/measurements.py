@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import Config
-from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
+from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import stored_points
 from asca_pillars.geometry.anchors import IGNORED
@@ -17,7 +17,7 @@ from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.geometry.sensor_height import ground_z_m
 from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
 class Fate(IntEnum):
@@ -76,7 +76,7 @@ def measure_frame(split: KittiSplit, frame_id: str, config: Config) -> FrameMeas
     Raises:
         DatasetError, ScanError: a damaged file, see `read_frame`.
     """
-    spec = config.detector
+    spec = config.model.spec
     # min_points=0: objects that training ignores for their few points are to be counted by class, too.
     frame = read_frame(split, frame_id, spec.class_names, camera_view=config.data.camera_view, min_points=0)
     points = points_in_boxes(frame.points, frame.boxes).sum(axis=0)
@@ -94,10 +94,10 @@ def measure_frame(split: KittiSplit, frame_id: str, config: Config) -> FrameMeas
     )
 
 
-def match(frame: LabeledFrame, spec: DetectorSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def match(frame: LabeledFrame, spec: PillarSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The `Fate` of each box (M,), and the number of positive anchors of each class (C,)."""
     # Rows in the place of the labels tell which boxes the grid holds.
-    kept = within_grid(replace(frame, labels=np.arange(len(frame.boxes))), spec.grid).labels
+    kept = within_ranges(replace(frame, labels=np.arange(len(frame.boxes))), spec.ranges).labels
     boxes, labels = frame.boxes[kept], frame.labels[kept]
     targets = assign_targets(spec.anchors, spec.classes, boxes, labels)
     anchors = spec.anchors.reshape(-1, 7)[targets.positives]
@@ -111,7 +111,7 @@ def match(frame: LabeledFrame, spec: DetectorSpec) -> tuple[NDArray[np.int64], N
     return fates, np.bincount(labels[targets.matched], minlength=len(spec.classes))
 
 
-def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: DetectorSpec) -> ScanMeasure:
+def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: PillarSpec) -> ScanMeasure:
     """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4)."""
     finite = stored[np.isfinite(stored).all(axis=1)]
     ground = ground_z_m(finite)

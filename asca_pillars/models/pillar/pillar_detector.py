@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.config import Config
+from asca_pillars.config import PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.encoder import PillarEncoder
 from asca_pillars.models.pillar.head import SSDHead
@@ -79,9 +79,9 @@ def batch_pillars(frames: Sequence[Pillars]) -> PillarBatch:
     )
 
 
-def build_detector(config: Config) -> PillarDetector:
-    """The network that `config` describes, with fresh random weights."""
-    network, spec = config.network, config.detector
+def build_pillar_detector(model: PillarModel) -> PillarDetector:
+    """The network that `model` describes, with fresh random weights."""
+    network, spec = model.network, model.spec
     neck = RPNNeck(network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels)
     return PillarDetector(
         grid=spec.grid,

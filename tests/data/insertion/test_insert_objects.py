@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from asca_pillars.commands.prepare import run
 from asca_pillars.config import Config, DataConfig, InsertConfig
 from asca_pillars.data.augment import augment
-from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
+from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_labels, write_labels
 from asca_pillars.data.scans.scan_reader import write_scan
@@ -190,7 +190,7 @@ def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -
     folder = tmp_path / "prepared"
     plain = dataclasses.replace(plain, data=dataclasses.replace(plain.data, prepared=str(folder)))
     rng = np.random.default_rng((plain.train.seed, 2, 4))
-    frame = within_grid(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid)
+    frame = within_ranges(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid.ranges)
     pillars = SPEC.pillarize(frame.points, rng)
     for settings_ in (plain, config("rs_aug", objects=0), config("gt_aug", objects=0)):
         sample = KittiDataset(root, settings_, training=True)[2, 4]

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from asca_pillars.commands.inspect import run
-from asca_pillars.config import Config, DataConfig
+from asca_pillars.config import Config, DataConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
@@ -54,7 +54,7 @@ def with_data(**changes: int | bool) -> Config:
 
 
 def with_detector(**changes: object) -> Config:
-    return dataclasses.replace(CONFIG, detector=dataclasses.replace(SPEC, **changes))
+    return dataclasses.replace(CONFIG, model=PillarModel(spec=dataclasses.replace(SPEC, **changes)))
 
 
 def with_grid(**changes: object) -> Config:
@@ -118,7 +118,8 @@ def test_points_of_a_box_by_a_plain_loop(clean: Path) -> None:
 
 def test_positives_are_those_of_the_training_loader(clean: Path) -> None:
     config = with_data(min_points=110)  # some objects are to be ignored
-    config = dataclasses.replace(config, detector=dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1)))
+    one_zone = dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1))
+    config = dataclasses.replace(config, model=PillarModel(spec=one_zone))
     samples = [KittiDataset(clean, config, training=False)[0, number] for number in range(FRAMES)]
     inspection = inspect_dataset(clean, config)
     for index, facts in enumerate(inspection.classes):
@@ -234,9 +235,17 @@ def test_scans_that_were_raised_without_their_labels(data: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "about", "message"),
     [
-        (with_grid(x_range_m=(4.8, 15.04)), "Car", r"\d+ % in x and 0 % in y, .* widen detector.grid.x_range_m \[4.8"),
-        (with_grid(y_range_m=(-1.28, 7.68)), "Car", r"0 % in x and \d+ % in y, .* widen detector.grid.y_range_m \[-1"),
-        (with_grid(z_range_m=(-1.0, 1.0)), "Car", r"100 % of the boxes reach beyond detector.grid.z_range_m \[-1"),
+        (
+            with_grid(x_range_m=(4.8, 15.04)),
+            "Car",
+            r"\d+ % in x and 0 % in y, .* model.spec.grid.x_range_m \[4.8",
+        ),
+        (
+            with_grid(y_range_m=(-1.28, 7.68)),
+            "Car",
+            r"0 % in x and \d+ % in y, .* model.spec.grid.y_range_m \[-1",
+        ),
+        (with_grid(z_range_m=(-1.0, 1.0)), "Car", r"100 % of the boxes reach beyond model.spec.grid.z_range_m \[-1"),
         (with_data(min_points=110), "Car", r"fewer points than data.min_points = 110 and are ignored; lower it"),
         (with_detector(limits=PillarLimits(500, 24)), "points", r"100 % of the scans have more pillars .* raise it to"),
         (with_detector(limits=PillarLimits(9000, 1)), "points", r"max_points = 1 takes away \d+ % of the points"),
@@ -260,7 +269,7 @@ def test_anchors_of_another_size(clean: Path) -> None:
 
 def test_anchors_too_far_apart(clean: Path) -> None:
     (warning, *_) = [item for item in found(clean, with_grid(v_max_m=1.28, v_y_m=1.76)) if item.about == "Pedestrian"]
-    assert "make detector.grid.v_max_m and v_y_m smaller" in warning.text
+    assert "make model.spec.grid.v_max_m and v_y_m smaller" in warning.text
 
 
 def test_points_that_are_not_numbers_and_scans_that_see_nothing(data: Path) -> None:
@@ -293,7 +302,7 @@ def refusal(root: Path, config: Config, tmp_path: Path) -> str:
         ("label_2", lambda text: text.replace("Cyclist", "cyclist"), CONFIG, r"spell it 'cyclist'; rename"),
         ("label_2", lambda text: "", CONFIG, r"\(there are: none at all\)"),
         ("label_2", lambda text: text, with_data(min_points=9999), r"data.min_points = 9999; lower it"),
-        ("label_2", lambda text: text, with_grid(x_range_m=(40, 60.48)), r"widen detector.grid.x_range_m \[40"),
+        ("label_2", lambda text: text, with_grid(x_range_m=(40, 60.48)), r"widen model.spec.grid.x_range_m \[40"),
         ("calib", lambda text: text.replace(f"{-0.08:.12e}", "9.0"), CONFIG, r"labels and calib must belong"),
     ],
 )

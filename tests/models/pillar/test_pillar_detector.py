@@ -1,24 +1,22 @@
 """The whole network: Table 1's shapes and sizes, and that a feature cell lies where its anchor stands."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import Config, NetworkConfig
+from asca_pillars.config import NetworkConfig, PillarModel
 from asca_pillars.models.pillar.neck import RPNNeck
-from asca_pillars.models.pillar.pillar_detector import PillarBatch, PillarDetector, batch_pillars, build_detector
+from asca_pillars.models.pillar.pillar_detector import PillarBatch, PillarDetector, batch_pillars, build_pillar_detector
 from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 # Rectangular, asymmetric, away from zero: a swapped axis or a forgotten minimum cannot hide.
-SPEC = DetectorSpec(grid=PillarGrid(x_range_m=(4.8, 20.16), y_range_m=(-7.68, 12.8), v_max_m=0.32, zones=3))
+SPEC = PillarSpec(grid=PillarGrid(x_range_m=(4.8, 20.16), y_range_m=(-7.68, 12.8), v_max_m=0.32, zones=3))
 
 
 def _detector(cpa: str = "channel") -> PillarDetector:
     torch.manual_seed(0)
-    return build_detector(Config(detector=SPEC, network=NetworkConfig(cpa=cpa))).eval()
+    return build_pillar_detector(PillarModel(spec=SPEC, network=NetworkConfig(cpa=cpa))).eval()
 
 
 def _points(count: int = 600, seed: int = 0) -> np.ndarray:
@@ -48,7 +46,7 @@ def test_neck_has_table_1s_widths_and_size() -> None:
 
 def test_whole_network_size() -> None:
     def count(network: NetworkConfig) -> int:
-        return sum(p.numel() for p in build_detector(Config(network=network)).parameters())
+        return sum(p.numel() for p in build_pillar_detector(PillarModel(network=network)).parameters())
 
     head = 384 * (6 + 42 + 12) + 60
     pfn = 9 * 64 + 128
@@ -101,7 +99,7 @@ def test_a_pillar_excites_the_feature_cell_whose_anchor_stands_over_it(row: int,
     found = np.unravel_index(int(answer.argmax()), answer.shape)
     assert found == (row, column)
     cells = np.array([2 * row * SPEC.grid.nx + 2 * column, (2 * row + 1) * SPEC.grid.nx + 2 * column + 1])
-    pillar_center = SPEC.grid.cell_centres_m(cells).mean(axis=0)
+    pillar_center = SPEC.grid.cell_centers_m(cells).mean(axis=0)
     np.testing.assert_allclose(SPEC.anchors[row, column, 0, :2], pillar_center, atol=1e-4)
 
 
@@ -114,8 +112,7 @@ def test_pillar_batch_moves_indices_by_the_pillars_before() -> None:
 
 
 def test_config_without_attention_and_with_one_zone_is_pointpillars() -> None:
-    spec = DetectorSpec(grid=PillarGrid(zones=1, v_max_m=0.16))
-    config = dataclasses.replace(Config(), detector=spec, network=NetworkConfig(cpa="none"))
-    detector = build_detector(config)
+    spec = PillarSpec(grid=PillarGrid(zones=1, v_max_m=0.16))
+    detector = build_pillar_detector(PillarModel(spec=spec, network=NetworkConfig(cpa="none")))
     assert (detector.grid.ny, detector.grid.nx) == (496, 432)
     assert detector.encode.pillar_attention is None and detector.encode.point_attention is None

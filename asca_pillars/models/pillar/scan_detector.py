@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.pillar.pillar_detector import PillarBatch, PillarDetector, batch_pillars
-from asca_pillars.pillars.spec import DetectorSpec
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
 class ScanDetector:
@@ -18,7 +18,7 @@ class ScanDetector:
         spec: grid, classes and thresholds that belong to the weights.
     """
 
-    def __init__(self, network: PillarDetector, spec: DetectorSpec) -> None:
+    def __init__(self, network: PillarDetector, spec: PillarSpec) -> None:
         self.network = network
         self.spec = spec
         self._device = next(network.parameters()).device

@@ -1,9 +1,10 @@
-"""One detector's numbers, all that training and the vehicle must agree on. `bundle.json` carries it."""
+"""What every family of detectors shares: where it looks, for which classes, and how its head maps become boxes."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,30 +13,35 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillarize import PillarLimits, Pillars, pillarize
+from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.schema import Strict
 
 
 @dataclass(frozen=True)
-class DetectorSpec:
-    """Grid, input limits, classes and post-processing; the defaults are the paper's values.
+class DetectorSpec(Strict, ABC):
+    """Classes and post-processing; each family adds the grid that its ranges and head cells come from.
 
     Raises:
         ConfigError: if there is no class or two have the same name.
     """
 
-    grid: PillarGrid = field(default_factory=PillarGrid)
-    limits: PillarLimits = field(default_factory=PillarLimits)
     classes: tuple[ClassSpec, ...] = KITTI_CLASSES
     post: PostProcess = field(default_factory=PostProcess)
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         if not self.classes:
             raise ConfigError("classes is empty: a detector needs at least one class")
         if len(set(self.class_names)) < len(self.classes):
             raise ConfigError(f"classes {', '.join(self.class_names)} must have different names")
+
+    @property
+    @abstractmethod
+    def ranges(self) -> Ranges:
+        """Where objects are looked for."""
+
+    @abstractmethod
+    def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
 
     @cached_property
     def class_names(self) -> tuple[str, ...]:
@@ -45,11 +51,11 @@ class DetectorSpec:
     @cached_property
     def anchors(self) -> NDArray[np.float32]:
         """(H, W, A, 7), see `make_anchors`. Read-only."""
-        anchors = make_anchors(self.grid, self.classes)
+        anchors = make_anchors(*self.head_centers_m(), self.classes)
         anchors.flags.writeable = False
         return anchors
 
-    def with_score_threshold(self, score: float | Mapping[str, float]) -> "DetectorSpec":
+    def with_score_threshold(self, score: float | Mapping[str, float]) -> Self:
         """The same detector that reports detections from `score` on: of every class, or of those named, by name.
 
         Raises:
@@ -64,10 +70,6 @@ class DetectorSpec:
                 replace(spec, score_threshold=scores.get(spec.name, spec.score_threshold)) for spec in self.classes
             ),
         )
-
-    def pillarize(self, points: NDArray[np.float32], rng: np.random.Generator | None = None) -> Pillars:
-        """Pillars of an (N, 4) scan on this detector's grid, see `pillarize`."""
-        return pillarize(points, self.grid, self.limits, rng)
 
     def decode(self, maps: HeadMaps[NDArray[np.float32]]) -> Detections:
         """Detections in this detector's head maps, see `decode`."""

@@ -1,4 +1,4 @@
-"""DetectorSpec: the numbers together, and the package's promise to need NumPy alone."""
+"""PillarSpec: the numbers together, and the package's promise to need NumPy alone."""
 
 import subprocess
 import sys
@@ -11,10 +11,10 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import KITTI_CLASSES, make_anchors
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import PillarLimits, pillarize
-from asca_pillars.pillars.spec import DetectorSpec
 
-SPEC = DetectorSpec(
+SPEC = PillarSpec(
     grid=PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5)),
     limits=PillarLimits(max_pillars=20, max_points=2),
     classes=KITTI_CLASSES[:2],
@@ -22,7 +22,7 @@ SPEC = DetectorSpec(
 
 
 def test_defaults_are_the_papers_values() -> None:
-    spec = DetectorSpec()
+    spec = PillarSpec()
     assert spec.class_names == ("Car", "Pedestrian", "Cyclist")
     assert (spec.limits.max_pillars, spec.limits.max_points) == (12000, 64)
     assert spec.anchors.shape == (248, 252, 6, 7)
@@ -50,16 +50,16 @@ def test_decode_uses_the_specs_anchors() -> None:
 
 def test_anchors_are_made_once_and_read_only() -> None:
     assert SPEC.anchors is SPEC.anchors
-    np.testing.assert_array_equal(SPEC.anchors, make_anchors(SPEC.grid, SPEC.classes))
+    np.testing.assert_array_equal(SPEC.anchors, make_anchors(*SPEC.head_centers_m(), SPEC.classes))
     with pytest.raises(ValueError, match="read-only"):
         SPEC.anchors[0] = 0
 
 
 def test_classes_must_exist_and_differ() -> None:
     with pytest.raises(ConfigError, match="at least one class"):
-        DetectorSpec(classes=())
+        PillarSpec(classes=())
     with pytest.raises(ConfigError, match="Car, Car"):
-        DetectorSpec(classes=(KITTI_CLASSES[0], KITTI_CLASSES[0]))
+        PillarSpec(classes=(KITTI_CLASSES[0], KITTI_CLASSES[0]))
 
 
 @pytest.mark.parametrize(
@@ -74,12 +74,12 @@ def test_classes_must_exist_and_differ() -> None:
 )
 def test_typos_are_refused_at_every_level(typo: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match="nexpected"):
-        TypeAdapter(DetectorSpec).validate_python(typo)
+        TypeAdapter(PillarSpec).validate_python(typo)
 
 
 def test_geometry_needs_numpy_alone() -> None:
     heavy = ["torch", "pydantic", "cv2", "onnxruntime", "scipy", "shapely", "numba"]
-    code = f"import sys, asca_pillars.pillars.spec; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, asca_pillars.pillars.pillar_spec; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_detector
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_pillar_detector
+from asca_pillars.models.pillar.scan_detector import ScanDetector
 from tests.scenes import make_scene
 from tests.training.test_loop import CONFIG
 
@@ -13,8 +13,8 @@ from tests.training.test_loop import CONFIG
 def test_scans_one_by_one_are_what_a_batch_of_them_gives() -> None:
     """And the second scan does not inherit the first."""
     torch.manual_seed(3)
-    network = build_detector(CONFIG).eval()
-    spec = CONFIG.detector.with_score_threshold(0.001)
+    network = build_pillar_detector(CONFIG.model).eval()
+    spec = CONFIG.model.spec.with_score_threshold(0.001)
     detect = ScanDetector(network, spec)
     scans = [make_scene(seed)[0] for seed in (1, 2)]
     with torch.inference_mode():
@@ -28,5 +28,5 @@ def test_scans_one_by_one_are_what_a_batch_of_them_gives() -> None:
 
 
 def test_a_scan_without_points_is_a_scan() -> None:
-    network = build_detector(CONFIG).eval()
-    assert len(ScanDetector(network, CONFIG.detector)(np.empty((0, 4), np.float32))) == 0
+    network = build_pillar_detector(CONFIG.model).eval()
+    assert len(ScanDetector(network, CONFIG.model.spec)(np.empty((0, 4), np.float32))) == 0
