@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from rich.console import Console
-from tests.evaluation.brute_force import Twin, brute_force
+from tests.evaluation.kitti.brute_force import Twin, brute_force
 
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, KittiResults, evaluate
 from asca_pillars.evaluation.kitti.objects import FrameObjects
