@@ -1,146 +1,84 @@
 """`asca detect`: scans in, tables, pictures and KITTI text out."""
 
-import json
-import logging
-import statistics
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
+import typer
 
-from asca_deploy import Detections, Detector, FrameReport, sample_scan_path
-from asca_deploy.auto import summary
-from asca_pillars.data.kitti import Calibration, objects_from_boxes, read_calibration, write_labels
-from asca_pillars.data.scans.scan_reader import find_scans, read_scan
-from asca_pillars.files import atomic_path
-from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
+from asca_pillars.commands.options import BundleOption, PrecisionOption, ProviderOption, ScansArgument, ThreadsOption
+from asca_pillars.errors import ScanError
 
 TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
 
 
-def run(
-    scans: Path | None,
-    out: Path,
-    bundle: Path | None,
-    score: float | None,
-    provider: str,
-    precision: str | None,
-    threads: int | None,
+def detect(
+    scans: ScansArgument = None,
+    *,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.")] = Path("detections"),
+    bundle: BundleOption = None,
+    score: Annotated[
+        float | None,
+        typer.Option("--score", help="Report detections from this score on. Default: the bundle's, per class."),
+    ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Draw a bird's-eye picture of each scan; without, faster.")
+    ] = True,
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
 ) -> None:
-    """See `asca detect --help`."""
+    """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
+
+    OUT/NAME.json holds the boxes of one scan in the LiDAR's frame, OUT/detections.jsonl those of the whole run, one line
+    per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image.
+
+    A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
+
+    Example: asca detect drive1/ drive2/ --out results --no-pictures
+    """
+    import logging
+    import sys
+
+    from rich.console import Console
+    from rich.progress import track
+
+    from asca_deploy import Detector, sample_scan_path
+    from asca_deploy.auto import summary
+    from asca_pillars.commands import detect_tables as show
+    from asca_pillars.commands.detect_files import ResultWriter
+    from asca_pillars.data.scans.find_scans import name_scans
+    from asca_pillars.data.scans.scan_reader import read_scan
+
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
-    paths = find_scans(sample_scan_path() if scans is None else scans)
+    named = name_scans(scans or [sample_scan_path()])
     detector = Detector(bundle, provider=provider, precision=precision, threads=threads, score_threshold=score)
     if detector.candidates:
         console.print(summary(detector.provider, detector.precision, detector.candidates), soft_wrap=True)
-    reports: list[FrameReport] = []
-    results: list[tuple[Path, Detections]] = []
-    for path in track(paths, "Detecting", console=console, disable=len(paths) == 1):
-        scan = read_scan(path)
-        detections = detector(scan.points)
-        reports.append(_report(detector))
-        results.append((path, detections))
-        _write(out, path, scan.points, detections, detector)
-    console.print(_table_of_boxes(*results[0]) if len(results) == 1 else _table_of_scans(results, reports))
-    for path, report in zip(paths, reports, strict=True):
-        for warning in report.warnings:
-            console.print(f"{path.name}: {warning}", style="yellow")
+    results: list[show.Result] = []
+    unreadable = 0
+    with ResultWriter(out, detector.spec.ranges, pictures=pictures) as write:
+        for path, name in track(named, "Detecting", console=console, disable=len(named) == 1):
+            try:
+                scan = read_scan(path)
+                detections = detector(scan.points)
+            except (ScanError, OSError) as error:
+                if len(named) == 1:
+                    raise
+                unreadable += 1
+                print(f"asca: {error}", file=sys.stderr)
+                continue
+            results.append(show.Result(path, detections.labels, detections.report))
+            write(path, name, scan, detections)
+    if not results:
+        raise ScanError(f"none of the {len(named)} scans can be read")
+    console.print(show.boxes(path, detections) if len(named) == 1 else show.scans(results, detector.spec.class_names))
+    for line in show.notes(results):
+        console.print(line, style="yellow", soft_wrap=True)
+    reports = [result.report for result in results]
     while len(reports) < TIMED_FRAMES:
-        detector(scan.points)
-        reports.append(_report(detector))
-    console.print(_timing(reports[1:], detector))
-    console.print(f"Pictures and results: {out}/")
-
-
-def _write(out: Path, path: Path, points: NDArray[np.float32], detections: Detections, detector: Detector) -> None:
-    """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
-    with atomic_path(out / f"{path.stem}.json") as temporary:
-        temporary.write_text(json.dumps(_to_json(path, detections, _report(detector)), indent=1), encoding="utf-8")
-    write_png(out / f"{path.stem}_bev.png", draw_bev(points, detections, detector.spec.ranges))
-    calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
-    if path.parent.name != "velodyne" or not calib_path.exists():
-        return
-    calibration = read_calibration(calib_path)
-    image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
-    image = cv2.imread(str(image_path)) if image_path.exists() else None
-    _write_kitti(out / f"{path.stem}.txt", detections, calibration, image)
-    if image is not None:
-        drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
-        write_png(out / f"{path.stem}_image.png", drawn)
-
-
-def _write_kitti(path: Path, detections: Detections, calibration: Calibration, image: Any) -> None:
-    """What the camera sees, as KITTI's tools want it: they know no boxes outside the image."""
-    size = {} if image is None else {"image_size_wh": (image.shape[1], image.shape[0])}
-    objects = objects_from_boxes(detections.boxes, detections.names, calibration, scores=detections.scores, **size)
-    write_labels(path, [item for item in objects if item.bbox[2] > item.bbox[0]])
-
-
-def _to_json(path: Path, detections: Detections, report: FrameReport) -> dict[str, Any]:
-    keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
-    boxes = [
-        {"class": name, "score": round(float(score), 4)}
-        | {key: round(float(value), 4) for key, value in zip(keys, box, strict=True)}
-        for name, score, box in zip(detections.names, detections.scores, detections.boxes, strict=True)
-    ]
-    counts = report.counts
-    return {
-        "scan": path.name,
-        "frame": "lidar: x forward, y left, z up; box centers; yaw counter-clockwise from x",
-        "boxes": boxes,
-        "points": counts.points,
-        "points_not_finite": report.non_finite_points,
-        "points_outside_range": counts.points_outside,
-        "points_over_limit": counts.points_over_limit,
-        "pillars": counts.pillars,
-        "pillars_over_limit": counts.pillars_over_limit,
-        "warnings": list(report.warnings),
-    }
-
-
-def _table_of_boxes(path: Path, detections: Detections) -> Table:
-    table = Table(title=f"{path.name}: {len(detections)} objects")
-    for column in ("class", "score", "distance", "size l x w x h", "heading"):
-        table.add_column(column, justify="left" if column == "class" else "right")
-    for index in np.argsort(detections.distances_m):
-        length, width, height, yaw = detections.boxes[index, 3:]
-        table.add_row(
-            detections.names[index],
-            f"{detections.scores[index]:.2f}",
-            f"{detections.distances_m[index]:.1f} m",
-            f"{length:.1f} x {width:.1f} x {height:.1f} m",
-            f"{np.rad2deg(yaw):+.0f}°",
-        )
-    return table
-
-
-def _table_of_scans(results: list[tuple[Path, Detections]], reports: list[FrameReport]) -> Table:
-    names = results[0][1].class_names
-    table = Table(title=f"{len(results)} scans")
-    for column in ("scan", "points", *names, "time"):
-        table.add_column(column, justify="left" if column == "scan" else "right")
-    for (path, detections), report in zip(results, reports, strict=True):
-        counts = [str((detections.labels == index).sum()) for index in range(len(names))]
-        table.add_row(path.name, str(report.counts.points), *counts, f"{report.total_ms:.0f} ms")
-    return table
-
-
-def _timing(reports: list[FrameReport], detector: Detector) -> str:
-    medians = {s: statistics.median(r.times_ms[s] for r in reports) for s in reports[0].times_ms}
-    total_ms = statistics.median(report.total_ms for report in reports)
-    stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
-    return (
-        f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan (median of {len(reports)} warm frames, "
-        f"{detector.provider} {detector.precision}, {detector.threads} threads): {stages} ms"
-    )
-
-
-def _report(detector: Detector) -> FrameReport:
-    assert detector.last_frame is not None, "the detector has run"
-    return detector.last_frame
+        reports.append(detector(scan.points).report)
+    console.print(show.timing(reports[1:], detector))
+    console.print(f"Results: {out}/")
+    if unreadable:
+        raise ScanError(f"{unreadable} of {len(named)} scans could not be read; they are named above")

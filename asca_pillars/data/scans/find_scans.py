@@ -1,0 +1,80 @@
+"""Which files are scans, and under which name the results of each are written."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from asca_pillars.errors import ScanError
+
+SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+
+
+class NamedScan(NamedTuple):
+    """A scan file, and a relative path without a suffix that no other scan of the same run has."""
+
+    path: Path
+    name: Path
+
+
+def find_scans(path: str | Path) -> list[Path]:
+    """The scan at `path`, or those in the folder at `path`, to any depth, in natural order (2.bin before 10.bin).
+
+    Hidden files and folders are left out.
+
+    Raises:
+        ScanError: there is no scan.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise ScanError(f"{path}: no such file or folder; check the path")
+    scans = [entry for entry in path.rglob("*") if _is_scan(entry.relative_to(path)) and entry.is_file()]
+    if not scans:
+        raise ScanError(f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}")
+    return sorted(scans, key=_natural_order)
+
+
+def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
+    """All scans at several paths, each once, with names for their results.
+
+    A name is the scan's path below the folder that was given, without its suffix. Scans that would share a name are put
+    below the name of the folder that was given (a/1.bin and b/1.bin), or keep their suffix (1.bin and 1.npy).
+
+    Raises:
+        ScanError: a path without scans, or two scans whose results would have the same name all the same.
+    """
+    found: dict[Path, tuple[Path, Path]] = {}  # resolved path -> (scan, the folder that was given)
+    for given in map(Path, paths):
+        for scan in find_scans(given):
+            found.setdefault(scan.resolve(), (scan, given.parent if given.is_file() else given))
+    scans = [scan for scan, _ in found.values()]
+    below = [scan.relative_to(root) for scan, root in found.values()]
+    rooted = [root.resolve().name / name for (_, root), name in zip(found.values(), below, strict=True)]
+    names = [name.with_suffix("") for name in below]
+    for others in ([name.with_suffix("") for name in rooted], below, rooted):
+        names = _where_shared(names, others)
+    for name, count in Counter(names).items():
+        if count > 1:
+            first, second, *_ = (scan for scan, own in zip(scans, names, strict=True) if own == name)
+            raise ScanError(f"{first} and {second}: their results would have one name, {name}; run them one by one")
+    return [NamedScan(scan, name) for scan, name in zip(scans, names, strict=True)]
+
+
+def _where_shared(names: Sequence[Path], others: Sequence[Path]) -> list[Path]:
+    """`names`, and in the place of each one that occurs twice its `others`."""
+    counts = Counter(names)
+    return [other if counts[name] > 1 else name for name, other in zip(names, others, strict=True)]
+
+
+def _is_scan(relative: Path) -> bool:
+    return relative.suffix.lower() in SCAN_SUFFIXES and not any(part.startswith(".") for part in relative.parts)
+
+
+def _natural_order(path: Path) -> list[list[tuple[int, str]]]:
+    return [
+        [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", part)]
+        for part in path.parts
+    ]
