@@ -1,13 +1,14 @@
 """The command `asca`: thin, and each command imports what it needs when it runs, so that --help is instant."""
 
+import io
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
 from asca_pillars import __version__
-from asca_pillars.errors import AscaError
+from asca_pillars.errors import AscaError, printable
 
 app = typer.Typer(
     help="LiDAR 3D detection: boxes from a point cloud on an ordinary CPU, and the pipeline that trains the model.",
@@ -37,15 +38,23 @@ Threads = Annotated[int | None, typer.Option(help="CPU threads. Default: the phy
 
 def main() -> None:
     """Run the command; what the user can mend is one line on stderr and exit code 2."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets `?` for `°`, not a traceback
     try:
         app()
     except AscaError as error:
-        print(f"asca: {error}", file=sys.stderr)
-        sys.exit(2)
+        _fail(str(error))
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"asca: {where}{error.strerror or error}", file=sys.stderr)
-        sys.exit(2)
+        _fail(f"{error.filename}: {error.strerror or error}" if error.filename else str(error.strerror or error))
+    except MemoryError as error:
+        _fail(f"not enough memory ({str(error) or 'no more is to be had'}); give it smaller input, or more memory")
+    except RecursionError:
+        _fail("the input is nested too deeply to be read; simplify the file or the option")
+
+
+def _fail(message: str) -> NoReturn:
+    print(f"asca: {printable(message)}", file=sys.stderr)
+    sys.exit(2)
 
 
 @app.callback(invoke_without_command=True)

@@ -14,6 +14,7 @@ import yaml
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import Strict, parse
+from asca_pillars.yaml_text import MAX_CHARACTERS, parse_yaml
 
 T = TypeVar("T")
 
@@ -240,7 +241,9 @@ def read_settings(type_: type[T], path: str | Path, overrides: Sequence[str], sh
     """
     path = shipped.get(str(path), Path(path))
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > 4 * MAX_CHARACTERS:  # a character has up to four bytes
+            raise ConfigError(f"{path}: {path.stat().st_size} bytes are too many for settings; give another file")
+        data = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); these ship: {', '.join(shipped)}") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date like 2026-99-99
@@ -278,6 +281,6 @@ def _apply(data: dict[str, Any], override: str) -> None:
         if not isinstance(data, dict):
             raise ConfigError(f"`{override}`: `{parent}` is a value, it has no keys")
     try:
-        data[leaf] = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError):
-        raise ConfigError(f"`{override}`: the value is not valid YAML") from None
+        data[leaf] = parse_yaml(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"`{override}`: the value is not valid YAML: {' '.join(str(error).split())}") from None

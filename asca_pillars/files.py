@@ -1,56 +1,254 @@
-"""Writing files so that a crash never leaves half of one under its final name."""
+"""Writing files so that a crash, a kill or a loss of power never leaves half of one under its final name.
+
+What is being written has a name of its own beside its target, `.NAME.asca-12345678.SUFFIX`, and is locked (`flock`)
+while its writer lives. What a killed writer left is therefore told from what another process writes just now, and the
+next process that writes into the same folder removes it.
+"""
 
 import contextlib
+import ctypes
+import errno
 import os
+import re
+import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+from asca_pillars.errors import OutputError
+
+try:
+    import fcntl
+except ImportError:  # Windows: nothing is locked, so that leftovers of a killed run stay
+    fcntl = None  # type: ignore[assignment]
+
+_TEMPORARY = re.compile(r"\.(?P<name>.+)\.asca-[0-9a-f]{8}(?P<retired>-old)?(?:\.[^.]*)?")
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_cleared: set[Path] = set()  # folders whose leftovers this process has looked for
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` that is renamed over it if the block succeeds, and removed if not.
 
-    The temporary name keeps the suffix of `path`, because several writers choose their format by it.
+    The temporary name keeps the suffix of `path`, because several writers choose their format by it. A link at `path`
+    stays one: the file that it leads to is replaced.
+
+    Raises:
+        OutputError: a folder or a device is at `path`.
+        OSError: names `path`, even where the system's own error names no file (a full disk).
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
+    target = _prepare(path)
+    if target.exists() and not target.is_file():
+        raise OutputError(f"{path}: is {'a folder' if target.is_dir() else 'no regular file'}; choose a file's name")
+    with _temporary(target, f".{target.stem}.asca-", target.suffix, folder=False) as temporary, _naming(path):
         yield temporary
-        temporary.chmod(0o666 & ~_umask())
+        _sync(temporary)
         temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+        _sync(target.parent)
 
 
 @contextlib.contextmanager
-def atomic_directory(path: str | Path) -> Iterator[Path]:
+def atomic_directory(path: str | Path, command: str, marker: str) -> Iterator[Path]:
     """Yield a temporary folder beside `path` that takes its place if the block succeeds, and is removed if not.
 
-    An existing folder at `path` stays whole until the new one is complete.
+    The block has to write `marker`, which names all other files of the folder. An existing folder at `path` stays whole
+    until the new one is complete, and the two change places in one step where the system can do that (Linux). Elsewhere
+    a kill between two renames leaves nothing at `path`; the next `recover` of the parent folder, which every write into
+    it starts with, puts the old folder back.
+
+    Raises:
+        OutputError: as `require_replaceable`.
+        OSError: names `path`, even where the system's own error names no file.
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    retired = temporary.with_name(temporary.name + "-old")
-    try:
+    target = _prepare(path)
+    require_replaceable(target, command, marker)
+    with _temporary(target, f".{target.name}.asca-", "", folder=True) as temporary, _naming(path):
         yield temporary
-        temporary.chmod(0o777 & ~_umask())
-        if target.exists():
-            target.replace(retired)
-        temporary.replace(target)
+        for folder, _, names in os.walk(temporary, topdown=False):
+            for name in names:
+                _sync(Path(folder, name))
+            _sync(Path(folder))
+        require_replaceable(target, command, marker)
+        if not target.exists():
+            temporary.replace(target)
+        elif not _exchange(temporary, target):
+            _replace_in_two_steps(temporary, target)
+        _sync(target.parent)
+
+
+def require_replaceable(folder: str | Path, command: str, marker: str) -> None:
+    """Make sure that nothing is lost if `command` replaces `folder` as a whole.
+
+    It may be absent, empty, or hold an earlier output of the same command: the file `marker` and files that are named
+    in its text, nothing else.
+
+    Raises:
+        OutputError: a file is there, or the folder holds something else; names it.
+    """
+    folder = Path(folder)
+    if not _entries(folder):
+        return
+    if not (folder / marker).is_file():
+        raise OutputError(
+            f"{folder}: holds {_entries(folder)[0].name} and no {marker}, so `{command}` did not write it; "
+            "choose another folder, or empty this one"
+        )
+    named = set(re.split(r"[\s\"'`()\[\]|,:]+", (folder / marker).read_text(encoding="utf-8", errors="replace")))
+    for entry in _entries(folder):
+        if entry.name != marker and not (entry.name in named and entry.is_file()):
+            raise OutputError(
+                f"{entry}: `{command}` did not write it and would delete it with the folder; move it elsewhere, "
+                "or choose another folder"
+            )
+
+
+def require_own(folder: str | Path, command: str, *markers: str, text: str = "") -> None:
+    """Make sure that `command` may write into `folder`: it is absent, empty, or holds one of the files `markers`.
+
+    Args:
+        folder: to be written into; what is in it and has other names stays.
+        command: for the message.
+        markers: files that the command writes, by their paths in the folder.
+        text: what a marker has to contain to be the command's own.
+
+    Raises:
+        OutputError: a file is there, or a folder of other files.
+    """
+    folder = Path(folder)
+    recover(folder.parent)
+    entries = _entries(folder)
+    for marker in markers:
+        path = folder / marker
+        if path.is_file() and text in path.read_text(encoding="utf-8", errors="replace"):
+            return
+    if entries:
+        raise OutputError(
+            f"{folder}: holds {entries[0].name} and nothing that `{command}` wrote; choose another folder, or empty it"
+        )
+
+
+def recover(folder: str | Path) -> None:
+    """Remove what killed writers left in `folder`; put back what one had moved aside and not replaced. Once a process.
+
+    What a living process writes just now is left alone, and so is everything that has not our temporary names.
+    """
+    folder = Path(os.path.realpath(folder))
+    if folder in _cleared or fcntl is None or not folder.is_dir():
+        return
+    _cleared.add(folder)
+    for path in sorted(folder.glob(".*.asca-*")):
+        match = _TEMPORARY.fullmatch(path.name)
+        if match is None or path.is_symlink():
+            continue
+        with contextlib.suppress(OSError), _locked(path, wait=False):
+            if not path.is_dir():
+                path.unlink()
+            elif match["retired"] and not (folder / match["name"]).exists():
+                path.replace(folder / match["name"])
+            else:
+                shutil.rmtree(path)
+
+
+def _prepare(path: str | Path) -> Path:
+    """The place that `path` leads to, in a folder that exists and holds nothing of killed writers."""
+    target = Path(os.path.realpath(path))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    recover(target.parent)
+    return target
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder, without what is being written just now; nothing if there is no folder."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file where a folder is to be written; choose another name")
+    return sorted(path for path in folder.glob("*") if not _TEMPORARY.fullmatch(path.name)) if folder.exists() else []
+
+
+@contextlib.contextmanager
+def _temporary(target: Path, prefix: str, suffix: str, *, folder: bool) -> Iterator[Path]:
+    """A new file or folder beside `target`, locked; removed at the end if it is still there."""
+    while True:
+        temporary = target.with_name(f"{prefix}{secrets.token_hex(4)}{suffix}")
+        # The kernel applies the umask: reading it from here would change it for all threads.
+        if folder:
+            temporary.mkdir()
+        else:
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(FileNotFoundError):  # taken for a leftover before it was locked
+                stack.enter_context(_locked(temporary))
+            if not temporary.exists():
+                continue
+            try:
+                yield temporary
+            finally:
+                # After an exchange this is the old folder.
+                shutil.rmtree(temporary, ignore_errors=True) if folder else temporary.unlink(missing_ok=True)
+            return
+
+
+@contextlib.contextmanager
+def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold the lock of a file or folder.
+
+    Raises:
+        OSError: another process holds it and `wait` is False, or there is nothing at `path`.
+    """
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with contextlib.suppress(*((OSError,) if wait else ())):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        yield
     finally:
-        if retired.exists() and not target.exists():
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Give the name of `path` to an error of the system that names no file, as those of a full disk do."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or isinstance(error, OutputError):
+            raise
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk and not only in memory."""
+    if path.is_dir() and fcntl is None:
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two folders change names in one step; False where the system or the file system cannot."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if os.name == "posix" else None
+    if rename is None:
+        return False
+    if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_RENAME_EXCHANGE)) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+        return False
+    raise OSError(code, os.strerror(code), str(other))
+
+
+def _replace_in_two_steps(temporary: Path, target: Path) -> None:
+    retired = temporary.with_name(f"{temporary.name}-old")
+    with _locked(target):
+        target.replace(retired)
+        try:
+            temporary.replace(target)
+        except OSError:
             retired.replace(target)
-        shutil.rmtree(temporary, ignore_errors=True)
-        shutil.rmtree(retired, ignore_errors=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+            raise
+    shutil.rmtree(retired, ignore_errors=True)

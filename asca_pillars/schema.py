@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import reprlib
 from typing import Any, ClassVar, TypeVar, get_args
 
 import pydantic
@@ -10,6 +11,8 @@ from asca_pillars.errors import ConfigError
 
 T = TypeVar("T")
 
+_QUOTE = reprlib.Repr()  # cuts: a value may be as long as its file
+_QUOTE.maxstring = _QUOTE.maxother = 80
 _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
 
 
@@ -59,7 +62,7 @@ def _explain(type_: type, error: Any) -> str:
         return f"unknown key `{key}`; {advice}"
     if error["type"] in ("missing", "missing_argument"):
         return f"missing key `{key}`"
-    return f"`{key}` = {error['input']!r}: {error['msg'][0].lower()}{error['msg'][1:]}"
+    return f"`{key}` = {_QUOTE.repr(error['input'])}: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
 def _type_at(type_: Any, location: list[Any]) -> Any:

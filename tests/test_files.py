@@ -1,12 +1,35 @@
 """Writing files: all or nothing."""
 
+import errno
 import os
+import signal
 import stat
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import pytest
 
-from asca_pillars.files import atomic_directory, atomic_path
+from asca_pillars import files
+from asca_pillars.errors import OutputError
+from asca_pillars.files import atomic_directory, atomic_path, recover, require_own, require_replaceable
+
+EXPORT = ("asca export", "bundle.json")
+linux = pytest.mark.skipif(sys.platform != "linux", reason="locks and renameat2")
+
+
+@pytest.fixture(autouse=True)
+def no_folder_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a new process, which looks for leftovers once."""
+    monkeypatch.setattr(files, "_cleared", set())
+
+
+def old_bundle(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "a.onnx").write_text("old")
+    (folder / "bundle.json").write_text('{"file": "a.onnx"}')
+    return folder
 
 
 def names(folder: Path) -> list[str]:
@@ -48,7 +71,7 @@ def test_permissions_follow_the_umask(tmp_path: Path) -> None:
     try:
         with atomic_path(tmp_path / "file") as temporary:
             temporary.write_text("")
-        with atomic_directory(tmp_path / "folder"):
+        with atomic_directory(tmp_path / "folder", *EXPORT):
             pass
     finally:
         os.umask(previous)
@@ -58,7 +81,7 @@ def test_permissions_follow_the_umask(tmp_path: Path) -> None:
 
 def test_a_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
     target = tmp_path / "models" / "bundle"
-    with atomic_directory(target) as temporary:
+    with atomic_directory(target, *EXPORT) as temporary:
         (temporary / "a.onnx").write_text("a")
         assert not target.exists()
     assert names(target) == ["a.onnx"]
@@ -66,33 +89,40 @@ def test_a_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
-    target = tmp_path / "bundle"
-    target.mkdir()
-    (target / "stale.onnx").write_text("old")
-    with atomic_directory(target) as temporary:
+    target = old_bundle(tmp_path / "bundle")
+    with atomic_directory(target, *EXPORT) as temporary:
         (temporary / "fresh.onnx").write_text("new")
-        assert names(target) == ["stale.onnx"]
+        assert names(target) == ["a.onnx", "bundle.json"]
     assert names(target) == ["fresh.onnx"]
     assert names(tmp_path) == ["bundle"]
 
 
 def test_a_failed_folder_leaves_the_old_one(tmp_path: Path) -> None:
-    target = tmp_path / "bundle"
-    target.mkdir()
-    (target / "whole.onnx").write_text("old")
-    with pytest.raises(RuntimeError, match="halfway"), atomic_directory(target) as temporary:
+    target = old_bundle(tmp_path / "bundle")
+    with pytest.raises(RuntimeError, match="halfway"), atomic_directory(target, *EXPORT) as temporary:
         (temporary / "half.onnx").write_text("new")
         raise RuntimeError("halfway")
-    assert names(target) == ["whole.onnx"]
+    assert names(target) == ["a.onnx", "bundle.json"]
     assert names(tmp_path) == ["bundle"]
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_folder_is_replaced_with_and_without_an_exchange(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool
+) -> None:
+    if not exchange:
+        monkeypatch.setattr(files, "_exchange", lambda *_: False)
+    target = old_bundle(tmp_path / "bundle")
+    with atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "bundle.json").write_text("new")
+    assert names(tmp_path) == ["bundle"]
+    assert names(target) == ["bundle.json"]
 
 
 def test_the_old_folder_returns_if_the_new_one_cannot_take_its_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target = tmp_path / "bundle"
-    target.mkdir()
-    (target / "whole.onnx").write_text("old")
+    target = old_bundle(tmp_path / "bundle")
     replace = os.replace
 
     def refuse_the_new_one(source: Path, destination: Path) -> None:
@@ -100,8 +130,171 @@ def test_the_old_folder_returns_if_the_new_one_cannot_take_its_place(
             raise OSError("no")
         replace(source, destination)
 
+    monkeypatch.setattr(files, "_exchange", lambda *_: False)
     monkeypatch.setattr(os, "replace", refuse_the_new_one)
-    with pytest.raises(OSError, match="no"), atomic_directory(target) as temporary:
+    with pytest.raises(OSError, match="no"), atomic_directory(target, *EXPORT) as temporary:
         (temporary / "fresh.onnx").write_text("new")
-    assert names(target) == ["whole.onnx"]
+    assert names(target) == ["a.onnx", "bundle.json"]
     assert names(tmp_path) == ["bundle"]
+
+
+# --- what is not ours
+
+
+def test_a_folder_of_other_files_is_not_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "thesis"
+    target.mkdir()
+    require_replaceable(target, *EXPORT)
+    require_replaceable(tmp_path / "absent", *EXPORT)
+    (target / "thesis.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"thesis.txt and no bundle.json"), atomic_directory(target, *EXPORT):
+        raise AssertionError("not reached")
+    assert (target / "thesis.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize("foreign", ["notes.txt", ".hidden", "b.onnx", "folder/"])
+def test_an_earlier_output_with_a_foreign_file_is_not_replaced(tmp_path: Path, foreign: str) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    require_replaceable(target, *EXPORT)
+    (target / foreign).mkdir() if foreign.endswith("/") else (target / foreign).write_text("precious")
+    with pytest.raises(OutputError, match=f"{foreign.rstrip('/')}: `asca export` did not write it"):
+        require_replaceable(target, *EXPORT)
+
+
+def test_a_foreign_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    with pytest.raises(OutputError, match="notes"), atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "bundle.json").write_text("new")
+        (target / "notes").write_text("precious")
+    assert names(target) == ["a.onnx", "bundle.json", "notes"]
+    assert names(tmp_path) == ["bundle"]
+
+
+def test_what_is_no_folder_and_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("precious")
+    for check in (lambda: require_replaceable(tmp_path / "file", *EXPORT), lambda: require_own(tmp_path / "file", "c")):
+        with pytest.raises(OutputError, match="is a file where a folder"):
+            check()
+    with pytest.raises(OutputError, match="is a folder"), atomic_path(tmp_path):
+        raise AssertionError("not reached")
+    with pytest.raises(OutputError, match="no regular file"), atomic_path("/dev/null"):
+        raise AssertionError("not reached")
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+def test_a_folder_to_write_into_is_empty_or_ones_own(tmp_path: Path) -> None:
+    require_own(tmp_path / "absent", "asca simulate", "simulation.json")
+    require_own(tmp_path, "asca simulate", "simulation.json")
+    (tmp_path / "simulation.json").write_text("{}")
+    require_own(tmp_path, "asca simulate", "simulation.json")
+    with pytest.raises(OutputError, match="nothing that `asca simulate` wrote"):
+        require_own(tmp_path, "asca simulate", "simulation.json", text='"seed"')
+
+
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real").write_text("old")
+    (tmp_path / "link").symlink_to("real")
+    with atomic_path(tmp_path / "link") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real").read_text() == "new"
+
+
+# --- killed writers
+
+KILLED = """
+import os, signal, sys
+from asca_pillars import files
+from asca_pillars.files import atomic_directory, atomic_path
+place, kind = sys.argv[1:]
+if kind == "file":
+    with atomic_path(place + "/last.ckpt") as temporary:
+        temporary.write_text("half")
+        os.kill(os.getpid(), signal.SIGKILL)
+if kind == "two steps":
+    files._exchange = lambda *_: False
+    replace = os.replace
+    def kill_before_the_second(source, target):
+        if os.path.basename(target) == "bundle":
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(source, target)
+    os.replace = kill_before_the_second
+with atomic_directory(place + "/bundle", "asca export", "bundle.json") as temporary:
+    (temporary / "bundle.json").write_text("new")
+    if kind == "folder":
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@linux
+@pytest.mark.parametrize("kind", ["file", "folder", "two steps"])
+def test_the_next_run_clears_up_after_a_killed_one(tmp_path: Path, kind: str) -> None:
+    old_bundle(tmp_path / "bundle")
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), kind], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert (tmp_path / "bundle").exists() == (kind != "two steps")
+    assert len(names(tmp_path)) == 2
+    with atomic_path(tmp_path / "other.txt") as temporary:
+        temporary.write_text("next")
+    assert names(tmp_path) == ["bundle", "other.txt"]
+    assert (tmp_path / "bundle" / "a.onnx").read_text() == "old"
+
+
+@linux
+def test_what_is_being_written_is_no_leftover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / ".notes.asca-1234567.txt").write_text("a name of somebody else")
+    with atomic_path(tmp_path / "a.txt") as one, atomic_directory(tmp_path / "b", *EXPORT) as two:
+        one.write_text("half")
+        files._cleared.clear()
+        recover(tmp_path)
+        assert one.exists() and two.exists()
+    assert names(tmp_path) == [".notes.asca-1234567.txt", "a.txt", "b"]
+
+
+# --- the system's errors, the disk, other threads
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EFBIG])
+def test_a_full_disk_names_the_file(tmp_path: Path, code: int) -> None:
+    for writing in (atomic_path(tmp_path / "a.ckpt"), atomic_directory(tmp_path / "a.ckpt", *EXPORT)):
+        with pytest.raises(OSError, match=r"a\.ckpt") as caught, writing:
+            raise OSError(code, os.strerror(code))
+        assert (caught.value.errno, caught.value.filename) == (code, str(tmp_path / "a.ckpt"))
+    assert names(tmp_path) == []
+
+
+@linux
+def test_files_and_folders_are_synced_before_they_get_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(str(Path(f"/proc/self/fd/{handle}").readlink())))
+    with atomic_path(tmp_path / "a.txt") as file:
+        assert synced == []
+    with atomic_directory(tmp_path / "b", *EXPORT) as folder:
+        (folder / "bundle.json").write_text("{}")
+    wanted = [file, tmp_path, folder / "bundle.json", folder, tmp_path]
+    assert synced == [str(path) for path in wanted]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
+def test_other_threads_keep_their_umask(tmp_path: Path) -> None:
+    previous, stop, modes = os.umask(0o077), threading.Event(), set()
+
+    def create() -> None:
+        for number in range(3000):
+            handle = os.open(tmp_path / f"{number}", os.O_CREAT | os.O_WRONLY, 0o666)
+            modes.add(stat.S_IMODE(os.fstat(handle).st_mode))
+            os.close(handle)
+        stop.set()
+
+    thread = threading.Thread(target=create)
+    try:
+        thread.start()
+        while not stop.is_set():
+            with atomic_path(tmp_path / "file"):
+                pass
+        thread.join()
+    finally:
+        os.umask(previous)
+    assert modes == {0o600}

@@ -17,7 +17,7 @@ from asca_pillars.commands import prepare
 from asca_pillars.commands.extras import require
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.files import atomic_path
+from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict
 from asca_pillars.system import command_line, cpu_model, default_threads, package_versions
 
@@ -47,6 +47,7 @@ def run(config: str, data: Path, out: Path, overrides: list[str], seeds: str, va
 
 def _claim(out: Path, base: dict[str, Any]) -> None:
     """Note what all runs in `out` have in common, or refuse to mix them with runs on another base."""
+    require_own(out, "asca ablate", "ablation.json", text='"config"')
     path = out / "ablation.json"
     if not path.exists():
         with atomic_path(path) as temporary:

@@ -2,8 +2,6 @@
 
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ from rich.console import Console
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.errors import ConfigError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
@@ -21,14 +19,14 @@ from asca_pillars.evaluation.kitti.verdicts import verdicts
 from asca_pillars.evaluation.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
-from asca_pillars.files import atomic_directory, atomic_path
+from asca_pillars.files import atomic_directory, atomic_path, require_own, require_replaceable
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.system import describe_environment
 
 TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
 GALLERY = 8
-MADE_BY = "made_by.json"  # marks a folder of predictions as ours to replace
+COMMAND, MADE_BY = "asca eval", "made_by.json"  # the file marks a folder of predictions as ours to replace
 
 
 @dataclass(frozen=True)
@@ -62,6 +60,9 @@ def run(
     """See `asca eval --help`."""
     console = Console(markup=False)
     _check_arguments(model, data, predictions, labels, gallery_frames, score)
+    require_own(out, COMMAND, "report.json", f"predictions/{MADE_BY}", text='"')
+    for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
+        require_replaceable(out / folder, COMMAND, marker)
     split = None if data is None else KittiSplit(data, split_name)
     if labels is None:
         assert split is not None, "checked with the arguments"
@@ -126,9 +127,9 @@ def _run_model(
 ) -> Task:
     """Write the model's predictions to `out`: what is scored is read from there, so that it can be scored again."""
     about = {"model": model.about, "data": str(split.root), "split": split.name}
-    with _replacing(out / "predictions", MADE_BY) as folder:
+    with atomic_directory(out / "predictions", COMMAND, MADE_BY) as folder:
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
-        _write_json(folder / MADE_BY, about)
+        _write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
     if model.unlike:
         console.print(
             f"{len(model.unlike)} of {len(split.frame_ids)} scans are unlike those that {model.name} was trained on; "
@@ -167,17 +168,8 @@ def _draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None
     judged = verdicts(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
     worst = gallery.worst_frames(judged, count)
     folders = task.split, task.labels, task.predictions
-    with _replacing(out / "gallery", gallery.INDEX) as folder:
+    with atomic_directory(out / "gallery", COMMAND, gallery.INDEX) as folder:
         gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)
-
-
-@contextmanager
-def _replacing(folder: Path, marker: str) -> Iterator[Path]:
-    """A temporary folder that takes the place of `folder`, unless there is one that an evaluation did not write."""
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / marker).is_file():
-        raise DatasetError(f"{folder}: holds files that `asca eval` did not write; choose another --out, or move them")
-    with atomic_directory(folder) as temporary:
-        yield temporary
 
 
 def _write_json(path: Path, content: Any) -> None:

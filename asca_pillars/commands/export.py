@@ -11,10 +11,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from asca_deploy.bundle import Quantization
+from asca_deploy.bundle import MANIFEST, Quantization
 from asca_pillars.commands.extras import require
 from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.errors import ConfigError
+from asca_pillars.files import require_replaceable
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
 CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
@@ -37,6 +38,7 @@ def run(
     from asca_pillars.models.checkpoint import load_checkpoint
 
     console = Console(markup=False)
+    require_replaceable(out, "asca export", MANIFEST)  # before minutes of work
     loaded = load_checkpoint(checkpoint)
     spec = loaded.config.model.spec.with_score_threshold(dict(_score(text) for text in scores))
     loaded = loaded._replace(config=replace(loaded.config, model=replace(loaded.config.model, spec=spec)))

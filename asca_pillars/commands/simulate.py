@@ -5,6 +5,7 @@ from pathlib import Path
 from rich.console import Console
 
 from asca_pillars.commands.extras import require
+from asca_pillars.files import require_own
 
 FRAMES = 100
 
@@ -30,6 +31,7 @@ def run(
     config = load_simulation_config(config_path, view)
     if frames is not None or not (report and any((out / "training" / "velodyne").glob("*.bin"))):
         frames = frames or FRAMES
+        require_own(out, "asca simulate", "simulation.json", text='"seed"')
         simulate(out, frames, seed, workers, config, val_share)
         console.print(f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin")
     if report:
@@ -44,10 +46,11 @@ def _report(out: Path, console: Console) -> None:
     from asca_pillars.sim.report.reference import kitti_reference
     from asca_pillars.sim.report.tables import print_comparison, write_report
 
+    folder = out / "report"
+    require_own(folder, "asca simulate --report", "report.json", "reflectance.png")
     reference = kitti_reference()
     measured = measure(out)
     comparison = compare(measured, reference.statistics)
     print_comparison(comparison, console)
-    folder = out / "report"
     write_report(folder, comparison, write_plots(folder, comparison, measured, reference.sensor))
     console.print(f"All rows and plots: {folder}/report.md; all numbers: {folder}/report.json", soft_wrap=True)

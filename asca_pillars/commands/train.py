@@ -5,6 +5,7 @@ from pathlib import Path
 from rich.console import Console
 
 from asca_pillars.commands.extras import require
+from asca_pillars.files import require_own
 
 
 def run(
@@ -15,6 +16,7 @@ def run(
 
     settings = load_config(config, overrides)
     require("train")
+    require_own(out, "asca train", "config.yaml", "environment.json", "train.log")  # the log is that of `asca ablate`
     from asca_pillars.training.loop import train
 
     last = train(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,10 @@ from asca_pillars.geometry.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.schema import Strict
 
 
 @dataclass(frozen=True)
-class DetectorSpec(Strict, ABC):
+class DetectorSpec(ABC):
     """Classes and post-processing; each family adds the grid that its ranges and head cells come from.
 
     Raises:
@@ -27,6 +26,8 @@ class DetectorSpec(Strict, ABC):
 
     classes: tuple[ClassSpec, ...] = KITTI_CLASSES
     post: PostProcess = field(default_factory=PostProcess)
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         if not self.classes:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import (
     BACKBONE,
     ENCODER,
+    MANIFEST,
     SCHEMA_VERSION,
     Bundle,
     Graphs,
@@ -66,7 +67,7 @@ def export_bundle(
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector, steps = checkpoint
     say("Exporting and proving parity")
-    with atomic_directory(out) as folder:
+    with atomic_directory(out, "asca export", MANIFEST) as folder:
         graphs.export_encoder(detector, folder / ENCODER)
         graphs.export_backbone(FastBackbone(detector), detector.grid, folder / BACKBONE)
         essentials = {

@@ -214,7 +214,7 @@ def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Pat
     theirs = tmp_path / "out" / "predictions"
     shutil.copytree(texts["predictions"], theirs)
     assert refusal(tmp_path, data=root) == (
-        "out/predictions: holds files that `asca eval` did not write; choose another --out, or move them"
+        "out: holds predictions and nothing that `asca eval` wrote; choose another folder, or empty it"
     )
     assert len(list(theirs.glob("*.txt"))) == 3
 

@@ -20,7 +20,7 @@ from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.training.dataset import Batch, KittiDataset, Sample
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
 
-CONFIG = Config(detector=SPEC, data=DataConfig(train_set="train", val_set="val", workers=0))
+CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(train_set="train", val_set="val", workers=0))
 DONT_CARE = KittiObject("DontCare", -1, -1, -10, (500, 150, 540, 190), -1, -1, -1, -1000, -1000, -1000, -10)
 
 
@@ -165,7 +165,7 @@ def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
     still = AugmentConfig(
         flip_probability=0.0, rotation_rad=0.0, scale=(1.0, 1.0), object_rotation_rad=0.0, object_shift_m=0.0
     )
-    config = dataclasses.replace(CONFIG, detector=tight, augment=still)
+    config = dataclasses.replace(CONFIG, model=PillarModel(spec=tight), augment=still)
     frames = KittiDataset(write_dataset(tmp_path, 2), config, training=True)
     first, second = frames[0, 0], frames[1, 0]
     assert np.array_equal(first.frame.points, second.frame.points)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from asca_pillars.config import DataConfig
 from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path
+from asca_pillars.files import atomic_path, require_own
 
 _NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
 
@@ -21,7 +21,9 @@ def require_writable(folder: Path) -> None:
 
     Raises:
         DatasetError: it cannot be written.
+        OutputError: it holds other files.
     """
+    require_own(folder, "asca prepare", "README.txt", text=_NOTE)
     with writing(folder / "README.txt") as temporary:
         temporary.write_text(_NOTE, encoding="utf-8")
 

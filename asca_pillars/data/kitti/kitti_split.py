@@ -18,6 +18,8 @@ from asca_pillars.data.kitti.kitti_labels import KittiObject, read_labels
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 
+_PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # the signature, then length and name of the first chunk
+
 
 @dataclass(frozen=True)
 class KittiSplit:
@@ -83,14 +85,24 @@ class KittiSplit:
         return read_labels(self.label_path(frame_id))
 
     def image_size_wh(self, frame_id: str) -> tuple[int, int]:
-        """Width and height of the frame's image in pixels; KITTI's commonest size where there is no image."""
+        """Width and height of the frame's image in pixels; KITTI's commonest size where there is no image.
+
+        Raises:
+            DatasetError: there is one, and it is no PNG: labels would be cropped by a random size.
+        """
+        path = self.image_path(frame_id)
         try:
-            with self.image_path(frame_id).open("rb") as file:
-                # PNG: 8 bytes of signature, length and name of the first chunk, then width and height.
-                width, height = struct.unpack(">16x2I", file.read(24))
-        except (OSError, struct.error):
+            with path.open("rb") as file:
+                start = file.read(24)
+        except FileNotFoundError:
             return DEFAULT_IMAGE_SIZE_WH
-        return width, height
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be read ({error.strerror}); replace or remove it") from None
+        if len(start) < 24 or not start.startswith(_PNG) or min(size := struct.unpack(">2I", start[16:])) == 0:
+            raise DatasetError(
+                f"{path}: no PNG, or a damaged one; replace it, or remove it: without images KITTI's size is taken"
+            )
+        return size[0], size[1]
 
 
 def write_image_set(root: str | Path, name: str, frame_ids: Iterable[str]) -> None:
@@ -103,6 +115,8 @@ def _read_image_set(root: Path, name: str) -> set[str]:
     path = root / "ImageSets" / f"{name}.txt"
     try:
         frame_ids = set(path.read_text(encoding="utf-8").split())
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path}: not UTF-8 text; write one frame id per line") from None
     except OSError as error:
         there = ", ".join(sorted(p.stem for p in path.parent.glob("*.txt"))) or "none"
         raise DatasetError(

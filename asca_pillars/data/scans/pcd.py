@@ -1,13 +1,19 @@
 """The Point Cloud Library's PCD format, version 0.7: ascii, binary and binary_compressed."""
 
-import math
 import struct
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from asca_pillars.data.scans.records import AGAIN, Field, points_from_bytes, points_from_text, whole_number
+from asca_pillars.data.scans.records import (
+    AGAIN,
+    MAX_HEADER_BYTES,
+    Field,
+    StoredPoints,
+    points_from_bytes,
+    points_from_text,
+    whole_number,
+)
 from asca_pillars.errors import ScanError
 
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -16,25 +22,33 @@ _TYPES = {
 }
 
 
-def read_pcd(path: Path) -> NDArray[np.float32]:
-    """Points (N, 4) of a PCD file in its own frame: VIEWPOINT is where the sensor stood, and is not applied.
+def read_pcd(path: Path) -> StoredPoints:
+    """The points of a PCD file in its own frame: VIEWPOINT is where the sensor stood, and is not applied.
 
     Raises:
-        ScanError: the header is not PCD's, lacks x, y or z, or the body is damaged.
+        ScanError: the header is not PCD's, contradicts itself, lacks x, y or z, or the body is damaged or not of
+            the length that the header states.
     """
     data = path.read_bytes()
     header, body = _split_header(path, data)
     fields = _fields(path, header)
     count = _point_count(path, header)
-    if count == 0:
-        return points_from_bytes(str(path), b"", fields, 0)
     encoding = " ".join(header["DATA"]).lower()
+    size = sum(field.size_bytes for field in fields)
     if encoding == "ascii":
-        return points_from_text(str(path), body.split(), fields, count)
+        lines = [line for line in body.splitlines() if line.strip()]
+        if len(lines) > count:
+            raise ScanError(f"{path}: {len(lines)} lines where the header states {count} points; correct the header")
+        return points_from_text(str(path), lines, fields, count)
     if encoding == "binary":
+        if size and len(body) >= (count + 1) * size:
+            raise ScanError(
+                f"{path}: {len(body)} bytes where the header states {count} points of {size}; correct the header"
+            )
         return points_from_bytes(str(path), body, fields, count)
     if encoding == "binary_compressed":
-        return points_from_bytes(str(path), _decompress(path, body), fields, count, by_field=True)
+        unpacked = _decompress(path, body, count * size) if count else b""
+        return points_from_bytes(str(path), unpacked, fields, count, by_field=True)
     raise ScanError(f"{path}: DATA is '{encoding}'; PCD knows ascii, binary and binary_compressed")
 
 
@@ -46,12 +60,13 @@ def lzf_decompress(data: bytes, size: int) -> bytearray:
     back from the end of what is written. A reference may overlap its own output.
 
     Raises:
-        ValueError: the stream ends within a token, refers to before its start, or has another size.
+        ValueError: the stream ends within a token, refers to before its start, or has another size. It is followed
+            no further than that size.
     """
     out = bytearray()
     position, end = 0, len(data)
     try:
-        while position < end:
+        while position < end and len(out) <= size:
             control = data[position]
             position += 1
             if control < 32:
@@ -74,14 +89,16 @@ def lzf_decompress(data: bytes, size: int) -> bytearray:
     except IndexError:
         raise ValueError("the end is missing") from None
     if position != end or len(out) != size:
-        raise ValueError(f"{len(out)} bytes instead of {size}")
+        raise ValueError(f"{len(out)}{' or more' if position < end else ''} bytes instead of {size}")
     return out
 
 
-def _decompress(path: Path, body: bytes) -> bytearray:
+def _decompress(path: Path, body: bytes, needed: int) -> bytearray:
     if len(body) < 8:
         raise ScanError(f"{path}: the compressed body is missing; {AGAIN}")
     packed_size, size = struct.unpack_from("<2I", body)
+    if size != needed:
+        raise ScanError(f"{path}: {size} unpacked bytes where the header's points need {needed}; {AGAIN}")
     packed = body[8 : 8 + packed_size]
     if len(packed) < packed_size:
         raise ScanError(f"{path}: {len(packed)} of {packed_size} compressed bytes are there; {AGAIN}")
@@ -95,15 +112,17 @@ def _split_header(path: Path, data: bytes) -> tuple[dict[str, list[str]], bytes]
     header: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in header:
-        end = data.find(b"\n", position)
+        end = data.find(b"\n", position, MAX_HEADER_BYTES)
         if end < 0:
-            raise ScanError(f"{path}: the PCD header ends before its DATA line; {AGAIN}")
+            raise ScanError(f"{path}: no DATA line within the first {MAX_HEADER_BYTES} bytes; {AGAIN}")
         words = data[position:end].decode("ascii", errors="replace").split()
         position = end + 1
         if not words or words[0].startswith("#"):
             continue
         if words[0] not in _KEYS:
             raise ScanError(f"{path}: {words[0][:20]!r} is not a line of a PCD header; {AGAIN}")
+        if words[0] in header:
+            raise ScanError(f"{path}: two {words[0]} lines; correct the header")
         header[words[0]] = words[1:]
     return header, data[position:]
 
@@ -127,8 +146,19 @@ def _fields(path: Path, header: dict[str, list[str]]) -> list[Field]:
 
 
 def _point_count(path: Path, header: dict[str, list[str]]) -> int:
-    words = header["POINTS"] if "POINTS" in header else header.get("WIDTH", []) + header.get("HEIGHT", ["1"])
-    numbers = [number for word in words if (number := whole_number(word)) is not None]
-    if not words or len(numbers) != len(words):
-        raise ScanError(f"{path}: no whole number of POINTS in the header; correct the header")
-    return math.prod(numbers)
+    """POINTS, which has to be WIDTH times HEIGHT where those are there too."""
+    numbers = {}
+    for key in ("POINTS", "WIDTH", "HEIGHT"):
+        words = header.get(key)
+        if words is None:
+            continue
+        number = whole_number(words[0]) if len(words) == 1 else None
+        if number is None:
+            raise ScanError(f"{path}: {key} is {' '.join(words)[:40]!r} and not one whole number; correct the header")
+        numbers[key] = number
+    if not {"POINTS", "WIDTH"} & numbers.keys():
+        raise ScanError(f"{path}: neither POINTS nor WIDTH in the header; correct the header")
+    area = numbers["WIDTH"] * numbers.get("HEIGHT", 1) if "WIDTH" in numbers else numbers["POINTS"]
+    if numbers.get("POINTS", area) != area:
+        raise ScanError(f"{path}: POINTS is {numbers['POINTS']} and WIDTH times HEIGHT is {area}; correct the header")
+    return area

@@ -4,11 +4,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from asca_pillars.data.scans.records import AGAIN, Field, points_from_bytes, points_from_text, whole_number
+from asca_pillars.data.scans.records import (
+    AGAIN,
+    MAX_HEADER_BYTES,
+    Field,
+    StoredPoints,
+    points_from_bytes,
+    points_from_text,
+    whole_number,
+)
 from asca_pillars.errors import ScanError
 
+MAX_LISTS = 1_000_000  # of the elements before the vertices: each has to be walked over
 _BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -30,43 +38,35 @@ class _Element:
         return any(length is not None for _, length in self.properties)
 
 
-def read_ply(path: Path) -> NDArray[np.float32]:
-    """Points (N, 4): the vertices of a PLY file.
+def read_ply(path: Path) -> StoredPoints:
+    """The vertices of a PLY file. In an ASCII one every entry of every element has a line.
 
     Raises:
         ScanError: the header is not PLY's, there are no vertices with x, y and z, or the body is damaged.
     """
     encoding, elements, body = _split_header(path, path.read_bytes())
     names = [element.name for element in elements]
-    if "vertex" not in names:
-        raise ScanError(f"{path}: no element vertex among {', '.join(names) or 'none'}; export a point cloud")
+    if names.count("vertex") != 1:
+        found = "two elements vertex" if "vertex" in names else "no element vertex"
+        raise ScanError(f"{path}: {found} among {', '.join(names) or 'none'}; export one point cloud")
     index = names.index("vertex")
     vertex = elements[index]
     if vertex.has_lists:
         raise ScanError(f"{path}: the vertices have a list property; export plain x, y, z and intensity")
     fields = [prop for prop, _ in vertex.properties]
     if encoding == "ascii":
-        words = body.split()
-        start = _skip_text(path, words, elements[:index])
-        return points_from_text(str(path), words[start:], fields, vertex.count)
+        start = sum(element.count for element in elements[:index])
+        lines = [line for line in body.splitlines() if line.strip()][start:]
+        if index == len(elements) - 1 and len(lines) > vertex.count:
+            raise ScanError(f"{path}: {len(lines)} lines where the header states {vertex.count} points; {AGAIN}")
+        return points_from_text(str(path), lines, fields, vertex.count)
     start = _skip_bytes(path, body, elements[:index])
+    size = sum(prop.size_bytes for prop in fields)
+    if index == len(elements) - 1 and size and len(body) - start >= (vertex.count + 1) * size:
+        raise ScanError(
+            f"{path}: {len(body) - start} bytes where the header states {vertex.count} points of {size}; {AGAIN}"
+        )
     return points_from_bytes(str(path), body[start:], fields, vertex.count)
-
-
-def _skip_text(path: Path, words: list[bytes], elements: list[_Element]) -> int:
-    """The number of words that `elements` take at the start of an ASCII body."""
-    position = 0
-    for element in elements:
-        if not element.has_lists:
-            position += element.count * len(element.properties)
-            continue
-        for _ in range(element.count):
-            for _, length in element.properties:
-                items = whole_number(words[position].decode("latin-1")) if position < len(words) else None
-                if items is None and (length is not None or position >= len(words)):
-                    raise ScanError(f"{path}: element {element.name} before the vertices breaks off; {AGAIN}")
-                position += 1 if length is None else 1 + (items or 0)
-    return position
 
 
 def _skip_bytes(path: Path, body: bytes, elements: list[_Element]) -> int:
@@ -76,6 +76,11 @@ def _skip_bytes(path: Path, body: bytes, elements: list[_Element]) -> int:
         if not element.has_lists:
             position += element.count * sum(prop.size_bytes for prop, _ in element.properties)
             continue
+        if element.count > MAX_LISTS:
+            raise ScanError(
+                f"{path}: {element.count} lists of element {element.name} before the vertices, at most {MAX_LISTS} "
+                "are read; export the vertices first"
+            )
         for _ in range(element.count):
             for prop, length in element.properties:
                 if length is None:
@@ -89,10 +94,12 @@ def _skip_bytes(path: Path, body: bytes, elements: list[_Element]) -> int:
 
 
 def _split_header(path: Path, data: bytes) -> tuple[str, list[_Element], bytes]:
-    end = data.find(b"\nend_header")
+    end = data.find(b"\nend_header", 0, MAX_HEADER_BYTES)
     start_of_body = data.find(b"\n", end + 1) + 1
     if not data.startswith(b"ply") or end < 0 or start_of_body == 0:
-        raise ScanError(f"{path}: no PLY header from 'ply' to 'end_header'; {AGAIN}")
+        raise ScanError(
+            f"{path}: no PLY header from 'ply' to 'end_header' within the first {MAX_HEADER_BYTES} bytes; {AGAIN}"
+        )
     lines = [line.split() for line in data[:end].decode("ascii", errors="replace").splitlines()[1:]]
     encoding = next((words[1] for words in lines if len(words) == 3 and words[0] == "format"), "missing")
     if encoding not in _BYTE_ORDERS:

@@ -1,7 +1,9 @@
 """Point records with named fields, which the PCD and PLY formats share once their headers are read."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +11,9 @@ from numpy.typing import NDArray
 from asca_pillars.errors import ScanError
 
 AGAIN = "the file is damaged or incomplete: copy or export it again"
-_REFLECTANCE = ("intensity", "reflectance", "i")
+MAX_HEADER_BYTES = 65_536
+_REFLECTANCE = ("intensity", "reflectance", "reflectivity", "i")
+_DIGITS = re.compile(r"[0-9]{1,18}")
 
 
 @dataclass(frozen=True)
@@ -25,67 +29,66 @@ class Field:
         return self.dtype.itemsize * self.count
 
 
+class StoredPoints(NamedTuple):
+    """What a file holds: `xyz` (N, 3) float32 in m, `reflectance` (N,) of any scale, or None if there is none.
+
+    `dtype` is the type that the file declares for the reflectance, and `remarks` say what the reader had to decide.
+    """
+
+    xyz: NDArray[np.float32]
+    reflectance: NDArray[np.generic] | None
+    dtype: np.dtype[np.generic] | None
+    remarks: tuple[str, ...] = ()
+
+
 def whole_number(word: str) -> int | None:
     """The number that a word writes in decimal digits; None if it is anything else, or absurdly long."""
-    return int(word) if word.isdecimal() and len(word) <= 18 else None
+    return int(word) if _DIGITS.fullmatch(word) else None
 
 
-def unit_reflectance(values: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Reflectance (N,) as float32 in 0..1, or NaN where `values` are not finite.
-
-    Sensors and exporters write either 0..1 or 0..255, and no format says which. Integers, and any scan with a
-    value above 1, are taken as 0..255; the rest is taken as it is. A sensor with yet another range (0..65535)
-    saturates at 1, which the comparison of a scan with the input that a bundle expects reports.
-    """
-    with np.errstate(over="ignore", invalid="ignore"):
-        reflectance = values.astype(np.float32)
-        finite = np.isfinite(reflectance)
-        if values.dtype.kind in "iu" or reflectance.max(initial=0, where=finite) > 1:
-            reflectance = reflectance / np.float32(255)
-        return np.where(finite, np.clip(reflectance, 0, 1), np.float32(np.nan))
-
-
-def points_from_text(source: str, words: Sequence[bytes], fields: Sequence[Field], count: int) -> NDArray[np.float32]:
-    """Points (count, 4) from the words of an ASCII body, `fields` after `fields`, point after point.
+def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field], count: int) -> StoredPoints:
+    """The `count` points of the lines of an ASCII body: one point a line, `fields` after `fields`.
 
     Raises:
-        ScanError: words are missing or not numbers, or the fields hold no x, y and z.
+        ScanError: lines are missing, not as long as the fields, or not of numbers; or there is no x, y and z.
     """
-    width = sum(field.count for field in fields)
-    if len(words) < count * width:
-        raise ScanError(f"{source}: {len(words)} numbers where {count} points need {count * width}; {AGAIN}")
+    wanted, width = _wanted(source, fields), sum(field.count for field in fields)
+    if len(lines) < count:
+        raise ScanError(f"{source}: {len(lines)} lines where {count} points need {count}; {AGAIN}")
+    rows = [line.split() for line in lines[:count]]
+    # Joined without a look at the lines, one value too few would shift all later ones into other columns.
+    for number, row in enumerate(rows):
+        if len(row) != width:
+            raise ScanError(f"{source}: point {number} has {len(row)} values where the fields need {width}; {AGAIN}")
     try:
-        table = np.array(words[: count * width], dtype=np.float64).reshape(count, width)
+        table = np.array(rows, dtype=np.float64).reshape(count, width)
     except ValueError as error:
         raise ScanError(f"{source}: {error}; {AGAIN}") from error
     starts = np.cumsum([0] + [field.count for field in fields])
-    # In its declared type, because `unit_reflectance` treats integers as 0..255.
-    with np.errstate(over="ignore", invalid="ignore"):
-        columns = [table[:, starts[index]].astype(fields[index].dtype) for index in _wanted(source, fields)]
-    return _assemble(count, columns)
+    return _assemble(count, [table[:, starts[index]] for index in wanted], [fields[index] for index in wanted])
 
 
 def points_from_bytes(
     source: str, data: bytes | bytearray, fields: Sequence[Field], count: int, *, by_field: bool = False
-) -> NDArray[np.float32]:
-    """Points (count, 4) from a binary body: point after point, or (`by_field`) field after field.
+) -> StoredPoints:
+    """The `count` points of a binary body: point after point, or (`by_field`) field after field.
 
     Raises:
         ScanError: the body is shorter than `count` points, or the fields hold no x, y and z.
     """
-    size = sum(field.size_bytes for field in fields)
+    wanted, size = _wanted(source, fields), sum(field.size_bytes for field in fields)
     if len(data) < count * size:
         raise ScanError(f"{source}: {len(data)} bytes where {count} points need {count * size}; {AGAIN}")
     raw = np.frombuffer(data, dtype=np.uint8, count=count * size)
     columns = []
-    for index in _wanted(source, fields):
+    for index in wanted:
         start, field = sum(f.size_bytes for f in fields[:index]), fields[index]
         if by_field:
             column = raw[start * count : (start + field.size_bytes) * count]
         else:
             column = np.ascontiguousarray(raw.reshape(count, size)[:, start : start + field.size_bytes])
         columns.append(column.reshape(-1).view(field.dtype))
-    return _assemble(count, columns)
+    return _assemble(count, columns, [fields[index] for index in wanted])
 
 
 def _wanted(source: str, fields: Sequence[Field]) -> list[int]:
@@ -100,14 +103,14 @@ def _wanted(source: str, fields: Sequence[Field]) -> list[int]:
     for index in wanted:
         if fields[index].count != 1:
             raise ScanError(f"{source}: {names[index]} has {fields[index].count} values per point; export one")
+        if names.count(names[index]) > 1:
+            raise ScanError(f"{source}: there are {names.count(names[index])} fields {names[index]}; export one")
     return wanted
 
 
-def _assemble(count: int, columns: Sequence[NDArray[np.generic]]) -> NDArray[np.float32]:
-    points = np.zeros((count, 4), dtype=np.float32)
+def _assemble(count: int, columns: Sequence[NDArray[np.generic]], fields: Sequence[Field]) -> StoredPoints:
+    xyz = np.zeros((count, 3), dtype=np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         for axis, column in enumerate(columns[:3]):
-            points[:, axis] = column
-    if len(columns) > 3:
-        points[:, 3] = unit_reflectance(columns[3])
-    return points
+            xyz[:, axis] = column
+    return StoredPoints(xyz, columns[3], fields[3].dtype) if len(columns) > 3 else StoredPoints(xyz, None, None)

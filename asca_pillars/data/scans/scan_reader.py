@@ -1,51 +1,93 @@
 """Scan files of any common format to points (N, 4) float32: x, y, z in metres, reflectance in 0..1."""
 
 import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.data.scans.arrays import read_npy
 from asca_pillars.data.scans.pcd import read_pcd
 from asca_pillars.data.scans.ply import read_ply
-from asca_pillars.data.scans.records import AGAIN, unit_reflectance
+from asca_pillars.data.scans.raw_floats import read_raw_floats
+from asca_pillars.data.scans.records import StoredPoints
+from asca_pillars.data.scans.reflectance import (
+    ReflectanceScale,
+    ambiguity,
+    checked_scale,
+    common_scale,
+    unit_reflectance,
+)
 from asca_pillars.errors import ScanError
 from asca_pillars.files import atomic_path
 
-_POINT_BYTES = 16
+MAX_FILE_BYTES = 8 * 2**30
+
+
+@dataclass(frozen=True)
+class ScanNotes:
+    """What reading a scan changed, dropped or had to decide.
+
+    Attributes:
+        dropped_points: with a coordinate or reflectance that is not finite.
+        clipped_reflectances: outside 0..1 after scaling, and brought to the nearer end.
+        reflectance_scale: what stored reflectances were divided by; None if the file has none.
+        remarks: sentences for the user, such as that five columns were found.
+    """
+
+    dropped_points: int = 0
+    clipped_reflectances: int = 0
+    reflectance_scale: float | None = None
+    remarks: tuple[str, ...] = ()
 
 
 class Scan(NamedTuple):
-    """The finite points (N, 4) float32 of a file, and how many others were dropped."""
+    """The finite points (N, 4) float32 of a file, x, y, z in m and reflectance 0..1, and what was done to get them."""
 
     points: NDArray[np.float32]
-    dropped_points: int
+    notes: ScanNotes
+
+    @property
+    def dropped_points(self) -> int:
+        """Points of the file that were not finite."""
+        return self.notes.dropped_points
 
 
-def read_scan(path: str | Path) -> Scan:
+def read_scan(path: str | Path, *, columns: int | None = None, reflectance_scale: ReflectanceScale = "auto") -> Scan:
     """Read a scan by its suffix (`SCAN_SUFFIXES`).
 
-    A file without reflectance gets zeros, a scale of 0..255 is brought to 0..1 (`records.unit_reflectance`).
-    Points with a coordinate or reflectance that is not finite are dropped and counted. A well-formed file
-    without points is an empty scan.
+    A file without reflectance gets zeros. Points with a coordinate or reflectance that is not finite are dropped and
+    counted. A well-formed file without points is an empty scan. Of each kind of file so much is read as its size
+    allows, at most `raw_floats.MAX_POINTS` points or MAX_FILE_BYTES.
+
+    Args:
+        path: the file.
+        columns: float32 values per point of a `.bin`; None: four (KITTI) or five (nuScenes), by the values.
+        reflectance_scale: the stored value that is a reflectance of 1; auto: by the field's type and the values
+            (`reflectance.decide_scale`). For a folder of scans decide it once: `folder_reflectance_scale`.
 
     Raises:
-        ScanError: the file is missing, damaged or of an unknown format.
+        ScanError: the file is missing, damaged, too large or of an unknown format.
     """
-    path = Path(path)
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise ScanError(f"{path}: unknown suffix '{path.suffix}'; scans are {', '.join(SCAN_SUFFIXES)}")
-    try:
-        if path.stat().st_size == 0:
-            raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
-        points = reader(path)
-    except OSError as error:
-        raise ScanError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    finite = np.isfinite(points).all(axis=1)
-    dropped = len(points) - int(finite.sum())
-    return Scan(points[finite] if dropped else points, dropped)
+    reflectance_scale = checked_scale(reflectance_scale)
+    stored = _read_stored(Path(path), columns)
+    return _finite_scan(stored, reflectance_scale)
+
+
+def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = None, sample: int = 16) -> float:
+    """One reflectance scale for scans that belong together, from `sample` of them, evenly spaced.
+
+    A dark scan among brighter ones is then not read on another scale.
+
+    Raises:
+        ScanError: as `read_scan`.
+    """
+    chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
+    stored = [_read_stored(path, columns) for path in chosen]
+    return common_scale([(one.reflectance, one.dtype) for one in stored if one.reflectance is not None])
 
 
 def stored_points(path: Path) -> NDArray[np.float32]:
@@ -54,13 +96,9 @@ def stored_points(path: Path) -> NDArray[np.float32]:
     Raises:
         ScanError: they are no whole number of points.
     """
-    data = path.read_bytes()
-    if len(data) % _POINT_BYTES:
-        raise ScanError(
-            f"{path}: {len(data)} bytes are no whole number of points of {_POINT_BYTES} "
-            f"(float32 x, y, z, reflectance); {AGAIN}"
-        )
-    return np.frombuffer(data, dtype="<f4").reshape(-1, 4).astype(np.float32)
+    stored = read_raw_floats(path, 4)
+    assert stored.reflectance is not None, "of four columns"
+    return np.column_stack([stored.xyz, stored.reflectance.astype(np.float32)])
 
 
 def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
@@ -102,33 +140,41 @@ def _natural_order(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if part.isdecimal() else part for part in parts], path.name
 
 
-def _read_bin(path: Path) -> NDArray[np.float32]:
-    points = stored_points(path)
-    points[:, 3] = unit_reflectance(points[:, 3])
-    return points
-
-
-def _read_npy(path: Path) -> NDArray[np.float32]:
-    # Mapped, not loaded: mapping compares the header's claim with the file's size before memory is taken, and
-    # refuses pickled objects.
+def _read_stored(path: Path, columns: int | None) -> StoredPoints:
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ScanError(f"{path}: unknown suffix '{path.suffix}'; scans are {', '.join(SCAN_SUFFIXES)}")
     try:
-        array = np.lib.format.open_memmap(path, mode="r")
-    except OSError:
-        raise
-    except Exception as error:  # NumPy reads the header as Python source and lets the tokenizer's errors pass.
-        reason = " ".join(str(error).split())[:100]
-        raise ScanError(f"{path}: not an array of numbers ({reason}); {AGAIN}") from error
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "iuf":
-        raise ScanError(
-            f"{path}: holds {array.dtype} of shape {array.shape}; save real numbers of shape (N, 3) or (N, 4)"
-        )
-    points = np.zeros((len(array), 4), dtype=np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        points[:, :3] = array[:, :3]
-    if array.shape[1] > 3:
-        points[:, 3] = unit_reflectance(np.asarray(array[:, 3]))
-    return points
+        size = path.stat().st_size
+        if size == 0:
+            raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
+        if size > MAX_FILE_BYTES:
+            raise ScanError(f"{path}: {size} bytes, at most {MAX_FILE_BYTES} are read; cut the recording into scans")
+        return read_raw_floats(path, columns) if reader is read_raw_floats else reader(path)
+    except OSError as error:
+        raise ScanError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except MemoryError:
+        raise ScanError(f"{path}: {size} bytes do not fit into memory; cut the recording into scans") from None
 
 
-_READERS = {".bin": _read_bin, ".npy": _read_npy, ".pcd": read_pcd, ".ply": read_ply}
+def _finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
+    points = np.zeros((len(stored.xyz), 4), dtype=np.float32)
+    points[:, :3] = stored.xyz
+    notes = ScanNotes(remarks=stored.remarks)
+    if stored.reflectance is not None:
+        scaled = unit_reflectance(stored.reflectance, stored.dtype, scale)
+        points[:, 3] = scaled.values
+        doubt = ambiguity(stored.reflectance, scaled.scale) if scaled.decided_by == "values" else None
+        notes = ScanNotes(0, scaled.clipped, scaled.scale, (*stored.remarks, *([doubt] if doubt else [])))
+    finite = np.isfinite(points).all(axis=1)
+    dropped = len(points) - int(finite.sum())
+    return Scan(points[finite] if dropped else points, replace(notes, dropped_points=dropped))
+
+
+_READERS: dict[str, Callable[[Path], StoredPoints]] = {
+    ".bin": read_raw_floats,
+    ".npy": read_npy,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+}
 SCAN_SUFFIXES = tuple(_READERS)

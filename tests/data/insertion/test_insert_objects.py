@@ -11,7 +11,7 @@ from shapely.geometry import Polygon
 from torch.utils.data import DataLoader
 
 from asca_pillars.commands.prepare import run
-from asca_pillars.config import Config, DataConfig, InsertConfig
+from asca_pillars.config import Config, DataConfig, InsertConfig, PillarModel
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares, prepare_inserter
@@ -33,7 +33,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(method: str, **insert: object) -> Config:
-    base = Config(detector=SPEC, data=DataConfig(workers=0))
+    base = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
     changed = InsertConfig(method=method, **insert)  # type: ignore[arg-type]
     return dataclasses.replace(base, augment=dataclasses.replace(base.augment, insert=changed))
 

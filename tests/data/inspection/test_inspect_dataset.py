@@ -35,7 +35,7 @@ from tests.scenes import GRID, SIZES, SPEC, make_scene, write_dataset
 
 Points = NDArray[np.float32]
 FRAMES = 12
-CONFIG = Config(name="tiny", detector=SPEC, data=DataConfig(train_set="training", val_set="training"))
+CONFIG = Config(name="tiny", model=PillarModel(spec=SPEC), data=DataConfig(train_set="training", val_set="training"))
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,15 @@ def test_image_size_is_read_from_the_png_or_assumed(root):
     start = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + struct.pack(">2I", 1224, 370)
     split.image_path("000001").write_bytes(start + bytes(9))
     assert split.image_size_wh("000001") == (1224, 370)
+    for damaged in (b"", start[:20], b"\xff\xd8\xff\xe0" + bytes(40), start[:16] + bytes(8)):
+        split.image_path("000001").write_bytes(damaged)
+        assert_one_line(split.image_path("000001"), ["no PNG"], lambda: split.image_size_wh("000001"))
+
+
+def test_a_list_that_is_not_text_is_named(root):
+    write_image_set(root, "val", [])
+    (root / "ImageSets" / "val.txt").write_bytes(b"000001\n\xff\xfe\n")
+    assert_one_line("val.txt", ["not UTF-8"], lambda: KittiSplit(root, "val").frame_ids)
 
 
 # --- real frames, where there are some
