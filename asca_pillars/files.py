@@ -8,12 +8,14 @@ next process that writes into the same folder removes it.
 import contextlib
 import ctypes
 import errno
+import json
 import os
 import re
 import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from asca_pillars.errors import OutputError
 
@@ -75,6 +77,16 @@ def atomic_directory(path: str | Path, command: str, marker: str) -> Iterator[Pa
         elif not _exchange(temporary, target):
             _replace_in_two_steps(temporary, target)
         _sync(target.parent)
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write plain values as JSON, through `atomic_path`.
+
+    Raises:
+        ValueError: a number is NaN or infinite; JSON has no such thing.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def require_replaceable(folder: str | Path, command: str, marker: str) -> None:

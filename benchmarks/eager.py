@@ -27,7 +27,8 @@ from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import compare
 from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.commands.bench_tables import comparison_table
-from asca_pillars.data.scans.scan_reader import find_scans, read_scan
+from asca_pillars.data.scans.find_scans import find_scans
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint

@@ -20,7 +20,8 @@ from rich.table import Table
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.box_differences import box_difference
 from asca_export.parity import COMPARED_ANCHORS
-from asca_pillars.data.scans.scan_reader import find_scans, read_scan
+from asca_pillars.data.scans.find_scans import find_scans
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.decode import HeadMaps
 

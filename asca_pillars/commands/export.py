@@ -13,7 +13,8 @@ from rich.table import Table
 
 from asca_deploy.bundle import MANIFEST, Quantization
 from asca_pillars.commands.extras import require
-from asca_pillars.data.scans.scan_reader import find_scans, read_scan
+from asca_pillars.data.scans.find_scans import find_scans
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError
 from asca_pillars.files import require_replaceable
 

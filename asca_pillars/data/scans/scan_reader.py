@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.scans.arrays import read_npy
+from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES
 from asca_pillars.data.scans.pcd import read_pcd
 from asca_pillars.data.scans.ply import read_ply
 from asca_pillars.data.scans.raw_floats import read_raw_floats
@@ -118,28 +119,6 @@ def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
         points.astype("<f4").tofile(temporary)
 
 
-def find_scans(path: str | Path) -> list[Path]:
-    """The scan at `path`, or those in the folder at `path` in natural order (2.bin before 10.bin).
-
-    Raises:
-        ScanError: there is no scan.
-    """
-    path = Path(path)
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise ScanError(f"{path}: no such file or folder; check the path")
-    scans = [entry for entry in path.iterdir() if entry.suffix.lower() in _READERS and entry.is_file()]
-    if not scans:
-        raise ScanError(f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}")
-    return sorted(scans, key=_natural_order)
-
-
-def _natural_order(path: Path) -> tuple[list[str | int], str]:
-    parts = re.split(r"(\d+)", path.name)
-    return [int(part) if part.isdecimal() else part for part in parts], path.name
-
-
 def _read_stored(path: Path, columns: int | None) -> StoredPoints:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -177,4 +156,4 @@ _READERS: dict[str, Callable[[Path], StoredPoints]] = {
     ".pcd": read_pcd,
     ".ply": read_ply,
 }
-SCAN_SUFFIXES = tuple(_READERS)
+assert tuple(_READERS) == SCAN_SUFFIXES, "find_scans finds what can be read"

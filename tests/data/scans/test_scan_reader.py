@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.data.scans.pcd import lzf_decompress
-from asca_pillars.data.scans.scan_reader import SCAN_SUFFIXES, Scan, find_scans, read_scan, write_scan
+from asca_pillars.data.scans.scan_reader import SCAN_SUFFIXES, Scan, read_scan, write_scan
 from asca_pillars.errors import ScanError
 
 POINTS = np.array([[1.5, -2.25, 0.5, 0.25], [70.125, 39.5, -3, 1.0], [0, 0, 0, 0], [-5.0, 8.0, 1.0, 0.5]], np.float32)
@@ -323,15 +323,3 @@ def test_what_is_written_is_read(tmp_path):
         write_scan(tmp_path / "b.pcd", POINTS)
     with pytest.raises(ValueError, match=r"\(4, 3\)"):
         write_scan(tmp_path / "b.bin", POINTS[:, :3])
-
-
-def test_scans_are_found_in_natural_order(tmp_path):
-    for name in ("10.bin", "9.pcd", "2.bin", "b.npy", "A1.PLY", "notes.txt"):
-        (tmp_path / name).write_bytes(b"x")
-    (tmp_path / "1.bin").mkdir()
-    assert [path.name for path in find_scans(tmp_path)] == ["2.bin", "9.pcd", "10.bin", "A1.PLY", "b.npy"]
-    assert find_scans(str(tmp_path / "2.bin")) == [tmp_path / "2.bin"]
-    with pytest.raises(ScanError, match="no such file or folder"):
-        find_scans(tmp_path / "missing")
-    with pytest.raises(ScanError, match=r"no scans in this folder.*\.ply"):
-        find_scans(tmp_path / "1.bin")

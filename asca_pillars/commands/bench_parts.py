@@ -1,0 +1,101 @@
+"""The parts of a benchmark, measured one after the other and printed as soon as each is there."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from asca_deploy import Detector, find_bundle
+from asca_deploy.benchmark import (
+    benchmark,
+    cold_start,
+    compare,
+    measure_matrix,
+    measure_roofline,
+    measure_scaling,
+    measure_throughput,
+)
+from asca_deploy.benchmark.matrix import ON_THE_CPU
+from asca_pillars.commands import bench_tables as show
+from asca_pillars.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What to measure besides the stages."""
+
+    compare: bool = False
+    matrix: bool = False
+    scaling: bool = False
+    stream: bool = False
+    cold: bool = False
+
+
+def measure_parts(
+    detector: Detector,
+    scans: list[NDArray[np.float32]],
+    rounds: int,
+    parts: Parts,
+    bundles: dict[str, Path],
+    console: Console,
+) -> dict[str, Any]:
+    """Measure part after part, print each when it is there, and return everything as plain values."""
+
+    def bar(count: int, what: str) -> Iterable[int]:
+        return track(range(count), what, console=console, transient=True)
+
+    report = benchmark(detector, scans, rounds, track=bar)
+    result = report.to_dict()
+    lines = show.summary_lines(report)
+    if detector.provider in ON_THE_CPU:
+        found = measure_roofline(detector.bundle, report.stages_ms["neck+head"].p50, detector.threads)
+        result["roofline"] = asdict(found)
+        lines.append(show.roofline_line(found))
+    console.print(show.stages_table(report))
+    for line in (*lines, show.machine_line(report)):
+        console.print(line, soft_wrap=True)
+    if parts.stream:
+        streamed = measure_throughput(detector, scans, rounds, bar)
+        result["stream"] = asdict(streamed)
+        console.print(show.stream_table(streamed))
+    if parts.scaling:
+        rows = measure_scaling(detector, scans[0], rounds=rounds, track=bar)
+        result["scaling"] = [asdict(row) for row in rows]
+        console.print(show.scaling_table(rows))
+    if parts.compare:
+        others = {name: _like(detector, folder) for name, folder in list(bundles.items())[1:]}
+        compared = compare({next(iter(bundles)): detector} | others, scans, rounds, bar)
+        result["compare"] = asdict(compared)
+        console.print(show.comparison_table(compared))
+    if parts.matrix:
+        ways = measure_matrix(bundles, scans, rounds, bar)
+        result["matrix"] = [asdict(row) | {"way": row.way._asdict()} for row in ways]
+        console.print(show.matrix_table(ways))
+        for line in show.matrix_reasons(ways):
+            console.print(line, soft_wrap=True)
+    if parts.cold:
+        cold = cold_start(detector, scans[0], track=bar)
+        result["cold"] = asdict(cold)
+        console.print(show.cold_line(cold), soft_wrap=True)
+    return result
+
+
+def _like(detector: Detector, folder: Path) -> Detector:
+    """Another bundle, run the same way."""
+    return Detector(folder, provider=detector.provider, precision=detector.precision, threads=detector.threads)
+
+
+def named_bundles(bundles: Sequence[Path | None]) -> dict[str, Path]:
+    """Folders by the names that tables show them by."""
+    folders = [find_bundle(bundle) for bundle in bundles]
+    named = {folder.name: folder for folder in folders}
+    if len(named) < len(folders):  # two folders of one name are told apart by their whole path
+        named = {str(folder): folder for folder in folders}
+    if len(named) < len(folders):
+        raise ConfigError(f"--compare {bundles[-1]}: a bundle is compared with itself or given twice; name another one")
+    return named

@@ -1,0 +1,92 @@
+"""The files that `asca detect` writes: boxes of each scan and of the whole run, pictures, KITTI text."""
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import cv2
+
+from asca_deploy import Detections
+from asca_pillars.data.kitti import Calibration, objects_from_boxes, read_calibration, write_labels
+from asca_pillars.data.scans.scan_reader import Scan
+from asca_pillars.files import atomic_path
+from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
+
+RUN_FILE = "detections.jsonl"
+
+
+class ResultWriter:
+    """Writes the results of scan after scan to a folder; `detections.jsonl` appears when the block ends without an error.
+
+    Args:
+        out: the folder; files of other names in it stay.
+        ranges: what the bird's-eye pictures show.
+        pictures: False writes no picture.
+    """
+
+    def __init__(self, out: Path, ranges: Ranges, *, pictures: bool) -> None:
+        self._out, self._ranges, self._pictures = out, ranges, pictures
+        self._stack = ExitStack()
+        self._lines: IO[str]
+
+    def __enter__(self) -> "ResultWriter":
+        temporary = self._stack.enter_context(atomic_path(self._out / RUN_FILE))
+        self._lines = self._stack.enter_context(temporary.open("w", encoding="utf-8"))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def __call__(self, path: Path, name: Path, scan: Scan, detections: Detections) -> None:
+        """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
+        content = _content(path, scan, detections)
+        with atomic_path(self._named(name, ".json")) as temporary:
+            temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        self._lines.write(json.dumps(content) + "\n")
+        if self._pictures:
+            write_png(self._named(name, "_bev.png"), draw_bev(scan.points, detections, self._ranges))
+        calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
+        if path.parent.name != "velodyne" or not calib_path.exists():
+            return
+        calibration = read_calibration(calib_path)
+        image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
+        image = cv2.imread(str(image_path)) if image_path.exists() else None
+        _write_kitti(self._named(name, ".txt"), detections, calibration, image)
+        if image is not None and self._pictures:
+            drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
+            write_png(self._named(name, "_image.png"), drawn)
+
+    def _named(self, name: Path, ending: str) -> Path:
+        # Not with_suffix: a name may hold dots of its own.
+        return self._out / name.with_name(name.name + ending)
+
+
+def _write_kitti(path: Path, detections: Detections, calibration: Calibration, image: Any) -> None:
+    """What the camera sees, as KITTI's tools want it: they know no boxes outside the image."""
+    size = {} if image is None else {"image_size_wh": (image.shape[1], image.shape[0])}
+    objects = objects_from_boxes(detections.boxes, detections.names, calibration, scores=detections.scores, **size)
+    write_labels(path, [item for item in objects if item.bbox[2] > item.bbox[0]])
+
+
+def _content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
+    report, notes = detections.report, scan.notes
+    counts = report.counts
+    return {
+        "scan": str(path),
+        "frame": "lidar: x forward, y left, z up; box centers; yaw counter-clockwise from x",
+        "boxes": detections.to_dicts(),
+        "points": counts.points,
+        "points_not_finite": report.non_finite_points + notes.dropped_points,
+        "points_outside_range": counts.points_outside,
+        "points_over_limit": counts.points_over_limit,
+        "reflectance_scale": notes.reflectance_scale,
+        "reflectances_clipped": notes.clipped_reflectances,
+        "pillars": counts.pillars,
+        "pillars_over_limit": counts.pillars_over_limit,
+        "warnings": [*notes.remarks, *report.warnings],
+    }

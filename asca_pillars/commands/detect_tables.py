@@ -1,0 +1,77 @@
+"""What `asca detect` prints: one scan's boxes or a line per scan, notes, and the time of every stage."""
+
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from asca_deploy import Detections, Detector, FrameReport
+from asca_pillars.data.scans.scan_reader import ScanNotes
+
+
+class Result(NamedTuple):
+    """What is kept of a scan that has been detected: `labels` (N,) are class indices."""
+
+    path: Path
+    notes: ScanNotes
+    labels: NDArray[np.int64]
+    report: FrameReport
+
+
+def boxes(path: Path, detections: Detections) -> Table:
+    """The boxes of one scan, the nearest first."""
+    table = Table(title=f"{path.name}: {len(detections)} objects")
+    for column in ("class", "score", "distance", "size l x w x h", "heading"):
+        table.add_column(column, justify="left" if column == "class" else "right")
+    for index in np.argsort(detections.distances_m):
+        length, width, height, yaw = detections.boxes[index, 3:]
+        table.add_row(
+            detections.names[index],
+            f"{detections.scores[index]:.2f}",
+            f"{detections.distances_m[index]:.1f} m",
+            f"{length:.1f} x {width:.1f} x {height:.1f} m",
+            f"{np.rad2deg(yaw):+.0f}°",
+        )
+    return table
+
+
+def scans(results: Sequence[Result], class_names: Sequence[str]) -> Table:
+    """A line per scan: how many objects of each class."""
+    table = Table(title=f"{len(results)} scans")
+    for column in ("scan", "points", *class_names, "time"):
+        table.add_column(column, justify="left" if column == "scan" else "right")
+    for path, _, labels, report in results:
+        counts = np.bincount(labels, minlength=len(class_names))
+        table.add_row(path.name, str(report.counts.points), *map(str, counts), f"{report.total_ms:.0f} ms")
+    return table
+
+
+def notes(results: Iterable[Result]) -> Iterator[str]:
+    """What was repaired, dropped or odd, each kind once, with the first scan that it concerns and how many others."""
+    names: dict[str, list[str]] = defaultdict(list)
+    for path, notes, _, report in results:
+        found = [(remark, remark) for remark in notes.remarks] + [(kind, text) for kind, text in report.warnings_by_kind()]
+        if dropped := notes.dropped_points + report.non_finite_points:
+            found.append(("not finite", f"{dropped} points are not finite and were dropped"))
+        if notes.clipped_reflectances:
+            found.append(("clipped", f"{notes.clipped_reflectances} reflectances lie outside 0..1 and were clipped"))
+        for kind, text in found:
+            names[kind].append(f"{path.name}: {text}")
+    for lines in names.values():
+        yield lines[0] + (f" (and {len(lines) - 1} more scans alike)" if lines[1:] else "")
+
+
+def timing(reports: Sequence[FrameReport], detector: Detector) -> str:
+    """Median times of warm frames, stage by stage."""
+    medians = {stage: statistics.median(one.times_ms[stage] for one in reports) for stage in reports[0].times_ms}
+    total_ms = statistics.median(report.total_ms for report in reports)
+    stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
+    return (
+        f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan (median of {len(reports)} warm frames, "
+        f"{detector.runs_on}, {detector.threads} threads): {stages} ms"
+    )

@@ -1,0 +1,65 @@
+"""Which files are scans, in which order, and that no two of them get one name for their results."""
+
+from pathlib import Path
+
+import pytest
+
+from asca_pillars.data.scans.find_scans import find_scans, name_scans
+from asca_pillars.errors import ScanError
+
+
+def touch(root: Path, *names: str) -> Path:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    return root
+
+
+def names(*paths: Path) -> list[str]:
+    return [scan.name.as_posix() for scan in name_scans(paths)]
+
+
+def test_scans_of_a_folder_stand_in_natural_order(tmp_path: Path) -> None:
+    touch(tmp_path, "10.bin", "2.bin", "b.npy", "9.pcd", "A1.PLY", "notes.txt", ".hidden.bin", ".cache/1.bin")
+    assert [path.name for path in find_scans(tmp_path)] == ["2.bin", "9.pcd", "10.bin", "A1.PLY", "b.npy"]
+    assert find_scans(str(tmp_path / "2.bin")) == [tmp_path / "2.bin"]
+
+
+def test_folders_are_searched_to_any_depth(tmp_path: Path) -> None:
+    touch(tmp_path, "drive2/a/1.bin", "drive10/1.bin", "0.bin")
+    assert names(tmp_path) == ["0", "drive2/a/1", "drive10/1"]
+
+
+def test_what_is_no_scan_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match="no such file or folder"):
+        find_scans(tmp_path / "missing")
+    with pytest.raises(ScanError, match="no scans in this folder"):
+        find_scans(touch(tmp_path, "notes.txt"))
+
+
+def test_scans_of_one_stem_keep_their_suffix(tmp_path: Path) -> None:
+    touch(tmp_path, "a.bin", "a.npy", "b.bin")
+    assert names(tmp_path) == ["a.bin", "a.npy", "b"]
+
+
+def test_scans_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) -> None:
+    touch(tmp_path, "x/1.bin", "y/1.bin", "y/2.bin")
+    assert names(tmp_path / "x", tmp_path / "y") == ["x/1", "y/1", "2"]
+    assert names(tmp_path / "x" / "1.bin", tmp_path / "y" / "1.bin") == ["x/1", "y/1"]
+
+
+def test_a_scan_that_is_given_twice_is_run_once(tmp_path: Path) -> None:
+    touch(tmp_path, "x/1.bin")
+    assert names(tmp_path, tmp_path / "x" / "1.bin", tmp_path / "x") == ["x/1"]
+
+
+def test_names_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
+    touch(tmp_path, "p/x/1.bin", "q/x/1.bin")
+    with pytest.raises(ScanError, match="would have one name"):
+        name_scans([tmp_path / "p" / "x", tmp_path / "q" / "x"])
+
+
+def test_names_stay_inside_the_folder_of_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch(tmp_path, "x/1.bin", "1.bin")
+    monkeypatch.chdir(tmp_path / "x")
+    assert all(".." not in Path(name).parts and not Path(name).is_absolute() for name in names(Path("../1.bin"), Path()))
