@@ -16,10 +16,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from rich.console import Console
-from tests.evaluation.brute_force import Twin, brute_force
 
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, KittiResults, evaluate
 from asca_pillars.evaluation.kitti.objects import FrameObjects
+from tests.evaluation.kitti.brute_force import Twin, brute_force
 
 CLASS_NAMES = ("Car", "Pedestrian", "Cyclist")
 TYPES = np.array([*CLASS_NAMES, "Van", "Person_sitting", "Truck"])

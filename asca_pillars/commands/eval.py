@@ -17,8 +17,8 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
-from asca_pillars.evaluation.kitti.verdicts import verdicts
-from asca_pillars.evaluation.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
 from asca_pillars.files import atomic_directory, atomic_path
@@ -163,7 +163,7 @@ def _draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None
     count = GALLERY if count is None else count
     if task.split is None or count == 0:
         return
-    judged = verdicts(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
+    judged = matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
     worst = gallery.worst_frames(judged, count)
     folders = task.split, task.labels, task.predictions
     with _replacing(out / "gallery", gallery.INDEX) as folder:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, Curve, KittiEvaluation, KittiResults
-from asca_pillars.evaluation.operating_point import OperatingPoint
+from asca_pillars.evaluation.kitti.operating_point import OperatingPoint
 from asca_pillars.evaluation.predictions import ScoredFrames
 
 BANDS_M = {
@@ -59,19 +59,20 @@ def tables(report: EvalReport) -> list[TextTable]:
     """AP, AP by distance, recall and precision at the fixed scores."""
     recall = [(point, point.found, point.objects, point.recall, point.recall_interval) for point in report.points]
     precision = [
-        (point, point.true, point.detections, point.precision, point.precision_interval) for point in report.points
+        (point, point.true_positives, point.detections, point.precision, point.precision_interval)
+        for point in report.points
     ]
     return [
         _ap_table(report.ap.overall),
         _band_table(report.ap),
         _share_table("Recall", ("objects", "found"), recall),
-        _share_table("Precision", ("detections", "true"), precision),
+        _share_table("Precision", ("detections", "true positives"), precision),
     ]
 
 
 def notes(report: EvalReport) -> list[str]:
     """What one must know to read the tables: classes not evaluated, sets too small for their AP, detections
-    excused, scores to choose."""
+    ignored, scores to choose."""
     results = report.ap.overall
     lines = []
     for name in results.class_names:
@@ -80,7 +81,7 @@ def notes(report: EvalReport) -> list[str]:
         lines += [
             _cap_note(curve) for curve in _counts_of(results, name) if curve is not None and curve.counted <= SMALL_SET
         ]
-    lines += [_excuse_note(p) for p in report.points if p.difficulty == "hard" and p.excused > p.detections]
+    lines += [_ignored_note(p) for p in report.points if p.difficulty == "hard" and p.ignored > p.detections]
     if report.best_scores:
         scores = ", ".join(f"{name} {score:.2f}" for name, score in report.best_scores.items())
         lines.append(f"Scores with the best F1 on this data, moderate, in 3D: {scores}")
@@ -225,10 +226,10 @@ def _cap_note(curve: Curve) -> str:
     return f"{what}: {objects}; a perfect detector gets at most {curve.r40_cap:.1f} R40, {curve.r11_cap:.1f} R11"
 
 
-def _excuse_note(point: OperatingPoint) -> str:
-    of_all = f"{point.excused} of {point.excused + point.detections} detections"
+def _ignored_note(point: OperatingPoint) -> str:
+    of_all = f"{point.ignored} of {point.ignored + point.detections} detections"
     return (
-        f"{point.class_name}: {of_all} are excused even at hard (low in the image, without 2D box, on ignored objects "
+        f"{point.class_name}: {of_all} are ignored even at hard (low in the image, without 2D box, on ignored objects "
         "or DontCare areas); the precision does not count them"
     )
 

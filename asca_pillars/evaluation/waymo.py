@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.evaluation.assignment import NOBODY, best_assignments
+from asca_pillars.evaluation.assignment import UNMATCHED, best_assignments
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
@@ -194,7 +194,7 @@ class _Tally:
     def add(self, frame: _Frame) -> None:
         reached = np.searchsorted(-frame.scores, -SCORE_CUTOFFS, side="right")  # how many have score >= cutoff
         holders = best_assignments(frame.iou)
-        held = holders != NOBODY
+        held = holders != UNMATCHED
         accuracy = np.zeros(held.shape)
         columns = np.nonzero(held)[1]
         accuracy[held] = frame.heading_accuracy[holders[held], columns]
