@@ -99,7 +99,7 @@ def wrap(angle: float) -> float:
 @numba.njit(cache=True)
 def cast_triangles(triangles, surface, owners, salts, sensor, buffers, key):  # type: ignore[no-untyped-def]
     """Keep the nearest hit of triangles (T,3,3) in the buffers; count what each object alone would stop."""
-    slope, origin_z, phase, cos_az, sin_az, first_column, cast_columns, in_camera = sensor
+    slope, origin_z, phase, cos_az, sin_az, first_column, cast_columns, counted = sensor
     rho, cosine, reflectance, owner, stamp, alone = buffers
     columns = len(cos_az)
     edges = np.empty((3, 3))
@@ -161,7 +161,7 @@ def cast_triangles(triangles, surface, owners, salts, sensor, buffers, key):  # 
                 if reach <= 0.0:
                     continue
                 hidden = reach >= rho[k, j]
-                counts = who >= 0 and in_camera[j] and stamp[k, j] != who
+                counts = who >= 0 and counted[j] and stamp[k, j] != who
                 if hidden and not counts:
                     continue
                 if surface[t, 2] > 0.0 and ray_hash(key, k, j, salts[t]) < surface[t, 2]:
@@ -180,7 +180,7 @@ def cast_triangles(triangles, surface, owners, salts, sensor, buffers, key):  # 
 @numba.njit(cache=True)
 def cast_ellipsoids(centers, matrices, inverses, surface, owners, salts, sensor, buffers, key):  # type: ignore[no-untyped-def]
     """The same for ellipsoids, solid ones and clouds; `inverses` of `matrices`, for which numba would want SciPy."""
-    slope, origin_z, phase, cos_az, sin_az, first_column, cast_columns, in_camera = sensor
+    slope, origin_z, phase, cos_az, sin_az, first_column, cast_columns, counted = sensor
     rho, cosine, reflectance, owner, stamp, alone = buffers
     columns = len(cos_az)
     for e in range(len(centers)):
@@ -258,7 +258,7 @@ def cast_ellipsoids(centers, matrices, inverses, surface, owners, salts, sensor,
                 elif reach <= 0.0:
                     continue
                 hidden = reach >= rho[k, j]
-                counts = who >= 0 and in_camera[j] and stamp[k, j] != who
+                counts = who >= 0 and counted[j] and stamp[k, j] != who
                 if counts:
                     stamp[k, j] = who
                     alone[who] += 1

@@ -30,7 +30,7 @@ class Hits(NamedTuple):
     cosine: Singles  # (K,C) of the angle of incidence
     reflectance: Singles  # (K,C) of the material at this incidence
     owner: npt.NDArray[np.int32]  # (K,C) object index, BACKGROUND, GROUND or NOTHING
-    alone: Ints  # (objects,) firings in the camera's columns that would hit the object if it stood alone
+    alone: Ints  # (objects,) counted firings that would hit the object if it stood alone
     visible: Ints  # (objects,) those that do hit it
 
 
@@ -56,7 +56,7 @@ def cast(bodies: Bodies, objects: int, ground: Ground | None, firings: Firings, 
     stamp = np.full((rings, columns), -1, np.int32)
     alone = np.zeros(objects, np.int64)
     sensor = (firings.slope, firings.origin_z_m, firings.phase_rad, np.cos(firings.azimuth_rad),
-              np.sin(firings.azimuth_rad), firings.first_column, firings.cast, firings.in_camera)  # fmt: skip
+              np.sin(firings.azimuth_rad), firings.first_column, firings.cast, firings.counted)  # fmt: skip
     buffers = (rho, cosine, reflectance, owner, stamp, alone)
     key = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
     cast_triangles(primitives.triangles, primitives.triangle_surface, bodies.tri_owner, bodies.tri_salt,
@@ -67,6 +67,6 @@ def cast(bodies: Bodies, objects: int, ground: Ground | None, firings: Firings, 
     if ground is not None:
         grass = np.random.default_rng(seed).random((rings, columns), np.float32)
         cast_ground(ground.shape, ground.relief, ground.reflectance, ground.z_m, sensor, buffers, grass)
-    seen = owner[:, firings.in_camera]
+    seen = owner[:, firings.counted]
     visible = np.bincount(seen[seen >= 0], minlength=objects).astype(np.int64)
     return Hits(rho, cosine, reflectance, owner, alone, visible)
