@@ -154,8 +154,8 @@ def simulate(
     view: Annotated[
         str | None,
         typer.Option(
-            help="full: 360 degrees, of which the camera's part is labelled, as in KITTI; around: 360 degrees, labelled "
-            "in every direction; camera: only what the camera sees, 6x smaller. Default: the config's; else full."
+            help="full: 360 degrees, of which the camera's part is labelled, as in KITTI; around: 360 degrees, all "
+            "of it labelled; camera: only what the camera sees, 6x smaller. Default: the config's; else full."
         ),
     ] = None,
     val_share: Annotated[
