@@ -163,8 +163,8 @@ def simulate(
     view: Annotated[
         str | None,
         typer.Option(
-            help="full: 360 degrees, as KITTI stores scans; camera: only what the camera sees, 6x smaller. "
-            "Default: the config's; without one, full."
+            help="full: 360 degrees, of which the camera's part is labelled, as in KITTI; around: 360 degrees, all "
+            "of it labelled; camera: only what the camera sees, 6x smaller. Default: the config's; else full."
         ),
     ] = None,
     val_share: Annotated[

@@ -1,4 +1,4 @@
-"""The height of the ground, and rays against it (compiled by numba; see `bodycast` on why this is one file)."""
+"""The height and the material of the ground (compiled by numba)."""
 
 import numba
 import numpy as np
@@ -13,8 +13,6 @@ TRACK_SPACING_HALF_M, GAUGE_HALF_M, RAIL_HALF_M = 1.7, 0.75, 0.06
 RELIEF_STEP_M = 4.0
 RELIEF_HALF_M = 96.0
 NO_RAILS = -1000.0
-GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
-CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
 ASPHALT, PAVEMENT, VERGE, MARKING, RAIL, BALLAST = range(6)
 
 # Positions of the fields of Ground.shape: what numba reads has no names.
@@ -67,7 +65,7 @@ def on_rail(from_middle: float, tracks: float) -> bool:
     return abs(from_middle - GAUGE_HALF_M) < RAIL_HALF_M
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, inline="always")
 def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float) -> float:
     """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them."""
     cells = relief.shape[0] - 1
@@ -137,91 +135,3 @@ def highest_within(relief: Floats) -> Floats:
     for ring in range(1, len(highest)):
         highest[ring] = max(highest[ring], highest[ring - 1])
     return highest
-
-
-@numba.njit(cache=True)
-def cast_ground(shape, relief, materials, z_m, sensor, buffers, grass):  # type: ignore[no-untyped-def]
-    """Walk every ray down to the ground and keep the hit where nothing was nearer. Arguments as in `Ground`;
-    `grass` (K,C) in 0..1 says how far below the blades' tips a ray ends."""
-    slope, origin_z, phase, cos_az, sin_az, _, cast_columns, _ = sensor
-    rho, cosine, reflectance, owner, _, _ = buffers
-    highest = highest_within(relief)
-    rough = shape[ROUGH]
-    group = max(int(GROUP_DEG / 360.0 * len(cos_az)), 1)
-    for k in range(len(slope)):
-        cos_p, sin_p = np.cos(phase[k]), np.sin(phase[k])
-        stretch = np.sqrt(1.0 + slope[k] ** 2)
-        start, ring = 1.5, 0
-        while ring + 1 < len(highest) and origin_z[k] + slope[k] * start > z_m + highest[ring] + shape[RISE]:
-            # Up to the far edge of this ring of cells the ray stays above everything.
-            meet = (z_m + highest[ring] + shape[RISE] - origin_z[k]) / slope[k] if slope[k] < 0.0 else 1e9
-            start = max(start, min(meet, (ring + 1) * RELIEF_STEP_M))
-            if meet <= (ring + 1) * RELIEF_STEP_M:
-                break
-            ring += 1
-        # A neighboring ray of this ring was high above everything up to `clear`; this one starts there. Neighbors
-        # come in small groups, so that a ray does not depend on whether those far from it are cast.
-        clear = start
-        for j in range(len(cos_az)):
-            if not cast_columns[j]:
-                continue
-            if j % group == 0 or not cast_columns[j - 1]:
-                clear = start
-            dx = cos_az[j] * cos_p - sin_az[j] * sin_p
-            dy = sin_az[j] * cos_p + cos_az[j] * sin_p
-            limit = min(rho[k, j], 85.0)
-            near, reach, above = clear, clear, 0.0
-            gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
-            if gap < CLEAR_M:
-                near, reach = start, start
-                gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
-            clear, descending = start, max(-slope[k], 0.0)
-            far_above = descending > 0.03  # flatter rays graze crests that a neighbor may just have missed
-            while gap > 0.0 and reach < limit:
-                near, above = reach, gap
-                far_above &= gap >= CLEAR_M
-                if far_above:
-                    clear = reach
-                # Ground steeper than this is a kerb or a bank, which is wider than the step that passes its foot.
-                # On flat ground half of the way down is quicker; kerbs are lower than what is left above them then.
-                step = max(gap / (0.22 + descending), 0.04 + 0.006 * near)
-                if descending > 0.0:
-                    step = max(step, min(0.5 * gap / descending, 3.0))
-                reach = near + step
-                gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
-            if gap > 0.0:
-                continue
-            for _ in range(10):  # false position, halving the weight of an end that stays
-                if reach - near < 0.004 or above <= 0.0:
-                    break
-                middle = near + (reach - near) * above / (above - gap)
-                here = origin_z[k] + slope[k] * middle - ground_height(middle * dx, middle * dy, shape, relief, z_m)
-                if here > 0.0:
-                    near, above, gap = middle, here, 0.5 * gap
-                else:
-                    reach, gap, above = middle, here, 0.5 * above
-                if abs(here) < 0.001:
-                    reach = middle
-                    break
-            if reach >= limit:
-                continue
-            x, y = reach * dx, reach * dy
-            step = 0.05
-            height = origin_z[k] + slope[k] * reach
-            gx = (ground_height(x + step, y, shape, relief, z_m) - height) / step
-            gy = (ground_height(x, y + step, shape, relief, z_m) - height) / step
-            gx, gy = min(max(gx, -3.0), 3.0), min(max(gy, -3.0), 3.0)
-            facing = abs(slope[k] - gx * dx - gy * dy) / (np.sqrt(1.0 + gx * gx + gy * gy) * stretch)
-            material = ground_material(x, y, shape)
-            if material == VERGE:
-                # Blades of grass end the ray before the soil does, and stand up to it.
-                reach -= rough * grass[k, j] ** 2 / max(0.12, abs(slope[k]))
-                facing = max(facing, 0.08)
-                if reach < 1.5:
-                    continue
-            elif material == RAIL:
-                facing = max(facing, 0.3)
-            rho[k, j] = reach
-            owner[k, j] = GROUND
-            cosine[k, j] = min(max(facing, 0.004), 1.0)
-            reflectance[k, j] = materials[material]
