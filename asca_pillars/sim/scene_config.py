@@ -32,7 +32,7 @@ class SceneConfig:
     pedestrian_uniform_heading: float = 0.45  # the others walk along the street
     cyclist_crossing: float = 0.30
     # Height of a label box's bottom above the ground, mean and standard deviation: of people and riders, of vehicles.
-    box_lift_m: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.03), (0.03, 0.05))
+    box_lift_m: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.03), (0.012, 0.05))
     # Objects stand on streets and beside them, not on slopes: at most so far from the level of the car's street,
     # metres, plus metres per metre of distance. KITTI's labels deviate by 0.15, 0.22, 0.33 m at 15, 25, 35 m.
     level_band_m: tuple[float, float] = (0.15, 0.018)
@@ -68,7 +68,7 @@ class SceneConfig:
 
     clutter: tuple[float, float] = (15.0, 60.0)  # posts, signs, bins, shrubs and the like per 100 m of street
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
-    dark_paint_share: float = 0.33
+    dark_paint_share: float = 0.42
 
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
     min_points: int = 2

@@ -79,6 +79,9 @@ BOX_VAN = Profile(  # a small delivery van: a car's nose, a tall closed back
     ((0.22, 0.38),), (0.26, 0.50), 0.56, 0.88,
 )  # fmt: skip
 
+PALE_SHARE = 0.25  # of the cars that are not dark
+BELT_LOWER = 0.035  # windows of today's streets begin lower than the profiles' outlines suggest, share of height
+
 Shares = tuple[tuple[Profile, float], ...]
 _SMALL: Shares = ((CITY, 0.62), (HATCHBACK, 0.36), (CONVERTIBLE, 0.02))
 _MIDDLE: Shares = ((HATCHBACK, 0.66), (SALOON, 0.12), (ESTATE, 0.10), (SUV, 0.09), (CONVERTIBLE, 0.03))
@@ -106,7 +109,7 @@ def _varied(profile: Profile, rng: np.random.Generator) -> Profile:
         tail = 0.8
     x_from = (0.0, base, tail, 1.0)
     x_to = (0.0, base + rng.normal(0.0, 0.02), tail + min(rng.normal(0.0, 0.015), 0.8 * (1.0 - tail)), 1.0)
-    lift = float(np.clip(rng.normal(0.0, 0.018), -0.04, 0.04))
+    lift = float(np.clip(rng.normal(-BELT_LOWER, 0.02), -0.08, 0.02))
 
     outline = np.array(profile.top)
     z = np.interp(outline[:, 1], (0.0, profile.belt, 1.0), (0.0, profile.belt + lift, 1.0))
@@ -131,9 +134,12 @@ class Paint:
 
 
 def draw_paint(rng: np.random.Generator, dark_share: float = 0.5) -> Paint:
-    """Paint: dark lacquers shine where they are met head on and send hardly anything back elsewhere."""
+    """Paint: dark lacquers shine where they are met head on and send hardly anything back elsewhere; pale ones with
+    a matte pigment send back a good deal from any side, others scatter hardly anything where rays only graze them."""
     if rng.random() < dark_share:
         value, gloss = float(np.exp(rng.uniform(np.log(0.012), np.log(0.035)))), float(rng.uniform(0.5, 1.8))
     else:
-        value, gloss = float(np.exp(rng.uniform(np.log(0.24), np.log(0.58)))), float(rng.uniform(0.1, 0.6))
+        value, gloss = float(np.exp(rng.uniform(np.log(0.22), np.log(0.75)))), float(rng.uniform(0.1, 0.6))
+        if rng.random() < PALE_SHARE:
+            return Paint(Surface(float(rng.uniform(0.5, 0.95)), 0.1), Surface(float(rng.uniform(0.3, 0.6)), 0.2))
     return Paint(Surface(value, gloss), Surface(max(0.1 * value, 0.012), float(rng.uniform(0.25, 0.6))))

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.sim.bodies import cycles, heavy, people, styles, vehicles
+from asca_pillars.sim.bodies import bicycles, cycles, heavy, people, styles, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
 from asca_pillars.sim.scene_config import SceneConfig
@@ -127,7 +127,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     elif name == "Person_sitting":
         body = people.sitting_body(rng, height - 0.05)
     else:
-        body = people.cyclist_body(rng, height - 0.08, width, length - 0.04)
+        body = bicycles.cyclist_body(rng, height - 0.08, width, length - 0.04)
     dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
     return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 
