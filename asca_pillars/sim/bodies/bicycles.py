@@ -13,7 +13,7 @@ from asca_pillars.sim.bodies.figures import Floats, Limb, draw_cloth, draw_skin,
 from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, limbs, quads
 
 _SEGMENTS = 12  # of a wheel's circle
-_RIM = 0.74  # inner over outer radius of tire and rim together
+_RIM = 0.70  # inner over outer radius of tire and rim together
 MUDGUARD_SHARE, RACK_SHARE, REFLECTOR_SHARE = 0.8, 0.7, 0.75
 REFLECTOR = Surface(2.5, 0.5)  # sends the light back where it came from
 
@@ -115,7 +115,7 @@ def _tubes(rng: np.random.Generator, frame: _Frame, paint: float) -> Primitives:
         (post, (post[0] - 0.04, 0, 0.95)),
         ((bar, 0.29, 1.03), (bar, -0.29, 1.03)),
     ]
-    radii = np.full((len(tubes), 2), float(rng.uniform(0.03, 0.045)))
+    radii = np.full((len(tubes), 2), float(rng.uniform(0.034, 0.05)))
     surface = np.tile([paint, 0.4, 0.0], (len(tubes), 1))
     return limbs([t[0] for t in tubes], [t[1] for t in tubes], radii, surface, (0.0, 1.0, 0.0))
 
@@ -137,7 +137,7 @@ def cyclist_body(rng: np.random.Generator, height: float, width: float, length: 
 def _rider(rng: np.random.Generator, neck: Floats, width: float, bar_x: float) -> Primitives:
     """Trunk, arms and legs between saddle, pedals and handlebar."""
     upper, lower, shoe = draw_cloth(rng, 3, dark_share=0.15)
-    bulk = float(rng.uniform(1.15, 1.5))
+    bulk = float(rng.uniform(1.2, 1.55))
     shoulder = float(np.clip(0.36 * width, 0.17, 0.26))
     hips = np.array([-0.28, 0.0, 0.99])
     pedal = rng.uniform(0, 2 * np.pi)

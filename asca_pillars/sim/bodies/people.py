@@ -14,7 +14,7 @@ def pedestrian_body(rng: np.random.Generator, height: float, width: float, lengt
     lean = float(rng.normal(0.02, 0.03)) * h
     upper, lower, shoe = draw_cloth(rng, 3)
     skin = draw_skin(rng)
-    thick = float(rng.uniform(1.25, 1.65))
+    thick = float(rng.uniform(1.35, 1.8))
     # A box covers all the poses of a walk: in a single scan the feet are somewhere between together and far apart.
     stride = float(np.clip(length / 2 - 0.05, 0.06, 0.6)) * (1.0 if rng.random() < 0.88 else 0.2)
     # Feet rest on the ground where the step is widest: half of the walkers are near there.

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, prisms
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.placement import Occupied
+from asca_pillars.sim.world.occupied import Occupied
 
 Floats = npt.NDArray[np.float64]
 Material = tuple[float, float, float]  # reflectance, gloss, transparency

@@ -80,6 +80,13 @@ class Ground:
         yaw = numbers[groundcast.YAW] + math.atan(bend * u_m) + yaw_rad
         return float(u_m * cos - across * sin), float(u_m * sin + across * cos), float(yaw)
 
+    def to_road(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """A place in the LiDAR frame -> u, v in road coordinates."""
+        numbers = self._numbers
+        cos, sin = numbers[groundcast.COS_YAW], numbers[groundcast.SIN_YAW]
+        u, v = x_m * cos + y_m * sin, y_m * cos - x_m * sin
+        return u, v - numbers[groundcast.OFFSET] - 0.5 * numbers[groundcast.BEND] * u * u
+
     def cross_to_lidar(self, along_m: float, across_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
         """The same for the crossing road: along it to the left of the main road, across it ahead."""
         numbers = self._numbers

@@ -13,8 +13,10 @@ from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.builder import Builder
 from asca_pillars.sim.world.clutter import scatter
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.placement import Occupied, Placer, Target
+from asca_pillars.sim.world.occupied import Occupied
+from asca_pillars.sim.world.placement import Placer, Target
 from asca_pillars.sim.world.roadside import line_streets
+from asca_pillars.sim.world.screens import fill_gaps, hide_partly
 from asca_pillars.sim.world.streets import draw_ground, draw_kind
 
 # Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
@@ -58,6 +60,8 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
         for _ in range(rng.poisson(config.beyond)):
             placer.place_beyond()
     builder = Builder(rng, config, ground, occupied, kind)
+    hide_partly(builder, placer.half_hidden)
+    fill_gaps(builder, placer.targets)
     line_streets(builder)
     scatter(builder)
     return Scene(ground, tuple(placer.targets), builder.primitives(), draw_calibration(rng))
@@ -109,7 +113,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     name = target.type
     if name in ("Car", "Van"):
         # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
-        slack = rng.uniform((0.0, 0.0, -0.03), (0.16, 0.10, 0.09))
+        slack = rng.uniform((0.0, 0.0, -0.03), (0.24, 0.14, 0.09))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.1
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
