@@ -100,7 +100,7 @@ class SceneConfig:
     behind_gaps: float = 0.4  # share of vehicles behind whose ends something narrow stands
     thick_trunks: float = 0.45  # share of trees with a trunk of 0.35 to 0.6 m that spreads towards its roots
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
-    dark_paint_share: float = 0.42
+    dark_paint_share: float = 0.52
 
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
     min_points: int = 2

@@ -57,9 +57,14 @@ def _leg(h: float, side: float, stride: float, phase: float, thick: float, cloth
     return [
         ((0, side * 0.09, 0.52 * h), knee, 0.078 * thick, 0.088 * thick, lower),
         (knee, foot, 0.056 * thick, 0.062 * thick, lower),
-        ((foot[0] - 0.07, foot[1], foot[2] - 0.01 + heel), (foot[0] + 0.15, side * 0.10, foot[2] - 0.015),
-         0.055, 0.055, shoe),
-    ]  # fmt: skip
+        (
+            (foot[0] - 0.07, foot[1], foot[2] - 0.01 + heel),
+            (foot[0] + 0.15, side * 0.10, foot[2] - 0.015),
+            0.055,
+            0.055,
+            shoe,
+        ),
+    ]
 
 
 def _arm(

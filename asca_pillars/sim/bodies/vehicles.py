@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, quads
-from asca_pillars.sim.bodies.styles import Paint, Profile, draw_paint
+from asca_pillars.sim.bodies.profiles import Profile
+from asca_pillars.sim.bodies.styles import Paint, draw_paint
 
 Floats = npt.NDArray[np.float64]
 MIRROR = np.array([1.0, -1.0, 1.0])
@@ -25,9 +26,12 @@ def _unit_wheel() -> Floats:
     ring = np.stack([np.cos(angle), np.zeros(_SPOKES + 1), np.sin(angle)], axis=1)
     a, b = ring[:-1], ring[1:]
     return np.concatenate(
-        [np.stack([a, b, b, a], 1), np.stack([a, b, 0.65 * b, 0.65 * a], 1),
-         0.65 * np.stack([a[::2], b[::2], b[1::2], np.zeros_like(a[::2])], 1)]
-    )  # fmt: skip
+        [
+            np.stack([a, b, b, a], 1),
+            np.stack([a, b, 0.65 * b, 0.65 * a], 1),
+            0.65 * np.stack([a[::2], b[::2], b[1::2], np.zeros_like(a[::2])], 1),
+        ]
+    )
 
 
 _WHEEL = _unit_wheel()
@@ -54,16 +58,19 @@ def car_body(
 ) -> Primitives:
     """A lofted car or van with wheels, mirrors, plates and seats behind its glass."""
     hull = _Hull(
-        length, width, height, profile,
+        length,
+        width,
+        height,
+        profile,
         clearance=float(rng.uniform(0.12, 0.22)),
         wheel_x=np.array([rng.uniform(0.17, 0.21), rng.uniform(0.78, 0.83)]),
         wheel_radius=float(rng.uniform(0.29, 0.34)) * float(np.clip(1.0 + 0.25 * (height - 1.5), 0.95, 1.2)),
         crown=float(rng.uniform(0.04, 0.09)),
         nose_bow=float(rng.uniform(0.18, 0.42)),
         tail_bow=float(rng.uniform(0.05, 0.16)),
-    )  # fmt: skip
+    )
     paint = draw_paint(rng, dark_share)
-    trim = Surface(float(np.exp(rng.uniform(np.log(0.015), np.log(0.2)))), 0.5)
+    trim = Surface(float(np.exp(rng.uniform(np.log(0.008), np.log(0.06)))), 0.5)
     corners, table = _shell(hull, paint, trim, rng)
     corners = np.concatenate([corners, corners * MIRROR])
     floor = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (0.45 * length, 0.45 * width)
@@ -163,8 +170,8 @@ def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
 
 def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
     """A wheel at each x on both sides: tyre tread, and a dark sidewall around a rim that shines more or less."""
-    rubber = Surface(float(np.exp(rng.uniform(np.log(0.02), np.log(0.15)))), 0.3)
-    rim = Surface(float(np.exp(rng.uniform(np.log(0.08), np.log(0.7)))), 0.6)
+    rubber = Surface(float(np.exp(rng.uniform(np.log(0.01), np.log(0.06)))), 0.3)
+    rim = Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.5)))), 0.6)
     faces = radius_m * _WHEEL
     faces[:_SPOKES, 2:, 1] -= min(0.2, half_track_m)  # the tread reaches inwards
     table = np.repeat(np.stack([rubber.row, rim.row]), (2 * _SPOKES, _SPOKES // 2), axis=0)

@@ -66,7 +66,7 @@ def cast(bodies: Bodies, objects: int, ground: Ground | None, firings: Firings, 
                      bodies.ell_owner, bodies.ell_salt, sensor, buffers, key)  # fmt: skip
     if ground is not None:
         grass = np.random.default_rng(seed).random((rings, columns), np.float32)
-        cast_ground(ground.shape, ground.relief, ground.reflectance, ground.z_m, sensor, buffers, grass)
+        cast_ground(ground.street, ground.relief, ground.reflectance, ground.z_m, sensor, buffers, grass)
     seen = owner[:, firings.in_camera]
     visible = np.bincount(seen[seen >= 0], minlength=objects).astype(np.int64)
     return Hits(rho, cosine, reflectance, owner, alone, visible)

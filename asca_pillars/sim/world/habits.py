@@ -9,6 +9,7 @@ from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
 
 Floats = npt.NDArray[np.float64]
+QUARTER_TURNS = (0.0, np.pi, np.pi / 2, -np.pi / 2)
 NOSE_IN_M, ALONG_M = (0.5, 1.1), (0.4, 1.8)  # gaps between parked cars side by side and one behind the other
 
 
@@ -45,8 +46,10 @@ class Habits:
         at_junction = ground.cross_half_m > 0 and rng.random() < config.zebra_at_junction
         beside = ground.cross_u_m - rng.choice([-1.0, 1.0]) * (ground.cross_half_m + 2.5)
         anywhere = float(rng.uniform(6.0, 45.0))
-        self.zebra_u = (float(beside) if at_junction and beside > 0 else anywhere,
-                        float(beside) if at_junction and beside < 0 else -anywhere)  # fmt: skip
+        self.zebra_u = (
+            float(beside) if at_junction and beside > 0 else anywhere,
+            float(beside) if at_junction and beside < 0 else -anywhere,
+        )
 
     def vehicle(self, size: Floats, way: float) -> Candidate:
         """A car, van, truck or trailer: parked, in a yard, half hidden aside, on the crossing road, or on its way."""
@@ -149,9 +152,14 @@ class Habits:
         return self._at(self.riders, u, v, heading)
 
     def _at(
-        self, company: list[Neighbor], u: float, v: float, heading: float, length: float = 0.0,
+        self,
+        company: list[Neighbor],
+        u: float,
+        v: float,
+        heading: float,
+        length: float = 0.0,
         sway: tuple[float, float] = (0.0, 0.0),
-    ) -> Candidate:  # fmt: skip
+    ) -> Candidate:
         """A candidate beside which others of `company` may stand; `sway` is the spread of its place and heading."""
         across, turn = (float(self.rng.normal(0.0, spread)) if spread else 0.0 for spread in sway)
         place = self.ground.to_lidar(u, v + across, heading + turn)
@@ -196,7 +204,7 @@ class Habits:
         """In drives, yards and car parks, where the next one may stand beside it."""
         rng, ground = self.rng, self.ground
         v = (1.0 if rng.random() < 0.6 else -1.0) * (ground.half_width_m + ground.pavement_m + rng.uniform(2.0, 22.0))
-        heading = float(rng.choice([0.0, np.pi, np.pi / 2, -np.pi / 2], p=[0.3, 0.3, 0.2, 0.2])) + rng.normal(0, 0.12)
+        heading = float(rng.choice(QUARTER_TURNS, p=[0.3, 0.3, 0.2, 0.2])) + rng.normal(0, 0.12)
         return self._at(self.parked, way * self._distance(2.0, 15.0), v, heading, size[0])
 
     def _half_hidden(self, way: float) -> Candidate:

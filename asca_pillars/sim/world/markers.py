@@ -76,22 +76,42 @@ def leaning_board(builder: Builder, along: float, across: float) -> None:
 
 
 def mast(builder: Builder, along: float, across: float) -> None:
-    """A thick mast with boxes, bands of tape, notices and a foot wider than itself."""
+    """A mast, thin or thick, with boxes as high as a person, bands of tape, notices and a foot wider than itself."""
     rng = builder.rng
-    radius = float(rng.uniform(0.08, 0.28))
+    radius = float(rng.uniform(0.03, 0.09) if rng.random() < 0.6 else rng.uniform(0.09, 0.28))
     if not builder.claim(along, across, 0.6, 0.6):
         return
     builder.post(along, across, -0.3, float(rng.uniform(2.4, 7.0)), radius, float(rng.uniform(0.15, 0.5)), taper=0.85)
     if rng.random() < 0.6:
         builder.post(along, across, -0.2, float(rng.uniform(0.3, 1.2)), 1.5 * radius, float(rng.uniform(0.15, 0.5)))
+    z = float(rng.uniform(0.2, 0.8))
     for _ in range(int(rng.integers(1, 4))):
-        size = (float(rng.uniform(0.12, 0.35)), float(rng.uniform(0.2, 0.5)), float(rng.uniform(0.25, 0.8)))
+        size = (float(rng.uniform(0.15, 0.4)), float(rng.uniform(0.25, 0.6)), float(rng.uniform(0.25, 0.8)))
         turn = float(rng.uniform(0, 2 * np.pi))
         at, beside = along + radius * np.cos(turn), across + radius * np.sin(turn)
-        builder.box(float(at), float(beside), float(rng.uniform(0.3, 1.6)), size, material(builder), yaw=turn)
+        builder.box(float(at), float(beside), z, size, material(builder), yaw=turn)
+        z += size[2] * float(rng.uniform(0.6, 1.2))
     if rng.random() < 0.5:  # tape or a notice
         z, height = float(rng.uniform(0.5, 1.6)), float(rng.uniform(0.1, 0.5))
         builder.post(along, across, z, height, radius + 0.02, retroreflective(builder)[0])
+
+
+def covered_thing(builder: Builder, along: float, across: float) -> None:
+    """Something under a sheet, in a sack or wound with plants: a pump, a statue, stacked chairs, a parasol; some of it
+    tied to a pole."""
+    rng = builder.rng
+    wide, tall = float(rng.uniform(0.14, 0.34)), float(rng.uniform(0.9, 1.9))
+    if not builder.claim(along, across, 2.2 * wide, 2.2 * wide):
+        return
+    pieces, reflectance = int(rng.integers(3, 7)), float(rng.uniform(0.12, 0.6))
+    for i in range(pieces):
+        half = 0.7 * tall / pieces
+        radii = (wide * float(rng.uniform(0.6, 1.2)), wide * float(rng.uniform(0.6, 1.2)), half)
+        shift = rng.normal(0.0, 0.2 * wide, 2)
+        builder.ball(along + float(shift[0]), across + float(shift[1]), (i + 0.5) * tall / pieces, radii, reflectance)
+    if rng.random() < 0.4:
+        aside = float(rng.normal(0.0, wide))
+        builder.post(along + aside, across, -0.2, float(rng.uniform(2.2, 5.0)), float(rng.uniform(0.03, 0.09)), 0.35)
 
 
 def wall_end(builder: Builder, along: float, across: float) -> None:
@@ -104,8 +124,13 @@ def wall_end(builder: Builder, along: float, across: float) -> None:
         builder.box(along, across, -0.3, (length, thick, tall + 0.3), stone, yaw=yaw)
         if rng.random() < 0.5:
             beside = across + (0.5 * length if yaw > 0.8 else 0.0)
-            builder.box(along if yaw > 0.8 else along + 0.5 * length, beside, -0.3,
-                        (thick + 0.12, thick + 0.12, tall + 0.5), stone)  # fmt: skip
+            builder.box(
+                along if yaw > 0.8 else along + 0.5 * length,
+                beside,
+                -0.3,
+                (thick + 0.12, thick + 0.12, tall + 0.5),
+                stone,
+            )
 
 
 def fragments(builder: Builder, along: float, across: float) -> None:

@@ -159,6 +159,8 @@ def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: 
         blob_salts.append(first + 8000 + np.arange(len(body.centers)))
     return Bodies(
         Primitives.join(parts),
-        np.concatenate(owners).astype(np.int64), np.concatenate(salts).astype(np.int64),
-        np.concatenate(blob_owners).astype(np.int64), np.concatenate(blob_salts).astype(np.int64),
-    )  # fmt: skip
+        np.concatenate(owners).astype(np.int64),
+        np.concatenate(salts).astype(np.int64),
+        np.concatenate(blob_owners).astype(np.int64),
+        np.concatenate(blob_salts).astype(np.int64),
+    )
