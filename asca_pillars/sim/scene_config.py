@@ -50,7 +50,7 @@ class SceneConfig:
     # Shares of walkers by heading; the others walk along the street.
     pedestrian_uniform_heading: float = 0.45
     pedestrian_across_sight: float = 0.30  # of the sensor, at a right angle give or take 20 degrees
-    in_company: float = 0.48
+    in_company: float = 0.42
     side_by_side: float = 0.6  # of those in company; the others walk behind or meet
     side_by_side_m: tuple[float, float] = (0.45, 0.80)
     zebra_at_junction: float = 0.6

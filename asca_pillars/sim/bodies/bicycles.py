@@ -14,7 +14,8 @@ from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ell
 
 _SEGMENTS = 12  # of a wheel's circle
 _RIM = 0.70  # inner over outer radius of tire and rim together
-MUDGUARD_SHARE, RACK_SHARE, REFLECTOR_SHARE = 0.8, 0.7, 0.75
+MUDGUARD_SHARE, RACK_SHARE, REFLECTOR_SHARE = 0.8, 0.7, 0.8
+STRIPED_TIRE_SHARE, VEST_SHARE = 0.45, 0.2  # with a ring of foil on the sidewalls; riders with foil on their jacket
 REFLECTOR = Surface(2.5, 0.5)  # sends the light back where it came from
 
 
@@ -47,7 +48,7 @@ def bicycle(rng: np.random.Generator, length: float) -> Primitives:
         parts.append(_mudguards(frame, Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.6)))), 0.4)))
     if rng.random() < REFLECTOR_SHARE:
         lamps = ((frame.hub_x - 0.1, 0.78), (-frame.hub_x - frame.wheel_radius + 0.04, 0.62))
-        rows += [(x, 0, z, 0.05, 0.08, 0.08, 0, *REFLECTOR.row) for x, z in lamps]
+        rows += [(x, 0, z, 0.06, 0.10, 0.10, 0, *REFLECTOR.row) for x, z in lamps]
         rows += [
             (
                 hub + 0.6 * frame.wheel_radius * np.cos(turn),
@@ -71,6 +72,7 @@ def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
     angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
     ring = frame.wheel_radius * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
     rubber = Surface(float(np.exp(rng.uniform(np.log(0.12), np.log(0.5)))), 0.3)
+    sidewall = Surface(float(rng.uniform(0.6, 2.0)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
     spokes = Surface(float(rng.uniform(0.1, 0.4)), 0.2, float(rng.uniform(0.5, 0.75)))
     a, b, side = ring[:-1], ring[1:], np.array([0.0, 0.035, 0.0])
     faces = np.stack(
@@ -82,7 +84,7 @@ def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
     )
     hubs = np.array([[frame.hub_x, 0.0, frame.wheel_radius], [-frame.hub_x, 0.0, frame.wheel_radius]])
     corners = faces + hubs[:, None, None, None]
-    table = np.stack([rubber.row, rubber.row, spokes.row])[None, :, None]
+    table = np.stack([rubber.row, sidewall.row, spokes.row])[None, :, None]
     return quads(corners, np.broadcast_to(table, (*corners.shape[:3], 3)))
 
 
@@ -146,6 +148,10 @@ def _rider(rng: np.random.Generator, neck: Floats, width: float, bar_x: float) -
         (_offset(hips, 0, 0, -0.05), _offset(neck, 0, 0, -0.04), shoulder, 0.125 * bulk, upper),
         (_offset(hips, -0.02, 0, -0.06), _offset(hips, 0.06, 0, 0.08), 0.16 * bulk, 0.13 * bulk, lower),
     ]
+    if rng.random() < VEST_SHARE:
+        foil = np.array([rng.uniform(0.8, 2.0), 0.3, 0.0])
+        middle = 0.5 * (hips + neck)
+        rows.append((_offset(middle, 0, 0, -0.06), _offset(middle, 0.02, 0, 0.08), 1.04 * shoulder, 0.14 * bulk, foil))
     if rng.random() < 0.4:  # a jacket that hangs over the hips
         rows.append((_offset(hips, -0.06, 0, -0.12), 0.5 * (hips + neck), 0.19 * bulk, 0.15 * bulk, upper))
     for side in (1.0, -1.0):

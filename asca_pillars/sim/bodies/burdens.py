@@ -12,9 +12,9 @@ SHARES = {
     "bag": 0.18,
     "hip_bag": 0.08,
     "suitcase": 0.03,
-    "pram": 0.06,
-    "bicycle": 0.05,
-    "umbrella": 0.05,
+    "pram": 0.04,
+    "bicycle": 0.04,
+    "umbrella": 0.03,
 }
 _WALKER_M = 1.5  # children push nothing
 
@@ -55,7 +55,7 @@ def _pram(cloth: np.ndarray) -> Primitives:
 
 def _umbrella(rng: np.random.Generator, height: float, lean_m: float, side: float, cloth: np.ndarray) -> Primitives:
     """Open, over the head: a flat cap on a stick. It stands out of the label's box, as KITTI's do."""
-    top, radius = height + float(rng.uniform(0.02, 0.15)), float(rng.uniform(0.42, 0.55))
-    place = (lean_m + 0.1, side * 0.15, top - 0.1)
+    top, radius = height + float(rng.uniform(0.0, 0.1)), float(rng.uniform(0.35, 0.45))
+    place = (lean_m + 0.05, side * 0.05, top - 0.1)
     stick = prisms([(place[0], place[1], 0.6 * height, top - 0.6 * height, 0.02, 0.02, 0.2)], sides=4)
-    return Primitives.join([ellipsoids([place], [(radius, radius, 0.14)], cloth), stick])
+    return Primitives.join([ellipsoids([place], [(radius, radius, 0.1)], cloth), stick])

@@ -16,7 +16,7 @@ def pedestrian_body(rng: np.random.Generator, height: float, width: float, lengt
     skin = draw_skin(rng)
     thick = float(rng.uniform(1.35, 1.8))
     # A box covers all the poses of a walk: in a single scan the feet are somewhere between together and far apart.
-    stride = float(np.clip(length / 2 - 0.05, 0.06, 0.6)) * (1.0 if rng.random() < 0.88 else 0.2)
+    stride = float(np.clip(length / 2 - 0.07, 0.06, 0.58)) * (1.0 if rng.random() < 0.88 else 0.2)
     # Feet rest on the ground where the step is widest: half of the walkers are near there.
     phase = float(rng.uniform(0.0, 2 * np.pi) if rng.random() < 0.5 else rng.normal(np.pi / 2, 0.5))
     rows: list[Limb] = [

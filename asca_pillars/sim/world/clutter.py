@@ -81,7 +81,16 @@ def any_shrub(builder: Builder, along: float, across: float) -> None:
     shrub(builder, along, across, tall=bool(builder.rng.random() < 0.35))
 
 
-FAR: tuple[Thing, ...] = (low_pieces, low_pieces, fragments, board, weeds)  # low and sparse clutter beyond 28 m
+FAR: tuple[Thing, ...] = (
+    low_pieces,
+    low_pieces,
+    low_pieces,
+    fragments,
+    weeds,
+    covered_thing,
+    board,
+    mast,
+)  # low and sparse clutter beyond 28 m
 SHARES: dict[Thing, float] = {
     pole: 0.09,
     pole_group: 0.04,
@@ -112,8 +121,8 @@ SHARES: dict[Thing, float] = {
     striped_post: 0.08,
     board: 0.08,
     leaning_board: 0.04,
-    mast: 0.08,
-    covered_thing: 0.06,
+    mast: 0.10,
+    covered_thing: 0.07,
     wall_end: 0.03,
     fragments: 0.05,
     low_pieces: 0.03,

@@ -9,7 +9,7 @@ from asca_pillars.sim.world.furniture import material
 
 def retroreflective(builder: Builder) -> Material:
     """Foil that sends light back to where it came from: the sensor reports 0.6 to 0.99, far away too."""
-    return (float(np.exp(builder.rng.uniform(np.log(0.7), np.log(4.0)))), 0.3, 0.0)
+    return (float(np.exp(builder.rng.uniform(np.log(0.8), np.log(5.0)))), 0.3, 0.0)
 
 
 def beacon(builder: Builder, along: float, across: float) -> None:

@@ -184,7 +184,7 @@ def trunk(builder: Builder, along: float, across: float, height: float, cross: b
         if rng.random() < 0.4:  # a low kerb round its bed
             wide = float(rng.uniform(0.8, 1.8))
             builder.box(along, across, -0.2, (wide, wide, 0.2 + float(rng.uniform(0.04, 0.16))), (0.3, 0.3, 0.0), cross)
-    if rng.random() < 0.2:  # ivy or shoots round its foot
+    if rng.random() < 0.3:  # ivy or shoots round its foot
         round_it = (radius + float(rng.uniform(0.1, 0.3)), float(rng.uniform(0.4, 0.9)))
         crown(builder, along, across, 0.9 * round_it[1], round_it, float(rng.uniform(3.0, 8.0)), cross)
     for _ in range(boles):

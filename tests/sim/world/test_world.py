@@ -91,7 +91,9 @@ def test_every_kind_of_street_is_lined_and_cluttered(kind: str) -> None:
     assert builder.occupied.count > lined
     assert np.isfinite(primitives.triangles).all()
     assert np.isfinite(primitives.unit_from_world).all()
-    assert (primitives.triangle_surface[:, 0] > 0).all() and (primitives.triangle_surface[:, 0] < 1).all()
+    assert (primitives.triangle_surface[:, 0] > 0).all() and (
+        primitives.triangle_surface[:, 0] <= 5
+    ).all()  # foil sends light back to where it came from
     assert set(LININGS) == set(KINDS)
 
 
