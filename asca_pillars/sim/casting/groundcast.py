@@ -1,5 +1,7 @@
 """The height and the material of the ground (compiled by numba)."""
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 import numpy.typing as npt
@@ -15,45 +17,73 @@ RELIEF_HALF_M = 96.0
 NO_RAILS = -1000.0
 ASPHALT, PAVEMENT, VERGE, MARKING, RAIL, BALLAST = range(6)
 
-# Positions of the fields of Ground.shape: what numba reads has no names.
-YAW, BEND, OFFSET, HALF_WIDTH, CROSS_U, CROSS_HALF, CROSS_TILT, KERB, WALK, LANE = range(10)
-BANK_LEFT, BANK_RIGHT, RAILS_V, MEDIAN_HALF, ROUGH, CAMBER = range(10, 16)
-TRACKS, RAIL_RISE, BED, BED_HALF, SECOND_V, SECOND_HALF, DITCH = range(16, 23)
-# Derived, because heights are asked for by the million; RISE is how far all that may stand above the hills.
-COS_YAW, SIN_YAW, COS_TILT, SIN_TILT, RISE = range(23, 28)
+
+class Street(NamedTuple):
+    """What the ground of a street looks like: metres, slopes and radians, in road coordinates (`world.ground`). What
+    is 0 is absent."""
+
+    yaw_rad: float
+    bend_per_m: float
+    offset_m: float
+    half_width_m: float
+    cross_u_m: float
+    cross_half_m: float
+    cross_tilt_rad: float
+    kerb_m: float
+    pavement_m: float
+    lane_m: float
+    bank_left: float
+    bank_right: float
+    rails_v_m: float  # NO_RAILS where there are none
+    median_half_m: float
+    rough_m: float
+    camber: float
+    tracks: float
+    rail_m: float
+    bed_m: float
+    bed_half_m: float
+    second_v_m: float
+    second_half_m: float
+    ditch_m: float
+    # Derived, because heights are asked for by the million.
+    cos_yaw: float
+    sin_yaw: float
+    cos_tilt: float
+    sin_tilt: float
+    rise_m: float  # how far all that may stand above the hills
 
 
 @numba.njit(cache=True)
-def heights(points: Floats, shape: Floats, relief: Floats, z_m: float) -> Floats:
+def heights(points: Floats, street: Street, relief: Floats, z_m: float) -> Floats:
     """`ground_height` of many points (N,2)."""
     result = np.empty(len(points))
     for i in range(len(points)):
-        result[i] = ground_height(points[i, 0], points[i, 1], shape, relief, z_m)
+        result[i] = ground_height(points[i, 0], points[i, 1], street, relief, z_m)
     return result
 
 
 @numba.njit(cache=True, inline="always")
-def road_distances(x: float, y: float, shape: Floats) -> tuple[float, float, float, float, float]:
+def road_distances(x: float, y: float, street: Street) -> tuple[float, float, float, float, float]:
     """Road coordinates u, v, then how far outside the main road (either carriageway), the crossing road and both
     (negative inside)."""
-    cos, sin = shape[COS_YAW], shape[SIN_YAW]
+    cos, sin = street.cos_yaw, street.sin_yaw
     u = x * cos + y * sin
-    v = y * cos - x * sin - shape[OFFSET] - 0.5 * shape[BEND] * u * u
-    main = abs(v) - shape[HALF_WIDTH]
-    if shape[SECOND_HALF] > 0.0:
-        main = min(main, abs(v - shape[SECOND_V]) - shape[SECOND_HALF])
+    v = y * cos - x * sin - street.offset_m - 0.5 * street.bend_per_m * u * u
+    main = abs(v) - street.half_width_m
+    if street.second_half_m > 0.0:
+        main = min(main, abs(v - street.second_v_m) - street.second_half_m)
     cross = 1e3
-    if shape[CROSS_HALF] > 0.0:
-        cross = abs((u - shape[CROSS_U]) * shape[COS_TILT] + v * shape[SIN_TILT]) - shape[CROSS_HALF]
+    if street.cross_half_m > 0.0:
+        cross = abs((u - street.cross_u_m) * street.cos_tilt + v * street.sin_tilt) - street.cross_half_m
     return u, v, main, cross, min(main, cross)
 
 
 @numba.njit(cache=True)
-def outside_roads(points: Floats, shape: Floats) -> Floats:
+def outside_roads(points: Floats, street: Street) -> Floats:
     """How far each of (N,2) points lies outside all roads (negative inside), metres."""
     result = np.empty(len(points))
     for i in range(len(points)):
-        _, _, _, _, result[i] = road_distances(points[i, 0], points[i, 1], shape)
+        _, _, _, _, result[i] = road_distances(points[i, 0], points[i, 1], street)
     return result
 
 
@@ -66,7 +96,7 @@ def on_rail(from_middle: float, tracks: float) -> bool:
 
 
 @numba.njit(cache=True, inline="always")
-def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float) -> float:
+def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float) -> float:
     """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them."""
     cells = relief.shape[0] - 1
     row = min(max((x + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
@@ -75,44 +105,44 @@ def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float)
     a, b = row - i, col - j
     height = (relief[i, j] * (1 - a) + relief[i + 1, j] * a) * (1 - b)
     height += (relief[i, j + 1] * (1 - a) + relief[i + 1, j + 1] * a) * b
-    _, v, main, cross, outside = road_distances(x, y, shape)
+    _, v, main, cross, outside = road_distances(x, y, street)
     if outside <= 0.0:
-        height += shape[CAMBER] * min(-main, 4.0) if main < 0 else 0.0
-        if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF] and cross > 3.0:
-            height += shape[KERB]
+        height += street.camber * min(-main, 4.0) if main < 0 else 0.0
+        if street.median_half_m > 0.0 and abs(v) < street.median_half_m and cross > 3.0:
+            height += street.kerb_m
     else:
-        height += shape[KERB] * min(outside / 0.05, 1.0)
-        beyond = outside - shape[WALK]
+        height += street.kerb_m * min(outside / 0.05, 1.0)
+        beyond = outside - street.pavement_m
         if beyond > 0.0 and cross > 2.0:
             away = min((cross - 2.0) / 6.0, 1.0)  # banks and ditches end at a crossing, not as a cliff
-            if shape[DITCH] > 0.0:
-                height -= away * shape[DITCH] * max(1.0 - abs(beyond / DITCH_HALF_M - 1.0), 0.0)
+            if street.ditch_m > 0.0:
+                height -= away * street.ditch_m * max(1.0 - abs(beyond / DITCH_HALF_M - 1.0), 0.0)
                 beyond = max(beyond - 2.0 * DITCH_HALF_M, 0.0)
-            height += away * (shape[BANK_LEFT] if v > 0 else shape[BANK_RIGHT]) * min(beyond, BANK_RUN_M)
-    if shape[RAILS_V] > NO_RAILS:
-        from_middle = abs(v - shape[RAILS_V])
-        if from_middle < shape[BED_HALF] and cross > 1.0:
-            height += shape[BED] * min((shape[BED_HALF] - from_middle) / 0.25, 1.0)
-        if on_rail(from_middle, shape[TRACKS]):
-            height += shape[RAIL_RISE]
+            height += away * (street.bank_left if v > 0 else street.bank_right) * min(beyond, BANK_RUN_M)
+    if street.rails_v_m > NO_RAILS:
+        from_middle = abs(v - street.rails_v_m)
+        if from_middle < street.bed_half_m and cross > 1.0:
+            height += street.bed_m * min((street.bed_half_m - from_middle) / 0.25, 1.0)
+        if on_rail(from_middle, street.tracks):
+            height += street.rail_m
     return z_m + height
 
 
 @numba.njit(cache=True)
-def ground_material(x: float, y: float, shape: Floats) -> int:
+def ground_material(x: float, y: float, street: Street) -> int:
     """Material of the ground at (x, y)."""
-    u, v, main, cross, outside = road_distances(x, y, shape)
-    if shape[RAILS_V] > NO_RAILS:
-        from_middle = abs(v - shape[RAILS_V])
-        if on_rail(from_middle, shape[TRACKS]):
+    u, v, main, cross, outside = road_distances(x, y, street)
+    if street.rails_v_m > NO_RAILS:
+        from_middle = abs(v - street.rails_v_m)
+        if on_rail(from_middle, street.tracks):
             return RAIL
-        if from_middle < shape[BED_HALF] and cross > 1.0:
+        if from_middle < street.bed_half_m and cross > 1.0:
             return BALLAST
     if outside > 0.0:
-        return VERGE if outside > shape[WALK] else PAVEMENT
-    if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF]:
+        return VERGE if outside > street.pavement_m else PAVEMENT
+    if street.median_half_m > 0.0 and abs(v) < street.median_half_m:
         return VERGE
-    lane = shape[LANE]
+    lane = street.lane_m
     if lane > 0.0 and main < 0.0 and cross > 0.0:
         to_line = abs(v / lane - np.round(v / lane)) * lane
         if to_line < 0.07 and u - 9.0 * np.floor(u / 9.0) < 4.0:

@@ -10,9 +10,8 @@ from asca_pillars.sim.casting.groundcast import (
     GROUND,
     RAIL,
     RELIEF_STEP_M,
-    RISE,
-    ROUGH,
     VERGE,
+    Street,
     ground_height,
     ground_material,
     highest_within,
@@ -51,9 +50,9 @@ class GroundRay(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always")
-def gap_at(ray: GroundRay, reach: float, shape: Floats, relief: Floats, z_m: float) -> float:
+def gap_at(ray: GroundRay, reach: float, street: Street, relief: Floats, z_m: float) -> float:
     """Height of a ray above the ground at a horizontal distance."""
-    return ray.up + ray.slope * reach - ground_height(reach * ray.dx, reach * ray.dy, shape, relief, z_m)
+    return ray.up + ray.slope * reach - ground_height(reach * ray.dx, reach * ray.dy, street, relief, z_m)
 
 
 @numba.njit(cache=True)
@@ -77,7 +76,7 @@ def descend(
     clear: float,
     expected: float,
     limit: float,
-    shape: Floats,
+    street: Street,
     relief: Floats,
     z_m: float,
 ) -> Descent:
@@ -87,10 +86,10 @@ def descend(
     begins there, and looks there first once it is low.
     """
     near, reach, above = clear, clear, 0.0
-    gap = gap_at(ray, reach, shape, relief, z_m)
+    gap = gap_at(ray, reach, street, relief, z_m)
     if gap < CLEAR_M and clear > start:
         near, reach = start, start
-        gap = gap_at(ray, reach, shape, relief, z_m)
+        gap = gap_at(ray, reach, street, relief, z_m)
     clear, descending = start, max(-ray.slope, 0.0)
     far_above = descending > 0.03  # flatter rays graze crests that a neighbor may just have missed
     while gap > 0.0 and reach < limit:
@@ -107,12 +106,12 @@ def descend(
             if descending > 0.0:
                 step = max(step, min(0.5 * gap / descending, 3.0))
             reach = near + step
-        gap = gap_at(ray, reach, shape, relief, z_m)
+        gap = gap_at(ray, reach, street, relief, z_m)
     return Descent(near, above, reach, gap, clear)
 
 
 @numba.njit(cache=True)
-def meeting(ray: GroundRay, way: Descent, shape: Floats, relief: Floats, z_m: float) -> tuple[float, float]:
+def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: float) -> tuple[float, float]:
     """Where a ray meets the ground between above it and below, and what is left between them there: false position,
     halving the weight of an end that stays."""
     near, above, reach, gap = way.near_m, way.above_m, way.reach_m, way.gap_m
@@ -121,7 +120,7 @@ def meeting(ray: GroundRay, way: Descent, shape: Floats, relief: Floats, z_m: fl
         if reach - near < 0.004 or above <= 0.0 or left > -SAME_M:
             break
         middle = near + (reach - near) * above / (above - gap)
-        here = gap_at(ray, middle, shape, relief, z_m)
+        here = gap_at(ray, middle, street, relief, z_m)
         if abs(here) < MET_M:
             return middle, here
         if here > 0.0:
@@ -132,11 +131,11 @@ def meeting(ray: GroundRay, way: Descent, shape: Floats, relief: Floats, z_m: fl
 
 
 @numba.njit(cache=True)
-def facing_of(ray: GroundRay, reach: float, height: float, shape: Floats, relief: Floats, z_m: float) -> float:
+def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relief: Floats, z_m: float) -> float:
     """Cosine of the angle at which a ray meets the ground of this height there."""
     x, y, step = reach * ray.dx, reach * ray.dy, 0.05
-    gx = (ground_height(x + step, y, shape, relief, z_m) - height) / step
-    gy = (ground_height(x, y + step, shape, relief, z_m) - height) / step
+    gx = (ground_height(x + step, y, street, relief, z_m) - height) / step
+    gy = (ground_height(x, y + step, street, relief, z_m) - height) / step
     gx, gy = min(max(gx, -3.0), 3.0), min(max(gy, -3.0), 3.0)
     facing = abs(ray.slope - gx * ray.dx - gy * ray.dy)
     return facing / (np.sqrt(1.0 + gx * gx + gy * gy) * np.sqrt(1.0 + ray.slope**2))
@@ -144,7 +143,7 @@ def facing_of(ray: GroundRay, reach: float, height: float, shape: Floats, relief
 
 @numba.njit(cache=True)
 def cast_ground(
-    shape: Floats, relief: Floats, materials: Floats, z_m: float, rays: Rays, nearest: NearestHits, key: int
+    street: Street, relief: Floats, materials: Floats, z_m: float, rays: Rays, nearest: NearestHits, key: int
 ) -> None:
     """Walk every ray down to the ground and keep the hit where nothing was nearer; street as in `Ground`."""
     # Taken out of their tuples once: numba counts references at every access.
@@ -152,12 +151,12 @@ def cast_ground(
     cos_azimuth, sin_azimuth, is_cast = rays.cos_azimuth, rays.sin_azimuth, rays.cast
     rho, cosine, reflectance, owner = nearest.rho_m, nearest.cosine, nearest.reflectance, nearest.owner
     highest = highest_within(relief)
-    rough = shape[ROUGH]
+    rough = street.rough_m
     columns = len(is_cast)
     group = max(int(GROUP_DEG / 360.0 * columns), 1)
     for k in range(len(slopes)):
         up, slope, cos, sin = origins[k], slopes[k], cos_phase[k], sin_phase[k]
-        start = first_distance(up, slope, highest, shape[RISE], z_m)
+        start = first_distance(up, slope, highest, street.rise_m, z_m)
         # What a neighbor met holds for this ray, too. Neighbors come in small groups, so that a ray does not depend on
         # whether those far from it are cast.
         clear, expected = start, 0.0
@@ -169,16 +168,16 @@ def cast_ground(
             x, y = cos_azimuth[j], sin_azimuth[j]
             ray = GroundRay(up, slope, x * cos - y * sin, y * cos + x * sin)
             limit = min(rho[k, j], REACH_M)
-            way = descend(ray, start, clear, expected, limit, shape, relief, z_m)
+            way = descend(ray, start, clear, expected, limit, street, relief, z_m)
             clear, expected = way.clear_m, 0.0
             if way.gap_m > 0.0:
                 continue
-            reach, left = meeting(ray, way, shape, relief, z_m)
+            reach, left = meeting(ray, way, street, relief, z_m)
             if reach >= limit:
                 continue
             expected = reach
-            facing = facing_of(ray, reach, up + slope * reach - left, shape, relief, z_m)
-            material = ground_material(reach * ray.dx, reach * ray.dy, shape)
+            facing = facing_of(ray, reach, up + slope * reach - left, street, relief, z_m)
+            material = ground_material(reach * ray.dx, reach * ray.dy, street)
             if material == VERGE:
                 # Blades of grass end the ray before the soil does, and stand up to it.
                 reach -= rough * ray_chance(key, k, j, GRASS_SALT) ** 2 / max(0.12, abs(slope))

@@ -73,7 +73,7 @@ def cast(bodies: Bodies, objects: int, ground: Ground | None, firings: Firings, 
         key,
     )
     if ground is not None:
-        cast_ground(ground.shape, ground.relief, ground.reflectance, ground.z_m, rays, nearest, key)
+        cast_ground(ground.street, ground.relief, ground.reflectance, ground.z_m, rays, nearest, key)
     seen = nearest.owner[:, firings.counted]
     visible = np.bincount(seen[seen >= 0], minlength=objects).astype(np.int64)
     return Hits(nearest.rho_m, nearest.cosine, nearest.reflectance, nearest.owner, nearest.alone, visible)
