@@ -149,6 +149,11 @@ def _fixed_scores(model: Model, score: float | None, min_score: float) -> dict[s
     """For each class the score from which on detections count for precision and recall."""
     known = {name.lower(): name for name in CLASS_NAMES}
     scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
+    if not any(item.name.lower() in known for item in model.spec.classes):
+        raise ConfigError(
+            f"{model.name} detects {', '.join(item.name for item in model.spec.classes)}; KITTI's protocol scores "
+            f"{', '.join(CLASS_NAMES)}: give --protocol waymo, which scores any class"
+        )
     for item in model.spec.classes:
         if item.name.lower() not in known:
             continue  # the report names it

@@ -187,6 +187,21 @@ def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
     )
 
 
+def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path, root: Path) -> None:
+    torch.manual_seed(0)
+    content = to_dict(CONFIG)
+    names = [item["name"] for item in content["detector"]["classes"]]
+    for item, name in zip(content["detector"]["classes"], ("Forklift", "Pallet", "Crane")[: len(names)], strict=True):
+        item["name"] = name
+    weights = {f"detector.{name}": value for name, value in build_detector(CONFIG).state_dict().items()}
+    torch.save(
+        {"hyper_parameters": {"config": content}, "state_dict": weights, "global_step": 7}, tmp_path / "last.ckpt"
+    )
+    message = refusal(tmp_path, model=tmp_path / "last.ckpt", data=root, threads=None)
+    assert "detects Forklift" in message and "give --protocol waymo, which scores any class" in message
+    assert not (tmp_path / "out").exists()
+
+
 def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
     det, gt = texts["predictions"], texts["labels"]
     assert refusal(tmp_path) == "nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR"

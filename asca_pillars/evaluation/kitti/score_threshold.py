@@ -59,17 +59,17 @@ class ScoreMatches:
 
     @property
     def missed(self) -> _Mask:
-        """(N,) counted objects that were not found: the false negatives."""
+        """(N,) mask of the counted objects that were not found: the false negatives."""
         return self.counted & ~self.found
 
     @property
     def not_counted(self) -> _Mask:
-        """(N,) objects that need not be found."""
+        """(N,) mask of the objects that need not be found."""
         return ~self.counted
 
     @property
     def ignored(self) -> _Mask:
-        """(D,) reported detections that are neither true nor false positives."""
+        """(D,) mask of the reported detections that are neither true nor false positives."""
         return self.reported & ~self.true_positive & ~self.false_positive
 
     @property
