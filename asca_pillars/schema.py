@@ -17,9 +17,9 @@ _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
 
 
 class Strict:
-    """Base of the settings dataclasses: a key that does not exist is an error at every level."""
+    """Base of the settings dataclasses: a key that does not exist, or a number that is not finite, is an error."""
 
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
 def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
