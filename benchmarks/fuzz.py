@@ -14,6 +14,7 @@ import signal
 import tempfile
 import time
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -145,7 +146,8 @@ def read(kind: Kind, content: bytes) -> tuple[str, str]:
     kind.path.write_bytes(content)
     start = time.perf_counter()
     try:
-        with _alarm():
+        with _alarm(), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # NumPy's, of sums that overflow
             result = kind.read(kind.path)
     except AscaError:
         outcome, text = "refused", ""

@@ -3,8 +3,8 @@
     python -m benchmarks.kill --kills 25
 
 Each command runs once undisturbed. Then it is started, killed (SIGKILL, with all its processes) at a random moment
-after its first output and before its last, and given again: what is there at the end has to be what the undisturbed run
-wrote, and nothing else may be left. A kill that came after the command had ended does not count and is repeated.
+after its first output and before its last, and given again: what is there at the end has to be what the undisturbed
+run wrote, and nothing else may be left. A run that was not killed in time does not count and is repeated.
 """
 
 import hashlib
@@ -177,7 +177,7 @@ def _killed(job: Job, out: Path, reference: Reference, rng: random.Random) -> fl
     """Start, and kill after a random number of writes and a random fraction of the time between two.
 
     Returns:
-        The share of the writes that was done, None if the run had ended before.
+        The share of the writes that was done; None if all were, and the run was left to end.
     """
     wanted = rng.randint(1, max(1, reference.writes - 1))
     pause_s = rng.random() * reference.seconds / reference.writes
@@ -188,12 +188,13 @@ def _killed(job: Job, out: Path, reference: Reference, rng: random.Random) -> fl
         time.sleep(POLL_S)
     time.sleep(pause_s)
     seen |= _seen(job, out) - before
-    if process.poll() is not None:
+    if process.poll() is not None or len(seen) >= reference.writes:
+        process.wait()
         _check(process, job.arguments(out))
         return None
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    return min(1.0, len(seen) / reference.writes)
+    return len(seen) / reference.writes
 
 
 def _seen(job: Job, out: Path) -> set[tuple[Path, int]]:
