@@ -106,7 +106,7 @@ class SceneConfig:
     min_points: int = 2
     min_visible_share: float = 0.05
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
     def __post_init__(self) -> None:
         normal = ("slope_x", "slope_y", "box_lift_m", "level_band_m")  # no bounds of a draw

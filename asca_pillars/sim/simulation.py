@@ -47,7 +47,7 @@ class SimulationConfig:
     lidar: Lidar = field(default_factory=Lidar)
     field_of_view: Literal["full", "camera", "around"] = "full"
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ class Lidar:
     zero_share: float = 0.03  # of all returns, reported as 0 for no reason: so the best lasers do on near, bright road
     camera_half_angle_deg: float = 43.0
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
     def __post_init__(self) -> None:
         if list(self.elevation_deg) != sorted(self.elevation_deg, reverse=True) or not self.elevation_deg:
