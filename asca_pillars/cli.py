@@ -3,7 +3,7 @@
 import io
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import typer
 
@@ -163,8 +163,8 @@ def simulate(
     view: Annotated[
         str | None,
         typer.Option(
-            help="full: 360 degrees, as KITTI stores scans; camera: only what the camera sees, 6x smaller. "
-            "Default: the config's; without one, full."
+            help="full: 360 degrees, of which the camera's part is labelled, as in KITTI; around: 360 degrees, all "
+            "of it labelled; camera: only what the camera sees, 6x smaller. Default: the config's; else full."
         ),
     ] = None,
     val_share: Annotated[
@@ -283,17 +283,25 @@ def evaluate(
         float,
         typer.Option(min=0, max=1, help="Lowest score that a model is run with: AP needs the weak detections too."),
     ] = 0.05,
+    protocol: Annotated[
+        Literal["kitti", "waymo"],
+        typer.Option(
+            help="kitti: AP and AOS of Car, Pedestrian and Cyclist. waymo: AP and APH of any class, by level and range."
+        ),
+    ] = "kitti",
     provider: ProviderName = "cpu",
     precision: Precision = None,
     threads: Threads = None,
 ) -> None:
     """Score a model, or finished predictions, by KITTI's protocol: AP and AOS, by distance, recall and precision.
 
+    With --protocol waymo by Waymo's metric: AP and APH at LEVEL_1 and LEVEL_2, everywhere and by range.
     Frames without a prediction file are left out, as by KITTI's own tool, and named in every form of the report.
     """
     from asca_pillars.commands.eval import run
 
-    run(model, data, split, predictions, labels, out, json, gallery, score, min_score, provider, precision, threads)
+    where = provider, precision, threads
+    run(model, data, split, predictions, labels, out, json, gallery, score, min_score, *where, protocol)
 
 
 @app.command()

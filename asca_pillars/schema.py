@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import reprlib
+from functools import cache
 from typing import Any, ClassVar, TypeVar, get_args
 
 import pydantic
@@ -17,9 +18,9 @@ _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
 
 
 class Strict:
-    """Base of the settings dataclasses: a key that does not exist is an error at every level."""
+    """Base of the settings dataclasses: a key that does not exist, or a number that is not finite, is an error."""
 
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
 def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
@@ -34,7 +35,7 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
         ConfigError: an unknown key (the nearest one that exists is named), a missing or an unusable value.
     """
     try:
-        return pydantic.TypeAdapter(type_).validate_python(data)
+        return _adapter(type_).validate_python(data)  # type: ignore[arg-type]  # types are hashable
     except ConfigError as error:  # a dataclass that checks its own values
         raise ConfigError(f"{source}: {error}") from None
     except pydantic.ValidationError as error:
@@ -45,8 +46,14 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
 
 def to_dict(settings: Any) -> dict[str, Any]:
     """Plain values (dict, list, str, int, float, bool, None) of a settings dataclass, for YAML or JSON."""
-    plain: dict[str, Any] = pydantic.TypeAdapter(type(settings)).dump_python(settings, mode="json")
+    plain: dict[str, Any] = _adapter(type(settings)).dump_python(settings, mode="json")  # type: ignore[arg-type]
     return plain
+
+
+@cache
+def _adapter(type_: Any) -> pydantic.TypeAdapter[Any]:
+    """Made once a type: it takes milliseconds."""
+    return pydantic.TypeAdapter(type_)
 
 
 def _explain(type_: type, error: Any) -> str:

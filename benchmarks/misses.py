@@ -3,7 +3,8 @@
     asca eval --data data/check --out evaluation
     python -m benchmarks.misses data/check evaluation --class Pedestrian --score 0.37
 
-Objects that KITTI counts at moderate, found at BEV IoU 0.5 (cars) or 0.25, as `evaluation.verdicts` judges them.
+Objects that KITTI counts at moderate, found at BEV IoU 0.5 (cars) or 0.25, matched as in
+`evaluation.kitti.score_threshold`.
 """
 
 from itertools import pairwise
@@ -15,8 +16,8 @@ import typer
 from numpy.typing import NDArray
 
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
+from asca_pillars.evaluation.kitti.score_threshold import MatchInput, match_class
 from asca_pillars.evaluation.kitti.states import is_type
-from asca_pillars.evaluation.kitti.verdicts import Scene, judge
 from asca_pillars.evaluation.report import markdown_table
 from benchmarks.transfer import FOUND_IOU, read_evaluation
 
@@ -32,22 +33,22 @@ def main(
 ) -> None:
     """Print recall of one class by what makes objects hard to find."""
     frames = read_evaluation(data, out)
-    scene = Scene.of(frames.truth, frames.detections, CLASS_NAMES, dict.fromkeys(CLASS_NAMES, score), FOUND_IOU)
-    verdict, truth, found = judge(scene, name, "moderate", "bev"), scene.frames.truth, scene.frames.detections
-    nearest = _nearest_m(truth.locations[:, [0, 2]], scene.frames.truth_frames, is_type(truth, name))
+    inputs = MatchInput.of(frames.truth, frames.detections, CLASS_NAMES, dict.fromkeys(CLASS_NAMES, score), FOUND_IOU)
+    matches, truth, found = match_class(inputs, name, "moderate", "bev"), inputs.frames.truth, inputs.frames.detections
+    nearest = _nearest_m(truth.locations[:, [0, 2]], inputs.frames.truth_frames, is_type(truth, name))
     groups = {f"{low}-{high} m away": _within(truth.distances_m, low, high) for low, high in pairwise(DISTANCES_M)}
     groups |= {f"occlusion {state}": truth.occluded == state for state in (0, 1)}
     groups |= {f"next {name} at {low}-{high} m": _within(nearest, low, high) for low, high in pairwise(NEIGHBORS_M)}
     rows = []
     for title, mask in groups.items():
-        objects, hits = int((verdict.counted & mask).sum()), int((verdict.found & mask).sum())
+        objects, hits = int((matches.counted & mask).sum()), int((matches.found & mask).sum())
         rows.append((title, str(objects), f"{hits / max(objects, 1):.2f}"))
     print(markdown_table((name, "objects", "recall"), rows, left=1))
-    pairs = scene.pairs
+    pairs = inputs.pairs
     good = pairs.overlaps["bev"] > FOUND_IOU[name]
     weak = good & is_type(found, name)[pairs.detection] & (found.scores[pairs.detection] < score)
-    below = np.isin(np.flatnonzero(verdict.missed), pairs.truth[weak]).sum()
-    print(f"{verdict.missed.sum()} missed, {below} of them with a box of their class below {score:g}")
+    below = np.isin(np.flatnonzero(matches.missed), pairs.truth[weak]).sum()
+    print(f"{matches.missed.sum()} missed, {below} of them with a box of their class below {score:g}")
 
 
 def _nearest_m(places: NDArray[np.float64], frames: NDArray[np.int64], own: NDArray[np.bool_]) -> NDArray[np.float64]:

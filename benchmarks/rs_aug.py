@@ -172,7 +172,7 @@ def _is_street_or_flat(box: NDArray[np.float64], ground: Any) -> bool:
     from asca_pillars.sim.casting.groundcast import VERGE, ground_material
 
     xy = _spread(box)
-    verge = np.array([ground_material(x, y, ground.shape) == VERGE for x, y in xy])
+    verge = np.array([ground_material(x, y, ground.street) == VERGE for x, y in xy])
     step = 0.25
     slopes = [
         (ground.heights(xy + shift) - ground.heights(xy - shift)) / (2 * step) for shift in ((step, 0.0), (0.0, step))

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.data.kitti import in_image
-from asca_pillars.sim.annotation import make_labels
+from asca_pillars.sim.annotation import label_camera_view
 from asca_pillars.sim.casting.raycast import cast
 from asca_pillars.sim.sensor.lidar import draw_firings
 from asca_pillars.sim.sensor.returns import measure
@@ -77,9 +77,8 @@ def _stages(config: SimulationConfig, frames: int, seed: int) -> dict[str, list[
         marks.append(time.process_time())
         returns = measure(hits, firings, noise)
         marks.append(time.process_time())
-        make_labels(scene.targets, hits, returns, scene.calibration, config.scene)
-        if camera_only:
-            in_image(returns.points, scene.calibration)
+        seen = in_image(returns.points, scene.calibration)
+        label_camera_view(scene.targets, hits, returns.owner[seen], scene.calibration, config.scene)
         marks.append(time.process_time())
         if index >= WARM_UP:
             steps = [*np.diff(marks), marks[-1] - marks[0]]

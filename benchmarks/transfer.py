@@ -6,7 +6,7 @@
 
 For every class the score with the best F1 on the simulated frames is taken; real frames have no say in it. At that
 score stand recall of the objects that KITTI counts at moderate and false detections per frame, for the overlap in the
-bird's-eye view that a class is asked for. `evaluation.verdicts` tells what is counted, false and excused.
+bird's-eye view that a class is asked for. `evaluation.kitti.score_threshold` tells what counts and what is ignored.
 """
 
 import math
@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
-from asca_pillars.evaluation.operating_point import OperatingPoint, best_scores, operating_points
+from asca_pillars.evaluation.kitti.operating_point import OperatingPoint, best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
 from asca_pillars.evaluation.report import markdown_table
@@ -53,7 +53,7 @@ def main(
 def _row(point: OperatingPoint, title: str, frames: int) -> tuple[str, ...]:
     low, high = point.recall_interval
     found = f"{point.found} of {point.objects}", f"{point.recall:.2f}", f"{low:.2f}-{high:.2f}"
-    false = point.detections - point.true
+    false = point.detections - point.true_positives
     return point.class_name, title, f"{point.score:.2f}", f"{point.min_overlap:g}", *found, f"{false / frames:.2f}"
 
 

@@ -263,10 +263,10 @@ def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
         ("augment.insert.min_points", "0", "must be at least 1"),
         ("augment.insert.proportions.Car", "-1", "must be at least 0"),
         ("augment.object_shift_m", "-0.1", "must be at least 0"),
-        ("augment.rotation_rad", ".inf", "must be at least 0"),
+        ("augment.rotation_rad", ".inf", "should be a finite number"),
         ("augment.scale", "[1.05, 0.95]", "must be two positive numbers, the smaller first"),
         ("augment.scale", "[0, 1]", "must be two positive numbers, the smaller first"),
-        ("augment.scale", "[.nan, 1]", "must be two positive numbers, the smaller first"),
+        ("augment.scale", "[.nan, 1]", "should be a finite number"),
         ("data.min_points", "-1", "must be at least 0"),
         ("data.workers", "-1", "must be at least 0"),
         ("train.epochs", "0", "must be at least 1"),
@@ -274,7 +274,7 @@ def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
         ("train.decay_epochs", "0", "must be at least 1"),
         ("train.checkpoint_steps", "0", "must be at least 1"),
         ("train.learning_rate", "-1e-3", "must be at least 0"),
-        ("train.learning_rate", ".nan", "must be at least 0"),
+        ("train.learning_rate", ".nan", "should be a finite number"),
         ("train.weight_decay", "-1", "must be at least 0"),
         ("train.seed", "-1", "must be at least 0"),
     ],
@@ -282,7 +282,7 @@ def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
 def test_impossible_numbers(tmp_path: Path, key: str, value: str, message: str) -> None:
     *parents, name = key.split(".")
     path = write(tmp_path, "".join(f"{parent}: {{" for parent in parents) + f"{name}: {value}" + "}" * len(parents))
-    assert re.fullmatch(rf"{re.escape(str(path))}: {re.escape(key)} = .+: {message}.*", refusal(path))
+    assert re.fullmatch(rf"{re.escape(str(path))}: `?{re.escape(key)}.* = .+: .*{message}.*", refusal(path))
 
 
 @pytest.mark.parametrize(

@@ -1,28 +1,41 @@
-"""`asca eval`: a model or finished predictions against labels, as KITTI scores them."""
+"""`asca eval`: a model or finished predictions against labels, as KITTI or Waymo scores them."""
 
 import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from rich.console import Console
 
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
-from asca_pillars.evaluation.kitti.verdicts import verdicts
-from asca_pillars.evaluation.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
-from asca_pillars.evaluation.report import BANDS_M, EvalReport, print_report, to_json, to_markdown
+from asca_pillars.evaluation.report import (
+    BANDS_M,
+    EvalReport,
+    markdown_page,
+    print_report,
+    print_tables,
+    to_json,
+    to_markdown,
+)
+from asca_pillars.evaluation.waymo import waymo_detection
+from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
+from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
 from asca_pillars.files import atomic_directory, atomic_path, require_own, require_replaceable
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.system import describe_environment
+
+Protocol = Literal["kitti", "waymo"]
 
 TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
 GALLERY = 8
@@ -56,13 +69,15 @@ def run(
     provider: str,
     precision: str | None,
     threads: int | None,
+    protocol: Protocol = "kitti",
 ) -> None:
     """See `asca eval --help`."""
     console = Console(markup=False)
     _check_arguments(model, data, predictions, labels, gallery_frames, score)
-    require_own(out, COMMAND, "report.json", f"predictions/{MADE_BY}", text='"')
+    require_own(out, COMMAND, "report.json", "waymo.json", f"predictions/{MADE_BY}", text='"')
     for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
         require_replaceable(out / folder, COMMAND, marker)
+    _check_protocol(protocol, gallery_frames, score)
     split = None if data is None else KittiSplit(data, split_name)
     if labels is None:
         assert split is not None, "checked with the arguments"
@@ -75,11 +90,15 @@ def run(
     else:
         assert split is not None, "checked with the arguments"
         opened = open_model(model, min_score, provider, precision, threads)
-        scores = _fixed_scores(opened, score, min_score)
+        scores = _fixed_scores(opened, score, min_score) if protocol == "kitti" else {}
         task = _run_model(opened, split, labels, scores, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)
-    _report(task, frames, out, json_path, console)
-    _draw_gallery(task, frames, out, gallery_frames, console)
+    if protocol == "waymo":
+        _report_waymo(task, frames, out, json_path, console)
+    else:
+        _check_classes(task, frames)
+        _report(task, frames, out, json_path, console)
+        _draw_gallery(task, frames, out, gallery_frames, console)
     console.print(f"Written to {out}/", highlight=False)
 
 
@@ -105,13 +124,39 @@ def _check_arguments(
         raise ConfigError(f"--score {score} must be a number")
 
 
+def _check_protocol(protocol: str, gallery_frames: int | None, score: float | None) -> None:
+    if protocol not in get_args(Protocol):
+        raise ConfigError(f"--protocol {protocol}: choose {' or '.join(get_args(Protocol))}")
+    if protocol == "waymo" and (gallery_frames or score is not None):
+        option = f"--gallery {gallery_frames}" if gallery_frames else f"--score {score:g}"
+        raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
+
+
+def _check_classes(task: Task, frames: ScoredFrames) -> None:
+    """Refuse what KITTI's protocol has nothing to say about; the report names single classes that are left out."""
+    known = {name.casefold() for name in CLASS_NAMES}
+    if frames.foreign_types and not any(
+        known & set(frame.folded_types.tolist()) for frame in (*frames.truth, *frames.detections)
+    ):
+        raise DatasetError(
+            f"{task.labels}: neither labels nor predictions are of a class that KITTI's protocol scores "
+            f"({', '.join(CLASS_NAMES)}); they have {', '.join(frames.foreign_types)}: give --protocol waymo, "
+            "which scores any class"
+        )
+
+
 def _fixed_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
     """For each class the score from which on detections count for precision and recall."""
     known = {name.lower(): name for name in CLASS_NAMES}
     scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
+    if not any(item.name.lower() in known for item in model.spec.classes):
+        raise ConfigError(
+            f"{model.name} detects {', '.join(item.name for item in model.spec.classes)}; KITTI's protocol scores "
+            f"{', '.join(CLASS_NAMES)}: give --protocol waymo, which scores any class"
+        )
     for item in model.spec.classes:
         if item.name.lower() not in known:
-            raise ConfigError(f"{model.name} detects {item.name}; KITTI's protocol knows {', '.join(CLASS_NAMES)}")
+            continue  # the report names it
         fixed = item.score_threshold if score is None else score
         if fixed < min_score:
             raise ConfigError(
@@ -141,6 +186,25 @@ def _run_model(
     return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
 
 
+def _report_waymo(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
+    """Evaluate by Waymo's metric; print and write the table, and the JSON (to `json_path` too)."""
+    class_names = evaluated_classes(frames)
+    if not class_names:
+        raise DatasetError(f"{task.labels}: no label and no prediction is of a class to be evaluated")
+    prepared = waymo_frames(frames, class_names, task.split, console=console)
+    scores = waymo_detection(prepared.truth, prepared.detections, no_label=prepared.no_label, console=console)
+    about = task.about | {"environment": json.loads(describe_environment())}
+    report = WaymoReport(task.subject, frames, scores, task.split is not None, about)
+    tables, notes = [waymo_table(report)], waymo_notes(report)
+    print_tables(report.title, tables, notes, console)
+    content = waymo_json(report)
+    for path in (json_path, out / "waymo.json"):
+        if path is not None:
+            _write_json(path, content)
+    with atomic_path(out / "waymo.md") as temporary:
+        temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
+
+
 def _report(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
     """Evaluate; print and write the tables, the JSON (to `json_path` too) and the curves."""
     truth, found = frames.truth, frames.detections
@@ -165,7 +229,7 @@ def _draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None
     count = GALLERY if count is None else count
     if task.split is None or count == 0:
         return
-    judged = verdicts(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
+    judged = matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
     worst = gallery.worst_frames(judged, count)
     folders = task.split, task.labels, task.predictions
     with atomic_directory(out / "gallery", COMMAND, gallery.INDEX) as folder:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 _Doubles = NDArray[np.float64]
 _Indices = NDArray[np.int64]
 
-NOBODY = -1
+UNMATCHED = -1
 _ROUNDING = 1e-12  # sums of overlaps that differ by less are equal
 
 
@@ -41,9 +41,9 @@ def best_assignments(overlap: _Doubles) -> _Indices:
         overlap: (N, M) of N detections with M objects; 0 where the two must not match.
 
     Returns:
-        (N + 1, M): in row k which of the first k detections holds each object, or NOBODY.
+        (N + 1, M): in row k which of the first k detections holds each object, or UNMATCHED.
     """
-    holders = np.full((len(overlap) + 1, overlap.shape[1]), NOBODY)
+    holders = np.full((len(overlap) + 1, overlap.shape[1]), UNMATCHED)
     touching = np.any(overlap > 0, axis=1).tolist()
     for row in range(len(overlap)):
         holders[row + 1] = holders[row]
@@ -56,13 +56,13 @@ def _admit(row: int, overlap: _Doubles, holders: _Indices) -> None:
     """Bring `holders` (M,), the best matching of the detections before `row`, up to date with `row`.
 
     `gain[j]` is the most that the matching gains by a chain at whose end object j changes hands, not counting what its
-    old holder loses; `source[j]` is the object that its new holder leaves, or NOBODY for `row` itself.
+    old holder loses; `source[j]` is the object that its new holder leaves, or UNMATCHED for `row` itself.
     """
     gain = _weights(overlap[row])
-    source = np.full(len(holders), NOBODY)
+    source = np.full(len(holders), UNMATCHED)
     waiting = np.flatnonzero(gain > 0).tolist()
     for column in waiting:  # grows on the way
-        if holders[column] == NOBODY:
+        if holders[column] == UNMATCHED:
             continue
         held = overlap[holders[column]]
         moved = gain[column] - held[column] + _weights(held)
@@ -70,11 +70,11 @@ def _admit(row: int, overlap: _Doubles, holders: _Indices) -> None:
         gain[better], source[better] = moved[better], column
         waiting += better.tolist()
 
-    lost = np.where(holders == NOBODY, 0.0, overlap[holders, np.arange(len(holders))])
+    lost = np.where(holders == UNMATCHED, 0.0, overlap[holders, np.arange(len(holders))])
     column = int((gain - lost).argmax())
     if gain[column] - lost[column] <= _ROUNDING:
         return
-    while source[column] != NOBODY:
+    while source[column] != UNMATCHED:
         holders[column] = holders[source[column]]
         column = int(source[column])
     holders[column] = row

@@ -12,7 +12,7 @@ from rich.progress import track
 
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.evaluation.kitti.verdicts import Verdict
+from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.drawing import Color, Image
@@ -23,13 +23,13 @@ _INTRODUCTION = """# {title}: worst frames
 
 The frames with most misses and false detections at the fixed score, by KITTI's moderate difficulty. A false detection
 may well stand on an object: to find it, its 3D overlap must exceed 0.7 for cars and 0.5 for the others. Objects beyond
-the difficulty's limits are not counted, and what only touches them or DontCare areas is excused.
+the difficulty's limits are not counted, and what only touches them or DontCare areas is ignored.
 """
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """Boxes of one fate: whose they are, how they look, and what is written beside them."""
+    """Boxes of one outcome: whose they are, how they look, and what is written beside them."""
 
     title: str
     color: Color
@@ -42,19 +42,19 @@ _MISSED = _Kind("missed", (70, 70, 255), "missed {type}", 5)
 _FALSE = _Kind("false", (255, 110, 255), "{type} {score:.2f}", 5)
 _FOUND = _Kind("found", (255, 255, 255), "", 2)
 _TRUE = _Kind("true", (90, 230, 90), "", 6)
-_UNCOUNTED = _Kind("not counted", (150, 150, 150), "", 2)
-_EXCUSED = _Kind("excused", (200, 160, 60), "", 3)
+_NOT_COUNTED = _Kind("not counted", (150, 150, 150), "", 2)
+_IGNORED = _Kind("ignored", (200, 160, 60), "", 3)
 
 
-def worst_frames(verdicts: Sequence[Verdict], count: int) -> list[Verdict]:
+def worst_frames(frames: Sequence[ScoreMatches], count: int) -> list[ScoreMatches]:
     """The `count` frames with most misses and false detections, worst first; frames without any are left out."""
-    wrong = [verdict for verdict in verdicts if verdict.errors]
-    return sorted(wrong, key=lambda verdict: (-verdict.errors, verdict.frame_id))[:count]
+    wrong = [frame for frame in frames if frame.errors]
+    return sorted(wrong, key=lambda frame: (-frame.errors, frame.frame_id))[:count]
 
 
 def write_gallery(
     folder: str | Path,
-    verdicts: Sequence[Verdict],
+    frames: Sequence[ScoreMatches],
     split: KittiSplit,
     labels: str | Path,
     predictions: str | Path,
@@ -67,7 +67,7 @@ def write_gallery(
 
     Args:
         folder: for the pictures.
-        verdicts: of the frames, in the order in which they are numbered.
+        frames: their matches, in the order in which the pictures are numbered.
         split: the scans, calibrations and images.
         labels, predictions: the folders of KITTI text that were judged.
         ranges: what the pictures show.
@@ -78,28 +78,28 @@ def write_gallery(
         DatasetError, ScanError: a frame's scan, calibration or text cannot be read.
     """
     rows = [_INTRODUCTION.format(title=title), "| frame | missed | false |", "| --- | ---: | ---: |"]
-    bar = track(verdicts, "Drawing", console=console, disable=console is None)
-    for rank, verdict in enumerate(bar, start=1):
-        name = f"{rank:03d}_{verdict.frame_id}.png"
-        write_png(Path(folder) / name, _draw(verdict, split, Path(labels), Path(predictions), ranges))
-        rows.append(f"| [{verdict.frame_id}]({name}) | {verdict.missed.sum()} | {verdict.false.sum()} |")
+    bar = track(frames, "Drawing", console=console, disable=console is None)
+    for rank, frame in enumerate(bar, start=1):
+        name = f"{rank:03d}_{frame.frame_id}.png"
+        write_png(Path(folder) / name, _draw(frame, split, Path(labels), Path(predictions), ranges))
+        rows.append(f"| [{frame.frame_id}]({name}) | {frame.missed.sum()} | {frame.false_positive.sum()} |")
     with atomic_path(Path(folder) / INDEX) as temporary:
         temporary.write_text("\n".join([*rows, ""]), encoding="utf-8")
 
 
-def _draw(verdict: Verdict, split: KittiSplit, labels: Path, predictions: Path, ranges: Ranges) -> Image:
-    frame_id = verdict.frame_id
+def _draw(frame: ScoreMatches, split: KittiSplit, labels: Path, predictions: Path, ranges: Ranges) -> Image:
+    frame_id = frame.frame_id
     calibration = split.calibration(frame_id)
     points = read_scan(split.scan_path(frame_id)).points
     points = points[in_image(points, calibration, split.image_size_wh(frame_id))]
     truth, found = (read_labels(folder / f"{frame_id}.txt") for folder in (labels, predictions))
     layers = [
-        _layer(_MISSED, truth, verdict.missed, calibration),
-        _layer(_FALSE, found, verdict.false, calibration),
-        _layer(_FOUND, truth, verdict.found, calibration),
-        _layer(_TRUE, found, verdict.true, calibration),
-        _layer(_UNCOUNTED, truth, verdict.uncounted, calibration),
-        _layer(_EXCUSED, found, verdict.excused, calibration),
+        _layer(_MISSED, truth, frame.missed, calibration),
+        _layer(_FALSE, found, frame.false_positive, calibration),
+        _layer(_FOUND, truth, frame.found, calibration),
+        _layer(_TRUE, found, frame.true_positive, calibration),
+        _layer(_NOT_COUNTED, truth, frame.not_counted, calibration),
+        _layer(_IGNORED, found, frame.ignored, calibration),
     ]
     picture = draw_layers(points, layers, ranges)
     image_path = split.image_path(frame_id)

@@ -4,6 +4,7 @@ The official tool evaluates the frames that have a detection file. So does this 
 out: a frame without detections needs an empty file.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
 from asca_pillars.geometry.detections import Detections
 
 KITTI_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
-_KNOWN = {name.lower() for name in KITTI_TYPES}
+FOLDED_KITTI_TYPES = frozenset(name.casefold() for name in KITTI_TYPES)
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,21 @@ class ScoredFrames:
             f"evaluated on {len(self)} of {self.asked} frames: no prediction file for {first}{more}; "
             "a frame without detections needs an empty file"
         )
+
+    @property
+    def foreign_types(self) -> dict[str, tuple[int, int]]:
+        """Types that KITTI does not have, as first written: how many labels and how many detections name them."""
+        names: dict[str, str] = {}
+        counts = Counter[tuple[str, int]]()
+        for side, frames in enumerate((self.truth, self.detections)):
+            for name in (name for frame in frames for name in frame.types):
+                names.setdefault(name.casefold(), name)
+                counts[name.casefold(), side] += 1
+        return {
+            name: (counts[key, 0], counts[key, 1])
+            for key, name in sorted(names.items())
+            if key not in FOLDED_KITTI_TYPES
+        }
 
 
 def read_truth(folder: str | Path, frame_ids: Sequence[str] | None = None) -> list[FrameObjects]:
@@ -151,11 +167,6 @@ def _read_frame(folder: Path, frame_id: str, *, scored: bool) -> FrameObjects:
     path = folder / f"{frame_id}.txt"
     objects = read_labels(path)
     for index, item in enumerate(objects):
-        if item.type.lower() not in _KNOWN:
-            raise DatasetError(
-                f"{_place(path, index)}: unknown class '{item.type}'; KITTI has {', '.join(KITTI_TYPES)}; "
-                "rename it or remove the line"
-            )
         if scored and item.score is None:
             raise DatasetError(
                 f"{_place(path, index)}: 15 fields, but a prediction has 16; append the score at the end of the line"

@@ -40,24 +40,41 @@ class RecallRow(NamedTuple):
 class RecallTally:
     """Counts objects found and false detections, frame by frame.
 
+    Processes that see different frames add up their `counts`: recall is the ratio of the sums, not a mean of ratios.
+
     Args:
         class_names: names of labels 0, 1, ...
+        counts: (C + 1, 3) int64 to start from, for instance the sum over processes; zeros if None.
+
+    Raises:
+        ValueError: `counts` is of another shape.
+
+    Attributes:
+        counts: (C + 1, 3) int64. A row of objects, found and false for each class; the last row is the number of
+            frames, 0, 0. Sums of such arrays are such arrays.
     """
 
-    def __init__(self, class_names: Sequence[str]) -> None:
+    def __init__(self, class_names: Sequence[str], counts: NDArray[np.integer] | None = None) -> None:
+        shape = (len(class_names) + 1, 3)
+        if counts is not None and counts.shape != shape:
+            raise ValueError(f"counts of {len(class_names)} classes must have shape {shape}, not {counts.shape}")
         self.class_names = class_names
-        self.counts = np.zeros((len(class_names), 3), dtype=np.int64)  # objects, found, false
-        self.frames = 0
+        self.counts = np.zeros(shape, dtype=np.int64) if counts is None else counts.astype(np.int64)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that were counted."""
+        return int(self.counts[-1, 0])
 
     def add(self, detections: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> None:
         """Count one frame.
 
         Args:
             detections: of the frame, at the threshold in question, by descending score.
-            boxes: (N, 7) labelled boxes.
+            boxes: (N, 7) labelled boxes, LiDAR frame, metres and radians.
             labels: (N,) class index, negative for boxes that excuse a detection of any class but need not be found.
         """
-        self.frames += 1
+        self.counts[-1, 0] += 1
         for index, name in enumerate(self.class_names):
             own = detections.labels == index
             chosen = (labels == index) | (labels < 0)
@@ -72,7 +89,7 @@ class RecallTally:
         """One row per class."""
         return {
             name: RecallRow(int(objects), int(found), int(false), self.frames)
-            for name, (objects, found, false) in zip(self.class_names, self.counts, strict=True)
+            for name, (objects, found, false) in zip(self.class_names, self.counts[:-1], strict=True)
         }
 
 

@@ -8,8 +8,15 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, Curve, KittiEvaluation, KittiResults
-from asca_pillars.evaluation.operating_point import OperatingPoint
+from asca_pillars.evaluation.kitti.average_precision import (
+    CLASS_NAMES,
+    DIFFICULTIES,
+    METRICS,
+    Curve,
+    KittiEvaluation,
+    KittiResults,
+)
+from asca_pillars.evaluation.kitti.operating_point import OperatingPoint
 from asca_pillars.evaluation.predictions import ScoredFrames
 
 BANDS_M = {
@@ -42,7 +49,12 @@ class EvalReport:
     @property
     def title(self) -> str:
         """The subject, and how many frames stand behind the numbers."""
-        return f"{self.subject}: {self.frames.shortage or f'{len(self.frames)} frames'}"
+        return report_title(self.subject, self.frames)
+
+
+def report_title(subject: str, frames: ScoredFrames) -> str:
+    """The subject, and how many frames stand behind the numbers, or which ones are missing."""
+    return f"{subject}: {frames.shortage or f'{len(frames)} frames'}"
 
 
 @dataclass(frozen=True)
@@ -59,28 +71,31 @@ def tables(report: EvalReport) -> list[TextTable]:
     """AP, AP by distance, recall and precision at the fixed scores."""
     recall = [(point, point.found, point.objects, point.recall, point.recall_interval) for point in report.points]
     precision = [
-        (point, point.true, point.detections, point.precision, point.precision_interval) for point in report.points
+        (point, point.true_positives, point.detections, point.precision, point.precision_interval)
+        for point in report.points
     ]
     return [
         _ap_table(report.ap.overall),
         _band_table(report.ap),
         _share_table("Recall", ("objects", "found"), recall),
-        _share_table("Precision", ("detections", "true"), precision),
+        _share_table("Precision", ("detections", "true positives"), precision),
     ]
 
 
 def notes(report: EvalReport) -> list[str]:
-    """What one must know to read the tables: classes not evaluated, sets too small for their AP, detections
-    excused, scores to choose."""
+    """What one must know to read the tables.
+
+    Types left out, classes not evaluated, sets too small for their AP, detections ignored, scores to choose.
+    """
     results = report.ap.overall
-    lines = []
+    lines = [_foreign_note(name, *counts) for name, counts in report.frames.foreign_types.items()]
     for name in results.class_names:
         if not any(results.curve(name, metric, DIFFICULTIES[0]) for metric in METRICS):
             lines.append(f"{name}: not evaluated, because nothing was detected as one; the means leave the class out")
         lines += [
             _cap_note(curve) for curve in _counts_of(results, name) if curve is not None and curve.counted <= SMALL_SET
         ]
-    lines += [_excuse_note(p) for p in report.points if p.difficulty == "hard" and p.excused > p.detections]
+    lines += [_ignored_note(p) for p in report.points if p.difficulty == "hard" and p.ignored > p.detections]
     if report.best_scores:
         scores = ", ".join(f"{name} {score:.2f}" for name, score in report.best_scores.items())
         lines.append(f"Scores with the best F1 on this data, moderate, in 3D: {scores}")
@@ -89,8 +104,13 @@ def notes(report: EvalReport) -> list[str]:
 
 def print_report(report: EvalReport, console: Console) -> None:
     """Tables and notes on the console."""
-    console.print(report.title, style="bold", highlight=False, soft_wrap=True)
-    for table in tables(report):
+    print_tables(report.title, tables(report), notes(report), console)
+
+
+def print_tables(title: str, tables: Sequence[TextTable], notes: Sequence[str], console: Console) -> None:
+    """A title, tables and notes on the console; a name that the row above has is not repeated."""
+    console.print(title, style="bold", highlight=False, soft_wrap=True)
+    for table in tables:
         drawn = Table()
         for index, column in enumerate(table.columns):
             drawn.add_column(column, justify="left" if index < table.left else "right")
@@ -102,18 +122,23 @@ def print_report(report: EvalReport, console: Console) -> None:
             last = name
         console.print(f"\n{table.title}", highlight=False, soft_wrap=True)
         console.print(drawn)
-    for line in notes(report):
+    for line in notes:
         console.print(line, highlight=False, soft_wrap=True)
 
 
 def to_markdown(report: EvalReport) -> str:
     """The tables and notes as Markdown."""
-    parts = [f"# {report.title}\n"]
-    for table in tables(report):
+    return markdown_page(report.title, tables(report), notes(report))
+
+
+def markdown_page(title: str, tables: Sequence[TextTable], notes: Sequence[str]) -> str:
+    """A title, tables and notes as Markdown."""
+    parts = [f"# {title}\n"]
+    for table in tables:
         columns = [column.replace("\n", " ") for column in table.columns]
         parts.append(f"## {table.title}\n\n{markdown_table(columns, table.rows, table.left)}")
-    if lines := notes(report):
-        parts.append("\n".join([*(f"- {line}" for line in lines), ""]))
+    if notes:
+        parts.append("\n".join([*(f"- {line}" for line in notes), ""]))
     return "\n".join(parts)
 
 
@@ -131,6 +156,7 @@ def to_json(report: EvalReport) -> dict[str, Any]:
         "frames_asked": report.frames.asked,
         "frames_without_predictions": list(report.frames.without_predictions),
         "shortage": report.frames.shortage,
+        "types_left_out": list(report.frames.foreign_types),
         "results": report.ap.overall.to_json(),
         "bands": [
             {
@@ -225,10 +251,18 @@ def _cap_note(curve: Curve) -> str:
     return f"{what}: {objects}; a perfect detector gets at most {curve.r40_cap:.1f} R40, {curve.r11_cap:.1f} R11"
 
 
-def _excuse_note(point: OperatingPoint) -> str:
-    of_all = f"{point.excused} of {point.excused + point.detections} detections"
+def _foreign_note(name: str, labels: int, detections: int) -> str:
+    known = ", ".join(CLASS_NAMES)
     return (
-        f"{point.class_name}: {of_all} are excused even at hard (low in the image, without 2D box, on ignored objects "
+        f"{name}: left out ({labels} labels, {detections} detections), because KITTI's protocol scores {known}; "
+        "--protocol waymo scores any class"
+    )
+
+
+def _ignored_note(point: OperatingPoint) -> str:
+    of_all = f"{point.ignored} of {point.ignored + point.detections} detections"
+    return (
+        f"{point.class_name}: {of_all} are ignored even at hard (low in the image, without 2D box, on ignored objects "
         "or DontCare areas); the precision does not count them"
     )
 

@@ -15,13 +15,18 @@ Definition: P. Sun et al., "Scalability in Perception for Autonomous Driving: Wa
   recalls more than 0.05 apart precision falls only in the last step, which is at most 0.05 wide.
 - A range keeps the objects *and* the detections whose own centers lie in it, by 3D distance from the origin; what
   stands on two sides of a limit does not match.
+- A detection in a no-label zone is no false positive if it matches nothing.
 
 Table 7 of AFE-RCNN (2022) lists vehicles and cyclists, both levels, over all ranges; its text lets 5 points be LEVEL_1,
 which the tool does not.
 
-Departures: a level without objects has no AP (the tool says 0, or goes by the LEVEL_2 objects that were found); the
-tool rounds IoU to 1e-6 before matching; the leaderboard's no-label zones, which excuse detections, are not known here.
-Papers that let the tool choose 11 cutoffs by the distribution of the scores get somewhat different figures.
+Departures: a level without objects has no AP (the tool says 0, or goes by the LEVEL_2 objects that were found). Where
+several matchings have the same sum of IoU, the tool takes one that depends on the order in the file, false positives
+included: its matching is complete, and a detection that reaches no object may occupy one at weight 0. It also rounds
+IoU to 1e-6, which makes more sums equal. Here the order of detections of unlike scores has no influence: the higher
+score keeps its object, and of equal objects the first one is taken. LEVEL_1 can differ by this, because it matters
+there whether an object of LEVEL_1 or of LEVEL_2 is left over, and so can APH. Papers that let the tool choose 11
+cutoffs by the distribution of the scores get somewhat different figures.
 """
 
 from collections.abc import Sequence
@@ -30,9 +35,10 @@ from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 from rich.progress import track
 
-from asca_pillars.evaluation.assignment import NOBODY, best_assignments
+from asca_pillars.evaluation.assignment import UNMATCHED, best_assignments
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
@@ -96,8 +102,17 @@ def difficulty_levels(points: NDArray[np.integer], hard: NDArray[np.bool_] | Non
     return np.where(points > 0, np.where(level_2, 2, 1), 0)
 
 
+def min_iou(class_name: str) -> float:
+    """The least 3D IoU of a match: 0.7 for vehicles, 0.5 for every other class."""
+    return VEHICLE_MIN_IOU if class_name.casefold() in VEHICLES else SMALL_MIN_IOU
+
+
 def waymo_detection(
-    truth: Sequence[WaymoTruth], detections: Sequence[Detections], *, progress: bool = False
+    truth: Sequence[WaymoTruth],
+    detections: Sequence[Detections],
+    *,
+    no_label: Sequence[NDArray[np.bool_]] | None = None,
+    console: Console | None = None,
 ) -> list[WaymoScore]:
     """AP and APH for every class of the detections, level and range, in that order.
 
@@ -105,7 +120,8 @@ def waymo_detection(
         truth: labels of each frame.
         detections: of the same frames, in the same order and frame of reference, scores within [0, 1]. A frame in
             which nothing was found has an empty one.
-        progress: draw a progress bar.
+        no_label: (D,) of each frame, which detections lie in a no-label zone. None without such zones.
+        console: shows the progress.
 
     Raises:
         ValueError: the sequences are empty or of different length, frames have different class names, or a score
@@ -113,11 +129,13 @@ def waymo_detection(
     """
     class_names = _checked_class_names(truth, detections)
     tallies = {(index, span): _Tally() for index in range(len(class_names)) for span in RANGES_M}
-    pairs = list(zip(truth, detections, strict=True))
-    for labelled, found in track(pairs, "Evaluating", disable=not progress):
+    zones = [np.zeros(len(found), dtype=bool) for found in detections] if no_label is None else no_label
+    frames = list(zip(truth, detections, zones, strict=True))
+    for labelled, found, zone in track(frames, "Evaluating", console=console, disable=console is None):
         for index, name in enumerate(class_names):
             own = (labelled.labels == index) & (labelled.levels > 0)
-            frame = _frame(labelled.boxes[own], labelled.levels[own], found[found.labels == index], name)
+            detected = found.labels == index
+            frame = _frame(labelled.boxes[own], labelled.levels[own], found[detected], zone[detected], name)
             for span in RANGES_M:
                 tallies[index, span].add(frame.within(span))
     return [
@@ -143,6 +161,7 @@ class _Frame:
     """One class in one frame: N detections by descending score, M objects."""
 
     scores: NDArray[np.float32]  # (N,)
+    no_label: NDArray[np.bool_]  # (N,)
     distances_m: _Doubles  # (N,)
     iou: _Doubles  # (N, M), 0 where it is too small to match
     heading_accuracy: _Doubles  # (N, M)
@@ -157,6 +176,7 @@ class _Frame:
         both = np.ix_(rows, columns)
         return _Frame(
             self.scores[rows],
+            self.no_label[rows],
             self.distances_m[rows],
             self.iou[both],
             self.heading_accuracy[both],
@@ -165,13 +185,21 @@ class _Frame:
         )
 
 
-def _frame(boxes: NDArray[np.floating], levels: NDArray[np.int64], found: Detections, class_name: str) -> _Frame:
-    found = found[np.argsort(-found.scores, kind="stable")]
+def _frame(
+    boxes: NDArray[np.floating],
+    levels: NDArray[np.int64],
+    found: Detections,
+    no_label: NDArray[np.bool_],
+    class_name: str,
+) -> _Frame:
+    order = np.argsort(-found.scores, kind="stable")
+    found = found[order]
     iou = iou_3d(found.boxes, boxes)
-    iou[iou < (VEHICLE_MIN_IOU if class_name.casefold() in VEHICLES else SMALL_MIN_IOU)] = 0.0
+    iou[iou < min_iou(class_name)] = 0.0
     turned = wrap_angle(found.boxes[:, None, 6].astype(np.float64) - boxes[None, :, 6])
     return _Frame(
         scores=found.scores,
+        no_label=no_label[order],
         distances_m=np.linalg.norm(found.boxes[:, :3].astype(np.float64), axis=1),
         iou=iou,
         heading_accuracy=1 - np.abs(turned) / np.pi,
@@ -185,7 +213,7 @@ class _Tally:
 
     def __init__(self) -> None:
         self.objects = np.zeros(len(LEVELS), dtype=np.int64)  # up to each level
-        # At each cutoff: detections, finds, their heading accuracies, objects missed at each level.
+        # At each cutoff: true and false positives, finds, their heading accuracies, objects missed at each level.
         self.detections = np.zeros(len(SCORE_CUTOFFS))
         self.finds = np.zeros(len(SCORE_CUTOFFS))
         self.heading_accuracy = np.zeros(len(SCORE_CUTOFFS))
@@ -194,11 +222,13 @@ class _Tally:
     def add(self, frame: _Frame) -> None:
         reached = np.searchsorted(-frame.scores, -SCORE_CUTOFFS, side="right")  # how many have score >= cutoff
         holders = best_assignments(frame.iou)
-        held = holders != NOBODY
+        held = holders != UNMATCHED
         accuracy = np.zeros(held.shape)
         columns = np.nonzero(held)[1]
         accuracy[held] = frame.heading_accuracy[holders[held], columns]
-        self.detections += reached
+        ignored = np.cumsum([0, *frame.no_label])
+        np.subtract.at(ignored, np.nonzero(held)[0], frame.no_label[holders[held]])
+        self.detections += reached - ignored[reached]
         self.finds += held.sum(axis=1)[reached]
         self.heading_accuracy += accuracy.sum(axis=1)[reached]
         for row, level in enumerate(LEVELS):

@@ -1,55 +1,114 @@
-"""KITTI labels of a simulated scan: what the camera sees, how much of it, and what is only DontCare."""
+"""KITTI labels of a simulated scan: what the camera sees, or everything around the sensor.
+
+Labels all around (`label_all_around`) are KITTI's text with these meanings where there is no camera:
+
+    box 2D      -1 -1 -1 -1 for an object beside the image or behind the camera
+    truncated   -1 (unknown) for such an object: there is no image border that could cut it
+    occluded    0..3 by the share of the firings that reach the object, in whatever direction it stands
+    alpha       the heading against the line of sight, as for any object: it needs no image
+
+There are no DontCare areas: what hardly returns anything is occluded 3. simulation.json in the folder of the set says
+"field_of_view": "around". KITTI's protocol ignores objects without a 2D box, for their lack of height in the image.
+"""
 
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
-from asca_pillars.data.kitti import Calibration, KittiObject, image_boxes, in_image, objects_from_boxes
+from asca_pillars.data.kitti import Calibration, KittiObject, image_boxes, objects_from_boxes
 from asca_pillars.sim.casting.raycast import Hits
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sensor.returns import Returns
 from asca_pillars.sim.world.placement import Target
 
 # Visible share of the firings that would meet the object alone, above which KITTI's annotators would say
 # "fully visible" (0), "partly occluded" (1) and "largely occluded" (2); below the last it is "unknown" (3).
 # The steps give simulated cars the shares of KITTI's: 47, 28, 21 and 3 %.
 OCCLUSION_STEPS = (0.82, 0.36, 0.09)
+UNKNOWN = len(OCCLUSION_STEPS)
 MAX_TRUNCATION = 0.95
 UNKNOWN_FROM_TRUNCATION = 0.85  # what hardly stands in the image, KITTI mostly marks as unknown, too
 
+Owners = npt.NDArray[np.int32]
 
-def make_labels(
-    targets: tuple[Target, ...], hits: Hits, returns: Returns, calib: Calibration, config: SceneConfig
+
+def label_camera_view(
+    targets: tuple[Target, ...], hits: Hits, owner: Owners, calib: Calibration, config: SceneConfig
 ) -> list[KittiObject]:
     """Labels of the objects that the camera sees, nearest first; DontCare areas last.
 
     An object is DontCare if too few of its points lie in the image or too little of it is visible, and is left out
     if nothing of it is visible or it lies outside the image.
+
+    Args:
+        targets: the objects (M).
+        hits: how many of their firings are hidden.
+        owner: (N,) object index, or negative, of each point in the image.
+        calib: the camera.
+        config: from how many points and what visible share on an object is labelled.
     """
-    if not targets:
-        return []
-    boxes = np.array([target.box for target in targets])
-    _, truncated = image_boxes(boxes, calib)
-    owned = returns.owner >= 0
-    seen = in_image(returns.points[owned], calib)
-    points = np.bincount(returns.owner[owned][seen], minlength=len(targets))
-    visible = hits.visible / np.maximum(hits.alone, 1)
-    objects = objects_from_boxes(boxes, [target.type for target in targets], calib)
+    points, visible, truncated = _evidence(targets, hits, owner, calib)
     labels, areas = [], []
-    for index in np.argsort(np.hypot(boxes[:, 0], boxes[:, 1]), kind="stable"):
+    objects = _objects(targets, calib)
+    for index in _nearest_first(targets):
         if truncated[index] >= MAX_TRUNCATION or hits.visible[index] == 0:
             continue
         item = objects[index]
         if points[index] < config.min_points or visible[index] < config.min_visible_share:
             areas.append(dont_care(item.bbox))
             continue
-        occluded = int(np.searchsorted(-np.array(OCCLUSION_STEPS), -visible[index], side="right"))
-        if truncated[index] > UNKNOWN_FROM_TRUNCATION:
-            occluded = len(OCCLUSION_STEPS)
+        unknown = truncated[index] > UNKNOWN_FROM_TRUNCATION
+        occluded = UNKNOWN if unknown else occlusion_state(visible[index])
         labels.append(replace(item, truncated=round(float(truncated[index]), 2), occluded=occluded))
     return labels + areas
+
+
+def label_all_around(
+    targets: tuple[Target, ...], hits: Hits, owner: Owners, calib: Calibration, config: SceneConfig
+) -> list[KittiObject]:
+    """Labels of all objects that return a point, nearest first; arguments as for `label_camera_view`, but `owner` of
+    all points. See the top of the file for what the fields mean where there is no camera."""
+    points, visible, truncated = _evidence(targets, hits, owner, calib)
+    labels = []
+    objects = _objects(targets, calib)
+    for index in _nearest_first(targets):
+        if points[index] == 0:
+            continue
+        item = objects[index]
+        hardly = points[index] < config.min_points or visible[index] < config.min_visible_share
+        occluded = UNKNOWN if hardly else occlusion_state(visible[index])
+        in_image = item.bbox[2] > item.bbox[0]
+        cut = round(float(truncated[index]), 2) if in_image else -1.0
+        labels.append(replace(item, truncated=cut, occluded=occluded))
+    return labels
+
+
+def occlusion_state(visible_share: float) -> int:
+    """KITTI's occlusion state 0..3 of an object of which this share is visible."""
+    return int(np.searchsorted(-np.array(OCCLUSION_STEPS), -visible_share, side="right"))
 
 
 def dont_care(bbox: tuple[float, float, float, float]) -> KittiObject:
     """An area of the image in which detections count neither as right nor as wrong."""
     return KittiObject("DontCare", -1, -1, -10, bbox, -1, -1, -1, -1000, -1000, -1000, -10)
+
+
+def _boxes(targets: tuple[Target, ...]) -> npt.NDArray[np.float64]:
+    return np.array([target.box for target in targets], float).reshape(-1, 7)
+
+
+def _objects(targets: tuple[Target, ...], calib: Calibration) -> list[KittiObject]:
+    return objects_from_boxes(_boxes(targets), [target.type for target in targets], calib)
+
+
+def _nearest_first(targets: tuple[Target, ...]) -> npt.NDArray[np.int64]:
+    return np.argsort(np.hypot(*_boxes(targets)[:, :2].T), kind="stable")
+
+
+def _evidence(
+    targets: tuple[Target, ...], hits: Hits, owner: Owners, calib: Calibration
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Of each object (M,): its points, the visible share of its firings, and what the image's border cuts."""
+    points = np.bincount(owner[owner >= 0], minlength=len(targets))
+    _, truncated = image_boxes(_boxes(targets), calib)
+    return points, hits.visible / np.maximum(hits.alone, 1), truncated

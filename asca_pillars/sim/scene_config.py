@@ -29,13 +29,42 @@ class SceneConfig:
     empty_share: float = 0.12  # scenes without any labelled type
     reach_m: float = 79.0
 
-    pedestrian_uniform_heading: float = 0.45  # the others walk along the street
-    cyclist_crossing: float = 0.30
+    # Shares of vehicles by where they are: parked, by the kind of street; of those that are not: in yards and drives,
+    # on the crossing road; the others are on their way.
+    parked_residential: float = 0.64
+    parked_urban: float = 0.44
+    parked_rural: float = 0.14
+    parked_campus: float = 0.47
+    off_street: float = 0.18
+    on_crossing_road: float = 0.12
+    # Some way off to the side with a shrub, a post or another car before them, as real cars mostly are there.
+    half_hidden: float = 0.14
+    half_hidden_ahead_m: tuple[float, float] = (16.0, 45.0)
+    half_hidden_aside_m: tuple[float, float] = (7.0, 20.0)
+    next_to_parked: float = 0.65
+    nose_in: float = 0.15
+    parked_against_traffic: float = 0.20
+    in_queue: float = 0.30
+    oncoming: float = 0.45
+
+    # Shares of walkers by heading; the others walk along the street.
+    pedestrian_uniform_heading: float = 0.45
+    pedestrian_across_sight: float = 0.30  # of the sensor, at a right angle give or take 20 degrees
+    in_company: float = 0.42
+    side_by_side: float = 0.6  # of those in company; the others walk behind or meet
+    side_by_side_m: tuple[float, float] = (0.45, 0.80)
+    zebra_at_junction: float = 0.6
+    on_zebra: float = 0.10
+    walking_in_road: float = 0.10
+    beyond_pavement: float = 0.25  # of those beside the road, up to 8 m beyond
+    cyclist_crossing: float = 0.45  # the street, which is mostly across the line of sight
+    riding_together: float = 0.20
+    riding_against_traffic: float = 0.30
     # Height of a label box's bottom above the ground, mean and standard deviation: of people and riders, of vehicles.
-    box_lift_m: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.03), (0.03, 0.05))
+    box_lift_m: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.03), (0.012, 0.05))
     # Objects stand on streets and beside them, not on slopes: at most so far from the level of the car's street,
     # metres, plus metres per metre of distance. KITTI's labels deviate by 0.15, 0.22, 0.33 m at 15, 25, 35 m.
-    level_band_m: tuple[float, float] = (0.15, 0.018)
+    level_band_m: tuple[float, float] = (0.17, 0.02)
     # Standard deviation of a body's center about that of its label box.
     box_offset_sigma_m: float = 0.03
 
@@ -61,20 +90,23 @@ class SceneConfig:
     slope_y: tuple[float, float] = (-0.009, 0.016)
     relief_m: tuple[float, float] = (0.1, 2.6)
     bump_m: tuple[float, float] = (0.0, 0.15)  # standard deviation of bumps beyond the pavement
-    bank_slope_sigma: float = 0.045  # of the ground beyond the pavement
+    bank_slope_sigma: float = 0.065  # of the ground beyond the pavement
     embankment_slope: tuple[float, float] = (-0.25, 0.42)
     ditch_m: tuple[float, float] = (0.1, 0.6)
     grass_m: tuple[float, float] = (0.02, 0.16)
 
     clutter: tuple[float, float] = (15.0, 60.0)  # posts, signs, bins, shrubs and the like per 100 m of street
+    far_clutter: float = 30.0  # mean number of low and sparse things farther than 28 m, ahead and behind
+    behind_gaps: float = 0.4  # share of vehicles behind whose ends something narrow stands
+    thick_trunks: float = 0.45  # share of trees with a trunk of 0.35 to 0.6 m that spreads towards its roots
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
-    dark_paint_share: float = 0.33
+    dark_paint_share: float = 0.52
 
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
     min_points: int = 2
     min_visible_share: float = 0.05
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
     def __post_init__(self) -> None:
         normal = ("slope_x", "slope_y", "box_lift_m", "level_band_m")  # no bounds of a draw

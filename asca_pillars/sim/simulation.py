@@ -25,7 +25,7 @@ from asca_pillars.data.kitti import (
 )
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path
-from asca_pillars.sim.annotation import make_labels
+from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import cast
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
@@ -38,15 +38,16 @@ class SimulationConfig:
     """What to simulate.
 
     Attributes:
-        field_of_view: "full" is a whole revolution like KITTI's files; "camera" keeps only what the camera sees,
-            casts a quarter of the rays and gives the same labels and the same points there.
+        field_of_view: "full" is a whole revolution like KITTI's files, of which only what the camera sees is labelled;
+            "camera" keeps only that part, casts a quarter of the rays and gives the same labels and the same points
+            there; "around" is the revolution of "full" with labels in every direction (see `annotation`).
     """
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     lidar: Lidar = field(default_factory=Lidar)
-    field_of_view: Literal["full", "camera"] = "full"
+    field_of_view: Literal["full", "camera", "around"] = "full"
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
 
 @dataclass(frozen=True)
@@ -61,19 +62,19 @@ class Frame:
 def simulate_frame(seed: int, index: int, config: SimulationConfig | None = None) -> Frame:
     """Frame `index` of the data set `seed`: the same for every call, whatever other frames are made."""
     config = config or SimulationConfig()
-    camera_only = config.field_of_view == "camera"
+    camera_only, around = config.field_of_view == "camera", config.field_of_view == "around"
     scene = draw_scene(config.scene, np.random.default_rng([seed, index, 0]))
-    firings = draw_firings(config.lidar, np.random.default_rng([seed, index, 2]), camera_only)
+    firings = draw_firings(config.lidar, np.random.default_rng([seed, index, 2]), camera_only, around)
     half_angle = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0)
     bodies = build(scene, config.scene, (seed, index), half_angle if camera_only else np.pi)
     noise = np.random.default_rng([seed, index, 3])
     key = int(noise.integers(1 << 62))
     hits = cast(bodies, len(scene.targets), scene.ground, firings, key)
     returns = measure(hits, firings, noise)
-    objects = make_labels(scene.targets, hits, returns, scene.calibration, config.scene)
-    points = returns.points
-    if camera_only:
-        points = points[in_image(points, scene.calibration)]
+    seen = np.ones(len(returns.points), bool) if around else in_image(returns.points, scene.calibration)
+    label = label_all_around if around else label_camera_view
+    objects = label(scene.targets, hits, returns.owner[seen], scene.calibration, config.scene)
+    points = returns.points[seen] if camera_only else returns.points
     return Frame(np.ascontiguousarray(points), objects, scene.calibration)
 
 

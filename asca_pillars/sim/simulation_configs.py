@@ -14,7 +14,7 @@ def load_simulation_config(path: str | None, view: str | None = None) -> Simulat
 
     Args:
         path: the file, or the name of one in configs/simulation/; None for the defaults, which imitate KITTI.
-        view: "full" or "camera", which wins over the file.
+        view: "full", "camera" or "around", which wins over the file.
 
     Raises:
         ConfigError: unreadable YAML, an unknown key anywhere (the nearest is named), an impossible value.

@@ -225,7 +225,7 @@ def _read_manifest(manifest: Path) -> dict[str, Any]:
         ) from None
     except OSError as error:
         raise BundleError(f"{manifest}: {error.strerror}") from None
-    except ValueError as error:  # of the JSON, or of its UTF-8
+    except (ValueError, RecursionError) as error:  # of the JSON, or of its UTF-8
         raise BundleError(f"{manifest} is damaged ({error}); {_EXPORT_AGAIN}") from None
     version = data.get("schema_version") if isinstance(data, dict) else None
     if type(version) is not int:

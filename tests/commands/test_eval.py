@@ -13,9 +13,10 @@ import torch
 from numpy.testing import assert_allclose
 
 from asca_deploy import default_bundle_path, load_bundle
-from asca_pillars.commands.eval import run
+from asca_pillars.commands.eval import Protocol, run
 from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
 from asca_pillars.errors import AscaError
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.schema import to_dict
 from tests.scenes import write_dataset
@@ -62,11 +63,12 @@ def evaluate(
     provider: str = "cpu",
     precision: str | None = None,
     threads: int | None = 1,
+    protocol: Protocol = "kitti",
 ) -> dict:
-    """Run the command; what it wrote as report.json."""
+    """Run the command; what it wrote as JSON."""
     where = provider, precision, threads
-    run(model, data, "val", predictions, labels, out, json_path, gallery, score, min_score, *where)
-    return json.loads((out / "report.json").read_text())
+    run(model, data, "val", predictions, labels, out, json_path, gallery, score, min_score, *where, protocol)
+    return json.loads((out / ("report.json" if protocol == "kitti" else "waymo.json")).read_text())
 
 
 def refusal(tmp_path: Path, **arguments) -> str:
@@ -185,6 +187,21 @@ def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
     )
 
 
+def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path, root: Path) -> None:
+    torch.manual_seed(0)
+    content = to_dict(CONFIG)
+    names = [item["name"] for item in content["detector"]["classes"]]
+    for item, name in zip(content["detector"]["classes"], ("Forklift", "Pallet", "Crane")[: len(names)], strict=True):
+        item["name"] = name
+    weights = {f"detector.{name}": value for name, value in build_detector(CONFIG).state_dict().items()}
+    torch.save(
+        {"hyper_parameters": {"config": content}, "state_dict": weights, "global_step": 7}, tmp_path / "last.ckpt"
+    )
+    message = refusal(tmp_path, model=tmp_path / "last.ckpt", data=root, threads=None)
+    assert "detects Forklift" in message and "give --protocol waymo, which scores any class" in message
+    assert not (tmp_path / "out").exists()
+
+
 def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
     det, gt = texts["predictions"], texts["labels"]
     assert refusal(tmp_path) == "nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR"
@@ -217,6 +234,80 @@ def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Pat
         "out: holds predictions and nothing that `asca eval` wrote; choose another folder, or empty it"
     )
     assert len(list(theirs.glob("*.txt"))) == 3
+
+
+def test_waymos_metric_of_labels_against_themselves(
+    tmp_path: Path, root: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With scans at both levels, without them at LEVEL_2; every class and range that has objects gets 100."""
+    (texts["predictions"] / "000000.txt").unlink()
+    arguments = {"predictions": texts["predictions"], "out": tmp_path / "out", "protocol": "waymo"}
+    report = evaluate(**arguments, data=root, json_path=tmp_path / "waymo.json")
+    assert json.loads((tmp_path / "waymo.json").read_text()) == report
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"waymo.json", "waymo.md"}
+    assert report["frames"] == 2 and {item["class_name"] for item in report["results"]} == set(CLASS_NAMES)
+    for item in report["results"]:
+        expected = [pytest.approx(100)] * 2 if item["objects"] else [None] * 2
+        assert [item["AP"], item["APH"]] == expected
+    means = [item["mAP"] for item in report["means"] if item["low_m"] == 0 and item["high_m"] is None]
+    assert means == pytest.approx([100, 100])
+    assert "LEVEL_1 is not evaluated" not in capsys.readouterr().out
+    blind = evaluate(**arguments, labels=texts["labels"])
+    assert blind["results"][0]["AP"] is None and blind["results"][4]["AP"] == pytest.approx(100)
+    assert blind["frames_without_predictions"] == ["000000"]
+    assert "LEVEL_1 is not evaluated" in capsys.readouterr().out
+
+
+def test_waymos_metric_of_the_shipped_bundle(tmp_path: Path, root: Path) -> None:
+    report = evaluate(data=root, out=tmp_path / "out", protocol="waymo")
+    assert "asca_small_sim_int8 on" in report["subject"] and report["model"]["min_score"] == 0.05
+    assert len(list((tmp_path / "out" / "predictions").glob("*.txt"))) == 2
+    again = evaluate(predictions=tmp_path / "out" / "predictions", data=root, out=tmp_path / "again", protocol="waymo")
+    assert again["results"] == report["results"]
+
+
+def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
+    waymo = {**texts, "protocol": "waymo"}
+    assert refusal(tmp_path, **waymo, score=0.5) == (
+        "--score 0.5 belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
+    )
+    assert "--gallery 2 belongs to --protocol kitti" in refusal(tmp_path, **waymo, data=root, gallery=2)
+    assert refusal(tmp_path, **texts, protocol="coco") == "--protocol coco: choose kitti or waymo"
+
+
+def test_a_class_that_kitti_does_not_know_is_left_out_and_named(
+    tmp_path: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = evaluate(**texts, out=tmp_path / "before")
+    capsys.readouterr()
+    rename(texts["labels"], "Cyclist", "Forklift")
+    report = evaluate(**texts, out=tmp_path / "out")
+    assert report["types_left_out"] == ["Forklift"]
+    sentence = "Forklift: left out (3 labels, 0 detections), because KITTI's protocol scores Car, Pedestrian, Cyclist"
+    assert any(note.startswith(sentence) for note in report["notes"]) and sentence in " ".join(
+        capsys.readouterr().out.split()
+    )
+    for name in ("Car", "Pedestrian"):
+        assert report["results"][name] == expected["results"][name]
+    rename(texts["predictions"], "Cyclist", "forklift")
+    waymo = evaluate(**texts, out=tmp_path / "out", protocol="waymo")
+    forklift = next(item for item in waymo["results"] if item["class_name"] == "Forklift" and item["level"] == 2)
+    assert forklift["objects"] == 3 and forklift["AP"] == pytest.approx(100)
+
+
+def test_classes_that_are_all_unknown_are_refused(tmp_path: Path, texts: dict[str, Path]) -> None:
+    for folder in texts.values():
+        for name in CLASS_NAMES:
+            rename(folder, name, "Forklift")
+    assert refusal(tmp_path, **texts) == (
+        "kitti/training/label_2: neither labels nor predictions are of a class that KITTI's protocol scores "
+        "(Car, Pedestrian, Cyclist); they have Forklift: give --protocol waymo, which scores any class"
+    )
+
+
+def rename(folder: Path, name: str, other: str) -> None:
+    for path in folder.glob("*.txt"):
+        path.write_text(path.read_text().replace(f"{name} ", f"{other} "))
 
 
 def test_labels_against_themselves_reach_the_cap(tmp_path: Path, texts: dict[str, Path]) -> None:

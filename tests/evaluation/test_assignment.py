@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.evaluation.assignment import NOBODY, best_assignments, greedy_matches
+from asca_pillars.evaluation.assignment import UNMATCHED, best_assignments, greedy_matches
 
 
 def greatest_sum(overlap: NDArray[np.float64]) -> float:
@@ -28,7 +28,7 @@ def test_best_assignment_of_every_prefix(rows: int, columns: int, data: st.DataO
     holders = best_assignments(overlap)
     assert holders.shape == (rows + 1, columns)
     for known, row in enumerate(holders):
-        held = np.flatnonzero(row != NOBODY)
+        held = np.flatnonzero(row != UNMATCHED)
         assert len(set(row[held])) == len(held) and (row[held] < known).all()
         assert (overlap[row[held], held] > 0).all()
         np.testing.assert_allclose(overlap[row[held], held].sum(), greatest_sum(overlap[:known]), atol=1e-9)
@@ -42,7 +42,7 @@ def test_crowds(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     overlap = rng.uniform(0.5, 1, (30, 15)) * (rng.random((30, 15)) < share)
     for known, row in enumerate(best_assignments(overlap)):
-        held = np.flatnonzero(row != NOBODY)
+        held = np.flatnonzero(row != UNMATCHED)
         best = overlap[optimize.linear_sum_assignment(overlap[:known], maximize=True)].sum()
         np.testing.assert_allclose(overlap[row[held], held].sum(), best, atol=1e-9)
 
@@ -51,17 +51,17 @@ def test_a_new_detection_passes_objects_along_a_chain() -> None:
     """The third takes object 0 from the first, which takes object 1 from the second, which takes object 2."""
     overlap = np.array([[0.9, 0.8, 0], [0, 0.9, 0.8], [0.9, 0, 0]])
     assert best_assignments(overlap).tolist() == [
-        [NOBODY, NOBODY, NOBODY],
-        [0, NOBODY, NOBODY],
-        [0, 1, NOBODY],
+        [UNMATCHED, UNMATCHED, UNMATCHED],
+        [0, UNMATCHED, UNMATCHED],
+        [0, 1, UNMATCHED],
         [2, 0, 1],
     ]
 
 
 def test_a_better_detection_leaves_the_worse_one_without() -> None:
-    assert best_assignments(np.array([[0.6], [0.9], [0.7]])).tolist() == [[NOBODY], [0], [1], [1]]
+    assert best_assignments(np.array([[0.6], [0.9], [0.7]])).tolist() == [[UNMATCHED], [0], [1], [1]]
     assert best_assignments(np.empty((2, 0))).shape == (3, 0)
-    assert best_assignments(np.empty((0, 2))).tolist() == [[NOBODY, NOBODY]]
+    assert best_assignments(np.empty((0, 2))).tolist() == [[UNMATCHED, UNMATCHED]]
 
 
 def test_greedy_takes_pairs_in_turn() -> None:

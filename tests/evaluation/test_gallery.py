@@ -9,7 +9,7 @@ import pytest
 from asca_pillars.data.kitti import KittiSplit, read_labels, write_labels
 from asca_pillars.data.kitti.kitti_labels import KittiObject
 from asca_pillars.evaluation.gallery import worst_frames, write_gallery
-from asca_pillars.evaluation.kitti.verdicts import Verdict, verdicts
+from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches, matches_at_score
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from tests.scenes import GRID, write_dataset
 
@@ -37,13 +37,13 @@ def root(tmp_path: Path) -> Path:
     return root
 
 
-def judge(root: Path) -> list[Verdict]:
+def judge(root: Path) -> list[ScoreMatches]:
     labels = root / "training" / "label_2"
     frames = read_predictions(root.parent / "det", read_truth(labels), labels)
-    return verdicts(frames.truth, frames.detections, CLASSES, scores=0.3)
+    return matches_at_score(frames.truth, frames.detections, CLASSES, scores=0.3)
 
 
-def draw(root: Path, worst: list[Verdict]) -> Path:
+def draw(root: Path, worst: list[ScoreMatches]) -> Path:
     folder = root.parent / "gallery"
     write_gallery(
         folder, worst, KittiSplit(root), root / "training" / "label_2", root.parent / "det", GRID.ranges, "made up"
@@ -58,10 +58,10 @@ def pixels(image: np.ndarray, color: tuple[int, int, int]) -> int:
 
 def test_the_worst_frames_come_first_and_flawless_ones_not_at_all(root: Path) -> None:
     judged = judge(root)
-    assert [verdict.errors for verdict in judged] == [0, 4, 1, 3]
-    assert [verdict.frame_id for verdict in worst_frames(judged, 9)] == ["000001", "000003", "000002"]
-    assert [verdict.frame_id for verdict in worst_frames(judged, 2)] == ["000001", "000003"]
-    assert [verdict.frame_id for verdict in worst_frames(judged[::-1] * 2, 3)] == ["000001", "000001", "000003"]
+    assert [frame.errors for frame in judged] == [0, 4, 1, 3]
+    assert [frame.frame_id for frame in worst_frames(judged, 9)] == ["000001", "000003", "000002"]
+    assert [frame.frame_id for frame in worst_frames(judged, 2)] == ["000001", "000003"]
+    assert [frame.frame_id for frame in worst_frames(judged[::-1] * 2, 3)] == ["000001", "000001", "000003"]
 
 
 def test_misses_and_false_detections_have_their_colors(root: Path) -> None:
@@ -99,6 +99,6 @@ def test_objects_without_a_box_in_3d_are_not_drawn(root: Path) -> None:
         file.write("DontCare -1 -1 -10 0.00 0.00 50.00 50.00 -1 -1 -1 -1000 -1000 -1000 -10\n")
     detection.write_text("Car -1 -1 -10 100.00 100.00 200.00 200.00 -1 -1 -1 -1000 -1000 -1000 -10 0.9\n")
     worst = worst_frames(judge(root), 1)
-    assert (worst[0].missed.sum(), worst[0].false.sum()) == (4, 1) and len(read_labels(label)) == 5
+    assert (worst[0].missed.sum(), worst[0].false_positive.sum()) == (4, 1) and len(read_labels(label)) == 5
     image = cv2.imread(str(draw(root, worst) / "001_000001.png"))
     assert pixels(image, MAGENTA) == 0 < pixels(image, RED)

@@ -7,12 +7,11 @@ import pytest
 
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.errors import DatasetError
-from asca_pillars.evaluation.predictions import KITTI_TYPES, read_predictions, read_truth, write_predictions
+from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
 from asca_pillars.geometry.detections import Detections
 from tests.scenes import make_scene, write_dataset
 
 CAR = "Car -1 -1 -1.57 600.00 150.00 650.00 200.00 1.50 1.60 3.90 1.00 1.70 20.00 -1.57"
-KITTI = ", ".join(KITTI_TYPES)
 
 
 def write(folder: Path, files: dict[str, str]) -> Path:
@@ -69,12 +68,12 @@ def test_frames_without_a_prediction_file_are_left_out_and_named(tmp_path: Path)
             "det/000001.txt:3: 17 fields; a KITTI object label has 15 and a detection 16; convert the file",
         ),
         ("Car 0.5", "det/000001.txt:3: 2 fields; a KITTI object label has 15 and a detection 16; convert the file"),
-        (
-            f"Bus{CAR[3:]} 0.5",
-            f"det/000001.txt:3: unknown class 'Bus'; KITTI has {KITTI}; rename it or remove the line",
-        ),
         (f"{CAR} nan", "det/000001.txt:3: 'nan' is not a number; correct the line"),
         (f"{CAR.replace('20.00', '-inf')} 0.5", "det/000001.txt:3: '-inf' is not a number; correct the line"),
+        (
+            f"{CAR.replace('20.00', '1e308')} 0.5",
+            "det/000001.txt:3: '1e308' is too large; correct the line",
+        ),
         (f"{CAR.replace('20.00', '2O.OO')} 0.5", "det/000001.txt:3: '2O.OO' is not a number; correct the line"),
     ],
 )
@@ -83,9 +82,15 @@ def test_a_bad_line_is_named(tmp_path: Path, line: str, message: str) -> None:
 
 
 def test_bad_labels_are_named_too(tmp_path: Path) -> None:
-    line = f"\nTree{CAR[3:]}"
-    message = f"gt/000001.txt:2: unknown class 'Tree'; KITTI has {KITTI}; rename it or remove the line"
-    assert refusal(tmp_path, {"000001": ""}, {"000001": line}) == message
+    message = "gt/000001.txt:2: 2 fields; a KITTI object label has 15 and a detection 16; convert the file"
+    assert refusal(tmp_path, {"000001": ""}, {"000001": "\nCar 0.5"}) == message
+
+
+def test_types_that_kitti_does_not_have_are_counted(tmp_path: Path) -> None:
+    labels = {"000001": f"{CAR}\nForklift{CAR[3:]}\nvan{CAR[3:]}", "000002": f"FORKLIFT{CAR[3:]}"}
+    found = {"000001": f"Bus{CAR[3:]} 0.5", "000002": f"forklift{CAR[3:]} 0.5"}
+    assert score(tmp_path, found, labels).foreign_types == {"Bus": (0, 1), "Forklift": (2, 1)}
+    assert score(tmp_path, {"000001": "", "000002": ""}, dict.fromkeys(labels, CAR)).foreign_types == {}
 
 
 def test_a_prediction_without_labels(tmp_path: Path) -> None:

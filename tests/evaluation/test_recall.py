@@ -67,6 +67,22 @@ def test_frames_add_up() -> None:
     assert list(rows) == list(NAMES)
 
 
+def test_processes_add_up_their_counts() -> None:
+    """One finds 1 of 3 cars, the other one no frame with cars: a mean of their recalls would be NaN, the sum is 1/3."""
+    first, second = RecallTally(NAMES), RecallTally(NAMES)
+    cars = np.array([box(10, 2), box(20, -5), box(30, 5)], np.float32)
+    first.add(detections((CAR, box(10, 2))), cars, np.array([CAR, CAR, CAR]))
+    person = np.array([box(9, 1, PEDESTRIAN)], np.float32)
+    second.add(detections((PEDESTRIAN, box(9, 1, PEDESTRIAN))), person, np.array([PEDESTRIAN]))
+    second.add(detections((CAR, box(9, 1))), cars[:0], np.empty(0, np.int64))
+    rows = RecallTally(NAMES, first.counts + second.counts).rows()
+    assert rows["Car"] == RecallRow(objects=3, found=1, false=1, frames=3)
+    assert rows["Pedestrian"] == (1, 1, 0, 3) and rows["Car"].recall == pytest.approx(1 / 3)
+    assert first.frames == 1 and second.frames == 2
+    with pytest.raises(ValueError, match=r"counts of 3 classes must have shape \(4, 3\), not \(3, 3\)"):
+        RecallTally(NAMES, first.counts[:3])
+
+
 def test_a_second_detection_of_an_object_is_false() -> None:
     car = (CAR, box(10, 2))
     assert count([car, (CAR, box(10.1, 2)), (CAR, box(10, 2.1))], [car])["Car"] == (1, 1, 2)

@@ -11,7 +11,7 @@ from rich.console import Console
 from asca_pillars.data.kitti import KittiObject
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, evaluate
 from asca_pillars.evaluation.kitti.objects import frame_objects
-from asca_pillars.evaluation.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames
 from asca_pillars.evaluation.report import BANDS_M, EvalReport, notes, print_report, tables, to_json, to_markdown
 
@@ -80,17 +80,17 @@ def test_small_sets_and_missing_classes_are_named() -> None:
     assert lines[-1].endswith("in 3D: Car 0.89")  # the last of twelve found, with scores 1.00, 0.99 ...
 
 
-def test_excused_detections_are_named_where_they_are_most() -> None:
+def test_ignored_detections_are_named_where_they_are_most() -> None:
     """KITTI's tool ignores detections without a 2D box for their lack of height: a precision of 100 % says nothing."""
     made = report()
     flat = [dataclasses.replace(frame, bbox=np.full((1, 4), -1.0)) for frame in made.frames.detections]
     points = operating_points(made.frames.truth, flat, CLASSES, scores=0.5, difficulties=DIFFICULTIES)
-    hidden = [line for line in notes(dataclasses.replace(made, points=points)) if "are excused" in line]
-    assert not any("are excused" in line for line in notes(made))
+    hidden = [line for line in notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
+    assert not any("are ignored" in line for line in notes(made))
     far = [dataclasses.replace(frame, locations=frame.locations + 50) for frame in flat]
     points = operating_points(made.frames.truth, far, CLASSES, scores=0.5, difficulties=DIFFICULTIES)
-    hidden += [line for line in notes(dataclasses.replace(made, points=points)) if "are excused" in line]
-    assert len(hidden) == 1 and hidden[0].startswith("Car: 12 of 12 detections are excused even at hard")
+    hidden += [line for line in notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
+    assert len(hidden) == 1 and hidden[0].startswith("Car: 12 of 12 detections are ignored even at hard")
 
 
 def test_missing_frames_stand_in_every_form_of_the_report() -> None:

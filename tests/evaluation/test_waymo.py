@@ -106,6 +106,38 @@ def test_the_datasets_own_tool() -> None:
     np.testing.assert_allclose(figures, 100 * np.array(OFFICIAL).reshape(-1, 2), atol=1e-4, rtol=0)
 
 
+def test_no_label_zones_by_the_datasets_own_tool() -> None:
+    """Every third detection overlaps a no-label zone; AP and APH everywhere, for each class LEVEL_1 and LEVEL_2."""
+    truth, detections = crowded_frames(1, 12)
+    zones = [np.arange(len(found)) % 3 == 0 for found in detections]
+    results = waymo_detection(truth, detections, no_label=zones)
+    figures = np.array([(item.ap, item.aph) for item in results if item.range_m == EVERYWHERE], dtype=np.float64)
+    official = [(0.295828, 0.239746), (0.271611, 0.219966), (0.274176, 0.246180), (0.239996, 0.214582)]
+    official += [(0.419987, 0.388068), (0.356773, 0.327095)]
+    np.testing.assert_allclose(figures, 100 * np.array(official), atol=1e-4, rtol=0)
+
+
+def test_no_label_zones_hold_finds_but_no_false_ones() -> None:
+    truth = labelled(box(10, 0), box(20, 0))
+    detections = found((0.9, box(-10, 0)), (0.8, box(10, 0)))
+    assert waymo_detection([truth], [detections])[4].ap == pytest.approx(25)  # precision 1/2 at recall 1/2
+    zones = [np.array([True, True])]
+    assert waymo_detection([truth], [detections], no_label=zones)[4].ap == pytest.approx(50)
+
+
+def test_the_order_of_detections_does_not_matter() -> None:
+    """Two labels on one place, LEVEL_1 and LEVEL_2, and one detection of them; the other detection is false.
+
+    With the false one first in the file the tool gives LEVEL_1 an AP of 25 and leaves the LEVEL_1 object over; with
+    the false one last it gives 50. LEVEL_2 is 25 both times.
+    """
+    truth = labelled(box(10, 0), box(10, 0), levels=[1, 2])
+    false, true = (0.9, box(-20, 5)), (0.2, box(10, 0))
+    for scored in ((false, true), (true, false)):
+        assert score_of(truth, found(*scored), 1).ap == pytest.approx(50)
+        assert score_of(truth, found(*scored), 2).ap == pytest.approx(25)
+
+
 def naive(truth: list[WaymoTruth], detections: list[Detections], name: str, level: int) -> tuple[float, float] | None:
     """AP and APH by doing for every cutoff and frame what the definition says, with every matching tried."""
     if not any(((t.labels == NAMES.index(name)) & (t.levels > 0) & (t.levels <= level)).any() for t in truth):

@@ -1,26 +1,31 @@
 """Labels follow what KITTI's annotators could see."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from asca_pillars.data.kitti import KittiObject
-from asca_pillars.sim.annotation import make_labels
+from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import Target
 from asca_pillars.sim.world.scene import draw_calibration
 
 
-def labels_of(x_m: float, y_m: float, alone: int, visible: int, points: int) -> list[KittiObject]:
+def labels_of(
+    x_m: float,
+    y_m: float,
+    alone: int,
+    visible: int,
+    points: int,
+    label: Callable[..., list[KittiObject]] = label_camera_view,
+) -> list[KittiObject]:
     """Labels of one car of which `visible` of `alone` firings and `points` returns tell."""
     box = np.array([x_m, y_m, -0.9, 4.0, 1.6, 1.5, 0.0])
     hits = SimpleNamespace(alone=np.array([alone]), visible=np.array([visible]))
-    # All returns in the middle of the image.
-    cloud = np.tile(np.array([20.0, 0.0, -0.9, 0.2], np.float32), (points, 1))
-    returns = SimpleNamespace(points=cloud, owner=np.zeros(points, np.int64))
     calibration = draw_calibration(np.random.default_rng(0))
-    return make_labels((Target("Car", box),), hits, returns, calibration, SceneConfig())  # type: ignore[arg-type]
+    return label((Target("Car", box),), hits, np.zeros(points, np.int32), calibration, SceneConfig())
 
 
 @pytest.mark.parametrize(("visible", "state"), [(95, 0), (70, 1), (20, 2), (7, 3)])
@@ -48,3 +53,23 @@ def test_a_car_at_the_border_is_truncated_and_unknown_when_hardly_in_it() -> Non
     assert any(0.2 < cut <= 0.85 for cut in states)
     assert all(state == (3 if cut > 0.85 else 0) for cut, state in states.items() if cut != 0.85)
     assert 3 in states.values()
+
+
+def test_all_around_what_returns_a_point_is_labelled_wherever_it_stands() -> None:
+    for x, y in ((20.0, 0.0), (-20.0, 3.0), (2.0, -15.0), (0.5, 9.0)):
+        (label,) = labels_of(x, y, 100, 70, 50, label_all_around)
+        assert (label.type, label.occluded) == ("Car", 1)
+        assert label.bbox == (-1, -1, -1, -1) if x < 5 else label.bbox[2] > label.bbox[0]
+        assert label.truncated == (-1 if x < 5 else 0)
+    assert labels_of(-20.0, 3.0, 100, 0, 0, label_all_around) == []
+
+
+def test_all_around_what_hardly_returns_anything_is_unknown_and_no_dont_care() -> None:
+    (one_point,) = labels_of(-60.0, 0.0, 40, 40, 1, label_all_around)
+    (hidden,) = labels_of(-20.0, 0.0, 100, 3, 3, label_all_around)
+    assert [(o.type, o.occluded) for o in (one_point, hidden)] == [("Car", 3)] * 2
+
+
+def test_all_around_an_object_in_the_image_is_cut_by_its_border() -> None:
+    cut = [labels_of(5.0, y, 100, 100, 50, label_all_around)[0].truncated for y in (2.0, 4.0, 5.0)]
+    assert 0 <= cut[0] < cut[1] < cut[2] <= 1

@@ -1,10 +1,12 @@
 """Whole frames: reproducible, readable, labelled as KITTI would."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from asca_pillars.data.frames import read_frame
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image, objects_3d
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
@@ -217,3 +219,42 @@ def test_statistics_are_near_to_those_of_kitti(frames: list[Frame]) -> None:
         zero[name] = np.mean(np.concatenate(values) == 0)
     assert 0.30 < zero["Car"] < 0.60  # 0.46
     assert zero["Pedestrian"] < 0.25  # 0.09
+
+
+def test_around_is_the_whole_scan_with_labels_in_every_direction(whole: list[Frame]) -> None:
+    behind = 0
+    for index, full in enumerate(whole):
+        around = simulate_frame(0, index, SimulationConfig(field_of_view="around"))
+        np.testing.assert_array_equal(around.points, full.points)
+        seen = {(o.type, o.x_m, o.z_m) for o in full.objects if o.type != "DontCare"}
+        everywhere = {(o.type, o.x_m, o.z_m) for o in around.objects}
+        assert seen <= everywhere and "DontCare" not in {o.type for o in around.objects}
+        boxes = boxes_from_objects(around.objects, around.calibration)
+        boxes[:, 3:6] += 0.3  # a return may lie a little outside, as on the wheels or by its noise
+        assert points_in_boxes(around.points, boxes).any(axis=0).all()
+        behind += sum(boxes[:, 0] < 0)
+        # No object that holds points away from the ground and from other things is left out.
+        scene = draw_scene(SceneConfig(), np.random.default_rng([0, index, 0]))
+        targets = np.array([target.box for target in scene.targets], np.float32).reshape(-1, 7)
+        targets[:, 2] += 0.2
+        targets[:, 3:6] *= 0.9
+        rich = targets[points_in_boxes(around.points, targets).sum(axis=0) > 20]
+        for x, y in rich[:, :2]:
+            assert np.hypot(boxes[:, 0] - x, boxes[:, 1] - y).min() < 0.05
+    assert behind > 10
+
+
+def test_a_set_labelled_all_around_says_so_and_reads_back_for_training(tmp_path: Path) -> None:
+    simulate(tmp_path, 2, config=SimulationConfig(field_of_view="around"), progress=False)
+    assert json.loads((tmp_path / "simulation.json").read_text())["field_of_view"] == "around"
+    split, names = KittiSplit(tmp_path), ("Car", "Pedestrian", "Cyclist")
+    ahead = behind = 0
+    for name in split.frame_ids:
+        frame = read_frame(split, name, names, camera_view=False)
+        ahead += ((frame.boxes[:, 0] > 0) & (frame.labels >= 0)).sum()
+        behind += ((frame.boxes[:, 0] < 0) & (frame.labels >= 0)).sum()
+        cropped = read_frame(split, name, names)
+        assert (cropped.labels[cropped.boxes[:, 0] < -2] < 0).all(), "the camera's points hold nothing of them"
+    assert ahead > 0 and behind > 0
+    with pytest.raises(DatasetError, match="another folder"):
+        simulate(tmp_path, 3, progress=False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from asca_pillars.config import Config
-from asca_pillars.data.inspection.measurements import Fate, FrameMeasure, ScanMeasure, measure_frame
+from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError, ScanError
 from asca_pillars.geometry.anchors import ClassSpec
@@ -44,7 +44,7 @@ class ClassFacts:
         reach_m: lowest and highest x, y and z of the centers.
         outside_xyz: boxes whose center lies outside the grid's range of x, of y, of z.
         cut_in_z: boxes whose top or bottom reaches beyond the range of z.
-        overlapped, forced, missed: boxes by their `Fate`; together those that training is to find.
+        overlapped, forced, missed: boxes by their `MatchOutcome`; together those that training is to find.
         positives: positive anchors.
     """
 
@@ -190,7 +190,7 @@ def _class_facts(frames: Sequence[FrameMeasure], index: int, config: Config) -> 
     own = np.concatenate([frame.labels for frame in frames]) == index
     boxes = np.concatenate([frame.boxes for frame in frames])[own].astype(np.float64)
     points = np.concatenate([frame.points for frame in frames])[own]
-    fates = np.concatenate([frame.fates for frame in frames])[own]
+    outcomes = np.concatenate([frame.outcomes for frame in frames])[own]
     low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
     outside = (boxes[:, :3] < low) | (boxes[:, :3] >= high)
     cut = (boxes[:, 2] - boxes[:, 5] / 2 < low[2]) | (boxes[:, 2] + boxes[:, 5] / 2 > high[2])
@@ -209,9 +209,9 @@ def _class_facts(frames: Sequence[FrameMeasure], index: int, config: Config) -> 
         reach_m=tuple((float(axis.min()), float(axis.max())) for axis in boxes[:, :3].T) if len(boxes) else None,
         outside_xyz=tuple(outside.sum(axis=0).tolist()),
         cut_in_z=int(cut.sum()),
-        overlapped=int((fates == Fate.OVERLAPPED).sum()),
-        forced=int((fates == Fate.FORCED).sum()),
-        missed=int((fates == Fate.MISSED).sum()),
+        overlapped=int((outcomes == MatchOutcome.OVERLAPPED).sum()),
+        forced=int((outcomes == MatchOutcome.FORCED).sum()),
+        missed=int((outcomes == MatchOutcome.MISSED).sum()),
         positives=int(sum(frame.positives[index] for frame in frames)),
     )
 

@@ -20,7 +20,7 @@ from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
-class Fate(IntEnum):
+class MatchOutcome(IntEnum):
     """What training makes of a labelled object."""
 
     LEFT_OUT = 0
@@ -57,7 +57,7 @@ class ScanMeasure(NamedTuple):
 class FrameMeasure(NamedTuple):
     """A frame: its labels by type, the M objects of the C classes, and its scan.
 
-    `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `fates` (M,), `positives` (C,) positive
+    `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `outcomes` (M,), `positives` (C,) positive
     anchors of each class.
     """
 
@@ -65,7 +65,7 @@ class FrameMeasure(NamedTuple):
     boxes: NDArray[np.float32]
     labels: NDArray[np.int64]
     points: NDArray[np.int64]
-    fates: NDArray[np.int64]
+    outcomes: NDArray[np.int64]
     positives: NDArray[np.int64]
     scan: ScanMeasure
 
@@ -81,34 +81,34 @@ def measure_frame(split: KittiSplit, frame_id: str, config: Config) -> FrameMeas
     frame = read_frame(split, frame_id, spec.class_names, camera_view=config.data.camera_view, min_points=0)
     points = points_in_boxes(frame.points, frame.boxes).sum(axis=0)
     to_find = replace(frame, labels=np.where(points < config.data.min_points, IGNORED, frame.labels))
-    fates, positives = match(to_find, spec)
+    outcomes, positives = match(to_find, spec)
     own = frame.labels != IGNORED
     return FrameMeasure(
         types=Counter(item.type for item in split.objects(frame_id)),
         boxes=frame.boxes[own],
         labels=frame.labels[own],
         points=points[own],
-        fates=fates[own],
+        outcomes=outcomes[own],
         positives=positives,
         scan=measure_scan(stored_points(split.scan_path(frame_id)), frame.points, spec),
     )
 
 
 def match(frame: LabeledFrame, spec: PillarSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The `Fate` of each box (M,), and the number of positive anchors of each class (C,)."""
+    """The `MatchOutcome` of each box (M,), and the number of positive anchors of each class (C,)."""
     # Rows in the place of the labels tell which boxes the grid holds.
     kept = within_ranges(replace(frame, labels=np.arange(len(frame.boxes))), spec.ranges).labels
     boxes, labels = frame.boxes[kept], frame.labels[kept]
     targets = assign_targets(spec.anchors, spec.classes, boxes, labels)
     anchors = spec.anchors.reshape(-1, 7)[targets.positives]
-    fates = np.full(len(frame.boxes), Fate.LEFT_OUT, dtype=np.int64)
+    outcomes = np.full(len(frame.boxes), MatchOutcome.LEFT_OUT, dtype=np.int64)
     for row in np.flatnonzero(labels != IGNORED):
         overlap = aligned_bev_iou(anchors[targets.matched == row], boxes[row : row + 1]).max(initial=0)
         if overlap >= spec.classes[labels[row]].positive_iou:
-            fates[kept[row]] = Fate.OVERLAPPED
+            outcomes[kept[row]] = MatchOutcome.OVERLAPPED
         else:
-            fates[kept[row]] = Fate.FORCED if overlap > 0 else Fate.MISSED
-    return fates, np.bincount(labels[targets.matched], minlength=len(spec.classes))
+            outcomes[kept[row]] = MatchOutcome.FORCED if overlap > 0 else MatchOutcome.MISSED
+    return outcomes, np.bincount(labels[targets.matched], minlength=len(spec.classes))
 
 
 def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: PillarSpec) -> ScanMeasure:

@@ -197,6 +197,6 @@ def _matrix(
         matrix = np.array([float(word) for word in words]).reshape(shape)
     except ValueError as error:
         raise DatasetError(f"{path}: {key}: {error}; restore the file") from error
-    if not np.isfinite(matrix).all():
-        raise DatasetError(f"{path}: {key} holds a value that is not finite; restore the file")
+    if not (np.abs(matrix) < 1e9).all():
+        raise DatasetError(f"{path}: {key} holds a value that is not finite or above 1e9; restore the file")
     return matrix

@@ -18,6 +18,8 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import wrap_angle
 
+_TOO_LARGE = 1e9  # of any field; far above, float32 boxes are no longer finite
+
 
 @dataclass(frozen=True)
 class KittiObject:
@@ -176,6 +178,8 @@ def _number(word: str, place: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise DatasetError(f"{place}: '{word}' is not a number; correct the line")
+    if abs(value) >= _TOO_LARGE:
+        raise DatasetError(f"{place}: '{word}' is too large; correct the line")
     return value
 
 

@@ -5,7 +5,7 @@ official C++ tool computes it, with its 41 samples of recall:
 
 - Ground truth and detections are counted, ignored or absent, per class and difficulty (`states`).
 - They match at an overlap *above* 0.7 (Car) or 0.5 (others), in 2D, BEV and 3D alike. A box stands on its location.
-- Ground truth is served in file order (`matching`). The first pass, by score, gives the scores at which recall comes
+- Ground truth is processed in file order (`matching`). The first pass, by score, gives the scores at which recall comes
   nearest to 0, 1/40 ... 1; the second, by overlap, counts at each of these scores.
 - What counts and was not used up is a false positive; in 2D only, not if more than the same 0.7 or 0.5 of it lies in
   a DontCare area. These have no 3D box, so on them detections are false in BEV and 3D.
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.evaluation.kitti.matching import Counts, Judged, count
+from asca_pillars.evaluation.kitti.matching import ClassStates, Counts, count
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
 from asca_pillars.evaluation.kitti.states import detection_states, is_neighbor, is_type, truth_states
@@ -205,23 +205,23 @@ def _curves(
     """The curves of one class and difficulty in every metric that is evaluated."""
     truth, detections = frames.truth, frames.detections
     minimum = min_overlap(class_name)
-    judged = Judged(
+    states = ClassStates(
         truth_states(truth, class_name, difficulty, band),
         detection_states(detections, class_name, difficulty, band),
         detections.scores,
-        excused=dont_care > minimum,
+        in_dont_care=dont_care > minimum,
     )
-    nobody = judged._replace(excused=np.zeros_like(judged.excused))
+    no_dontcare = states._replace(in_dont_care=np.zeros_like(states.in_dont_care))
     similarity = (1 + np.cos(truth.alpha[pairs.truth] - detections.alpha[pairs.detection])) / 2
     own = is_type(detections, class_name)
-    for metric, known, judgement in (
-        ("bbox", detections.bbox[:, 0] >= 0, judged),
-        ("bev", detections.locations[:, 0] != _UNKNOWN_M, nobody),
-        ("3d", detections.locations[:, 1] != _UNKNOWN_M, nobody),
+    for metric, known, metric_states in (
+        ("bbox", detections.bbox[:, 0] >= 0, states),
+        ("bev", detections.locations[:, 0] != _UNKNOWN_M, no_dontcare),
+        ("3d", detections.locations[:, 1] != _UNKNOWN_M, no_dontcare),
     ):
         if (own & known).any():
             enough = pairs.overlaps[metric] > minimum
-            counts = count(pairs.where(enough), metric, judgement, similarity[enough], _RECALL_STEPS)
+            counts = count(pairs.where(enough), metric, metric_states, similarity[enough], _RECALL_STEPS)
             yield _curve(class_name, metric, difficulty, counts, counts.tp)
             if metric == "bbox" and not (detections.alpha == _UNKNOWN_ALPHA).any():
                 yield _curve(class_name, "aos", difficulty, counts, counts.similarity)

@@ -1,8 +1,9 @@
 """KITTI's assignment of detections to ground truth, for all frames and all score thresholds at once.
 
-Ground truth is served in file order, each object taking the best detection that is still free. Inside a frame that is
-sequential; frames and thresholds do not touch each other. So one round serves the first object of every frame at every
-threshold, the next round the second ones, and as many rounds do as the fullest frame has objects with a candidate.
+Ground truth is processed in file order; each object takes the best detection that is still free. Inside a frame that is
+sequential, but frames and thresholds are independent. So the first round matches the first object of every frame at
+every threshold, the next round the second ones; the number of rounds is that of the objects with a candidate in the
+fullest frame.
 """
 
 from collections.abc import Iterator
@@ -14,27 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.evaluation.kitti.pairs import Pairs
-from asca_pillars.evaluation.kitti.states import ABSENT, COUNTED
+from asca_pillars.evaluation.kitti.states import KittiState
 
 _Doubles = NDArray[np.float64]
 _Indices = NDArray[np.int64]
 _Mask = NDArray[np.bool_]
 
 
-class Judged(NamedTuple):
+class ClassStates(NamedTuple):
     """What one class, difficulty and distance band makes of the objects of all frames.
 
     Attributes:
-        truth_states: (N,) COUNTED, IGNORED or ABSENT.
-        detection_states: (D,) likewise.
-        scores: (D,).
-        excused: (D,) detections that are not false though they find nothing.
+        truth_states: (N,) `KittiState` of the ground truth.
+        detection_states: (D,) `KittiState` of the detections.
+        scores: (D,) of the detections, any monotonic measure.
+        in_dont_care: (D,) detections that are not false positives though they match nothing.
     """
 
     truth_states: NDArray[np.int8]
     detection_states: NDArray[np.int8]
     scores: _Doubles
-    excused: _Mask
+    in_dont_care: _Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class Counts:
     similarity: _Doubles
 
 
-def count(pairs: Pairs, metric: str, judged: Judged, similarity: _Doubles, recall_steps: int) -> Counts:
+def count(pairs: Pairs, metric: str, states: ClassStates, similarity: _Doubles, recall_steps: int) -> Counts:
     """Both passes of the protocol: score thresholds at even steps of recall, then the counts at each of them.
 
     Args:
@@ -67,17 +68,18 @@ def count(pairs: Pairs, metric: str, judged: Judged, similarity: _Doubles, recal
         similarity: (P,) of the headings of each pair.
         recall_steps: steps into which the recall from 0 to 1 is cut.
     """
-    states = judged.truth_states[pairs.truth], judged.detection_states[pairs.detection]
-    present = (states[0] != ABSENT) & (states[1] != ABSENT)
+    truth_states, detection_states = states.truth_states[pairs.truth], states.detection_states[pairs.detection]
+    present = (truth_states != KittiState.ABSENT) & (detection_states != KittiState.ABSENT)
     pairs, similarity = pairs.where(present), similarity[present]
-    truth_counted, detection_counted = states[0][present] == COUNTED, states[1][present] == COUNTED
+    truth_counted = truth_states[present] == KittiState.COUNTED
+    detection_counted = detection_states[present] == KittiState.COUNTED
     true = truth_counted & detection_counted
-    scores = judged.scores[pairs.detection]
+    scores = states.scores[pairs.detection]
 
     # First pass: the highest score wins, the earlier line of the file among equals.
     best = np.lexsort((pairs.detection, -scores, pairs.truth))
     taken = assign(pairs, best, np.ones((len(scores), 1), dtype=bool))[:, 0]
-    counted = int((judged.truth_states == COUNTED).sum())
+    counted = int((states.truth_states == KittiState.COUNTED).sum())
     thresholds = score_thresholds(scores[taken & true], counted, recall_steps)
 
     # Second pass: the greatest overlap among counted detections wins; an ignored one is the last resort.
@@ -85,8 +87,8 @@ def count(pairs: Pairs, metric: str, judged: Judged, similarity: _Doubles, recal
     best = np.lexsort((pairs.detection, -overlaps, ~detection_counted, pairs.truth))
     found = assign(pairs, best, scores[:, None] >= thresholds)
 
-    alone = (judged.detection_states == COUNTED) & ~judged.excused
-    reported = alone.sum() - np.searchsorted(np.sort(judged.scores[alone]), thresholds)
+    alone = (states.detection_states == KittiState.COUNTED) & ~states.in_dont_care
+    reported = alone.sum() - np.searchsorted(np.sort(states.scores[alone]), thresholds)
     return Counts(
         counted=counted,
         matched=int((taken & true).sum()),
@@ -117,7 +119,7 @@ def assign(pairs: Pairs, best: _Indices, candidates: _Mask) -> _Mask:
         free = candidates[chosen] & ~used[detection[chosen]]
         first = _first_true(free, starts)
         found[chosen] = first
-        # A round serves one object per frame, so that no detection stands here twice.
+        # A round has one object per frame, so that no detection occurs twice here.
         used[detection[chosen]] |= first
     return found
 

@@ -1,7 +1,7 @@
 """Which ground truth and which detections of a frame overlap, for all frames at once.
 
-Overlaps are the dear part of an evaluation and depend on no class, difficulty or distance band: they are computed
-once, and only the few pairs are kept that overlap enough for somebody to match them.
+Overlaps cost most of the time of an evaluation and depend on no class, difficulty or distance band: they are computed
+once, and only the few pairs are kept that overlap enough to match.
 """
 
 from collections.abc import Iterator, Sequence

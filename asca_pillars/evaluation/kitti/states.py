@@ -5,6 +5,7 @@ object. An absent one does neither.
 """
 
 from collections.abc import Mapping
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,14 @@ from numpy.typing import NDArray
 from asca_pillars.data.frames import NEIGHBOR_TYPES
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 
-COUNTED, IGNORED, ABSENT = 0, 1, -1
+
+class KittiState(IntEnum):
+    """What the protocol makes of an object at one class, difficulty and distance band."""
+
+    ABSENT = -1
+    COUNTED = 0
+    IGNORED = 1
+
 
 # Types so like a class that finding one is no mistake, and missing one neither.
 NEIGHBORS: Mapping[str, str] = {name.casefold(): other.casefold() for name, other in NEIGHBOR_TYPES.items()}
@@ -51,7 +59,7 @@ def is_neighbor(objects: FrameObjects, class_name: str) -> NDArray[np.bool_]:
 def truth_states(
     truth: FrameObjects, class_name: str, difficulty: str, band_m: _Band | None = None
 ) -> NDArray[np.int8]:
-    """(N,) COUNTED, IGNORED or ABSENT for ground truth.
+    """(N,) the `KittiState` of each ground truth.
 
     Counted: of the class and within the difficulty's limits. Ignored: of the class but beyond a limit, or of its
     neighboring type. Absent: every other type. In a distance band, what is counted but stands at a horizontal
@@ -68,7 +76,7 @@ def truth_states(
 def detection_states(
     detections: FrameObjects, class_name: str, difficulty: str, band_m: _Band | None = None
 ) -> NDArray[np.int8]:
-    """(N,) COUNTED, IGNORED or ABSENT for detections.
+    """(N,) the `KittiState` of each detection.
 
     Ignored: lower in the image than the difficulty's minimum, *whatever the class*. Counted: otherwise, if of the
     class. Absent: every other type. In a distance band, what is counted but stands at a horizontal distance outside
@@ -87,4 +95,5 @@ def _in_band(objects: FrameObjects, band_m: _Band | None) -> NDArray[np.bool_]:
 
 
 def _states(counted: NDArray[np.bool_], present: NDArray[np.bool_]) -> NDArray[np.int8]:
-    return np.where(counted, COUNTED, np.where(present, IGNORED, ABSENT)).astype(np.int8)
+    other = np.where(present, KittiState.IGNORED, KittiState.ABSENT)
+    return np.where(counted, KittiState.COUNTED, other).astype(np.int8)

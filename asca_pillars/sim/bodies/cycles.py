@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from asca_pillars.sim.bodies.people import bicycle
+from asca_pillars.sim.bodies.bicycles import bicycle
 from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, limbs
 from asca_pillars.sim.bodies.vehicles import wheels
 

@@ -25,7 +25,7 @@ def truck_body(rng: np.random.Generator, length: float, width: float, height: fl
         (front - 0.6, 0, cab_height * 0.4, 0.4, width * 0.85, cab_height * 0.4, 0, 0.1, 0.4, 0),
         (body[1], 0, bed, body[0], width, load, 0, box.reflectance, min(box.gloss, 1.2), 0),
         (0, 0, 0.7, length - 0.3, 0.9, bed - 0.7, 0, 0.05, 0.5, 0),
-    ]  # fmt: skip
+    ]
     axles = [length / 2 - 1.3, -length / 2 + 1.6, -length / 2 + 2.9 if length > 9 else -length / 2 + 1.6]
     return Primitives.join([cuboids(rows), wheels(np.unique(axles), width / 2 - 0.05, 0.48, rng)])
 
@@ -40,7 +40,7 @@ def bus_body(rng: np.random.Generator, length: float, width: float, height: floa
         (0, 0, low, length, width, waist - low, 0, paint.reflectance, paint.gloss, 0),
         (0, 0, waist, length - 0.06, width - 0.06, lintel - waist, 0, 0.15, 4.0, pane),
         (0, 0, lintel, length, width, height - lintel, 0, paint.reflectance, paint.gloss, 0),
-    ]  # fmt: skip
+    ]
     for x in np.arange(-length / 2 + 0.1, length / 2 - 0.8, 1.5):
         for sign in (1, -1):
             rows.append((x, sign * (width / 2 - 0.02), waist, 0.12, 0.06, lintel - waist, 0, paint.reflectance, 1.0, 0))
@@ -58,6 +58,6 @@ def trailer_body(rng: np.random.Generator, length: float, width: float, height: 
     rows = [
         (0.05 * length, 0, foot, 0.9 * length, width, height - foot, 0, paint.reflectance, min(paint.gloss, 1.0), 0),
         (length * 0.45, 0, foot, length * 0.1, 0.1, 0.1, 0, 0.1, 0.5, 0),
-    ]  # fmt: skip
+    ]
     rows[0] = (-0.05 * length, *rows[0][1:])
     return Primitives.join([cuboids(rows), wheels([-0.1 * length], width / 2, min(0.3, foot + 0.1), rng)])

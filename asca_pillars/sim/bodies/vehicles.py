@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, quads
-from asca_pillars.sim.bodies.styles import Paint, Profile, draw_paint
+from asca_pillars.sim.bodies.profiles import Profile
+from asca_pillars.sim.bodies.styles import Paint, draw_paint
 
 Floats = npt.NDArray[np.float64]
 MIRROR = np.array([1.0, -1.0, 1.0])
@@ -25,9 +26,12 @@ def _unit_wheel() -> Floats:
     ring = np.stack([np.cos(angle), np.zeros(_SPOKES + 1), np.sin(angle)], axis=1)
     a, b = ring[:-1], ring[1:]
     return np.concatenate(
-        [np.stack([a, b, b, a], 1), np.stack([a, b, 0.65 * b, 0.65 * a], 1),
-         0.65 * np.stack([a[::2], b[::2], b[1::2], np.zeros_like(a[::2])], 1)]
-    )  # fmt: skip
+        [
+            np.stack([a, b, b, a], 1),
+            np.stack([a, b, 0.65 * b, 0.65 * a], 1),
+            0.65 * np.stack([a[::2], b[::2], b[1::2], np.zeros_like(a[::2])], 1),
+        ]
+    )
 
 
 _WHEEL = _unit_wheel()
@@ -54,16 +58,19 @@ def car_body(
 ) -> Primitives:
     """A lofted car or van with wheels, mirrors, plates and seats behind its glass."""
     hull = _Hull(
-        length, width, height, profile,
-        clearance=float(rng.uniform(0.15, 0.24)),
+        length,
+        width,
+        height,
+        profile,
+        clearance=float(rng.uniform(0.12, 0.22)),
         wheel_x=np.array([rng.uniform(0.17, 0.21), rng.uniform(0.78, 0.83)]),
         wheel_radius=float(rng.uniform(0.29, 0.34)) * float(np.clip(1.0 + 0.25 * (height - 1.5), 0.95, 1.2)),
         crown=float(rng.uniform(0.04, 0.09)),
         nose_bow=float(rng.uniform(0.18, 0.42)),
         tail_bow=float(rng.uniform(0.05, 0.16)),
-    )  # fmt: skip
+    )
     paint = draw_paint(rng, dark_share)
-    trim = Surface(float(rng.uniform(0.005, 0.04)), 0.5)
+    trim = Surface(float(np.exp(rng.uniform(np.log(0.008), np.log(0.06)))), 0.5)
     corners, table = _shell(hull, paint, trim, rng)
     corners = np.concatenate([corners, corners * MIRROR])
     floor = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (0.45 * length, 0.45 * width)
@@ -157,14 +164,14 @@ def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
     z = np.broadcast_to(levels[:, 2], y.shape).copy()
     z[:, 2] += hull.crown * (1 - share[:, 0] ** 2)
     along = (0.5 - x) * hull.length + _bow(hull, np.full_like(y, x), y)
-    along[:, 0] -= np.sign(0.5 - x) * 0.06  # bumpers recede towards the road
+    along[:, 0] -= np.sign(0.5 - x) * 0.04  # bumpers recede towards the road
     return _panels(np.stack([along, y, z], axis=2))
 
 
 def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
     """A wheel at each x on both sides: tyre tread, and a dark sidewall around a rim that shines more or less."""
-    rubber = Surface(float(rng.uniform(0.005, 0.025)), 0.5)
-    rim = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.5)))), 1.0)
+    rubber = Surface(float(np.exp(rng.uniform(np.log(0.01), np.log(0.06)))), 0.3)
+    rim = Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.5)))), 0.6)
     faces = radius_m * _WHEEL
     faces[:_SPOKES, 2:, 1] -= min(0.2, half_track_m)  # the tread reaches inwards
     table = np.repeat(np.stack([rubber.row, rim.row]), (2 * _SPOKES, _SPOKES // 2), axis=0)
@@ -175,24 +182,27 @@ def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.ran
 
 
 def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface) -> Primitives:
-    """Plates (they shine), lamps, mirrors, and the dashboard."""
+    """Plates, lamps and their reflectors (they shine), mirrors, and the dashboard."""
     length, width, height, profile = hull.length, hull.width, hull.height, hull.profile
-    plate = min(0.45 * height, 0.75)
+    plate_z = min(0.45 * height, 0.75)
+    plate = Surface(float(rng.uniform(1.5, 4.0)), 0.3).row
+    rear_lamp, front_lamp = (Surface(float(rng.uniform(0.8, 2.2)), 0.4).row for _ in range(2))
     rows: list[tuple[float, ...]] = [
-        (length / 2 - 0.01, 0, 0.27 * height, 0.03, 0.52, 0.11, 0, 3.0, 0.3, 0),
-        (-length / 2 + 0.01, 0, plate - 0.1, 0.03, 0.52, 0.11, 0, 3.0, 0.3, 0),
+        (length / 2, 0, 0.25 * height, 0.05, 0.54, 0.14, 0, *plate),
+        (-length / 2, 0, plate_z - 0.1, 0.05, 0.54, 0.14, 0, *plate),
         (length * (0.46 - profile.cabin[0]), 0, 0.45 * height, 0.4, 0.8 * width, 0.14 * height, 0, 0.05, 0.5, 0),
     ]
     nose, tail = length / 2 - 0.55 * hull.nose_bow, -length / 2 + 0.6 * hull.tail_bow
     mirror = (0.5 - profile.cabin[0] - 0.05) * length
     stands_out = float(rng.uniform(0.03, 0.08))
+    lamp_m = float(rng.uniform(0.14, 0.32))  # height of the rear ones
     for sign in (1, -1):
         rows += [
-            (tail, sign * width * 0.39, 0.5 * height, 0.06, 0.16, 0.14, 0, 1.2, 0.6, 0),
-            (nose - 0.02 * length, sign * width * 0.37, 0.40 * height, 0.06, 0.24, 0.11, 0, 0.8, 1.0, 0),
-            (mirror, sign * (width / 2 + stands_out), profile.belt * height, 0.10, 0.17, 0.13, 0,
-             paint.reflectance, paint.gloss, 0),
-        ]  # fmt: skip
+            (tail, sign * width * 0.40, 0.5 * height, 0.08, 0.17, lamp_m, 0, *rear_lamp),
+            (tail - 0.03, sign * width * 0.38, 0.24 * height, 0.06, 0.14, 0.06, 0, 2.5, 0.4, 0),
+            (nose - 0.02 * length, sign * width * 0.38, 0.38 * height, 0.08, 0.28, 0.15, 0, *front_lamp),
+            (mirror, sign * (width / 2 + stands_out), profile.belt * height, 0.10, 0.17, 0.13, 0, *paint.row),
+        ]
     return cuboids(rows)
 
 

@@ -1,4 +1,6 @@
-"""The height of the ground, and rays against it (compiled by numba; see `bodycast` on why this is one file)."""
+"""The height and the material of the ground (compiled by numba)."""
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -13,49 +15,75 @@ TRACK_SPACING_HALF_M, GAUGE_HALF_M, RAIL_HALF_M = 1.7, 0.75, 0.06
 RELIEF_STEP_M = 4.0
 RELIEF_HALF_M = 96.0
 NO_RAILS = -1000.0
-GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
-CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
 ASPHALT, PAVEMENT, VERGE, MARKING, RAIL, BALLAST = range(6)
 
-# Positions of the fields of Ground.shape: what numba reads has no names.
-YAW, BEND, OFFSET, HALF_WIDTH, CROSS_U, CROSS_HALF, CROSS_TILT, KERB, WALK, LANE = range(10)
-BANK_LEFT, BANK_RIGHT, RAILS_V, MEDIAN_HALF, ROUGH, CAMBER = range(10, 16)
-TRACKS, RAIL_RISE, BED, BED_HALF, SECOND_V, SECOND_HALF, DITCH = range(16, 23)
-# Derived, because heights are asked for by the million; RISE is how far all that may stand above the hills.
-COS_YAW, SIN_YAW, COS_TILT, SIN_TILT, RISE = range(23, 28)
+
+class Street(NamedTuple):
+    """What the ground of a street looks like: metres, slopes and radians, in road coordinates (`world.ground`). What
+    is 0 is absent."""
+
+    yaw_rad: float
+    bend_per_m: float
+    offset_m: float
+    half_width_m: float
+    cross_u_m: float
+    cross_half_m: float
+    cross_tilt_rad: float
+    kerb_m: float
+    pavement_m: float
+    lane_m: float
+    bank_left: float
+    bank_right: float
+    rails_v_m: float  # NO_RAILS where there are none
+    median_half_m: float
+    rough_m: float
+    camber: float
+    tracks: float
+    rail_m: float
+    bed_m: float
+    bed_half_m: float
+    second_v_m: float
+    second_half_m: float
+    ditch_m: float
+    # Derived, because heights are asked for by the million.
+    cos_yaw: float
+    sin_yaw: float
+    cos_tilt: float
+    sin_tilt: float
+    rise_m: float  # how far all that may stand above the hills
 
 
 @numba.njit(cache=True)
-def heights(points: Floats, shape: Floats, relief: Floats, z_m: float) -> Floats:
+def heights(points: Floats, street: Street, relief: Floats, z_m: float) -> Floats:
     """`ground_height` of many points (N,2)."""
     result = np.empty(len(points))
     for i in range(len(points)):
-        result[i] = ground_height(points[i, 0], points[i, 1], shape, relief, z_m)
+        result[i] = ground_height(points[i, 0], points[i, 1], street, relief, z_m)
     return result
 
 
 @numba.njit(cache=True, inline="always")
-def road_distances(x: float, y: float, shape: Floats) -> tuple[float, float, float, float, float]:
+def road_distances(x: float, y: float, street: Street) -> tuple[float, float, float, float, float]:
     """Road coordinates u, v, then how far outside the main road (either carriageway), the crossing road and both
     (negative inside)."""
-    cos, sin = shape[COS_YAW], shape[SIN_YAW]
+    cos, sin = street.cos_yaw, street.sin_yaw
     u = x * cos + y * sin
-    v = y * cos - x * sin - shape[OFFSET] - 0.5 * shape[BEND] * u * u
-    main = abs(v) - shape[HALF_WIDTH]
-    if shape[SECOND_HALF] > 0.0:
-        main = min(main, abs(v - shape[SECOND_V]) - shape[SECOND_HALF])
+    v = y * cos - x * sin - street.offset_m - 0.5 * street.bend_per_m * u * u
+    main = abs(v) - street.half_width_m
+    if street.second_half_m > 0.0:
+        main = min(main, abs(v - street.second_v_m) - street.second_half_m)
     cross = 1e3
-    if shape[CROSS_HALF] > 0.0:
-        cross = abs((u - shape[CROSS_U]) * shape[COS_TILT] + v * shape[SIN_TILT]) - shape[CROSS_HALF]
+    if street.cross_half_m > 0.0:
+        cross = abs((u - street.cross_u_m) * street.cos_tilt + v * street.sin_tilt) - street.cross_half_m
     return u, v, main, cross, min(main, cross)
 
 
 @numba.njit(cache=True)
-def outside_roads(points: Floats, shape: Floats) -> Floats:
+def outside_roads(points: Floats, street: Street) -> Floats:
     """How far each of (N,2) points lies outside all roads (negative inside), metres."""
     result = np.empty(len(points))
     for i in range(len(points)):
-        _, _, _, _, result[i] = road_distances(points[i, 0], points[i, 1], shape)
+        _, _, _, _, result[i] = road_distances(points[i, 0], points[i, 1], street)
     return result
 
 
@@ -67,8 +95,8 @@ def on_rail(from_middle: float, tracks: float) -> bool:
     return abs(from_middle - GAUGE_HALF_M) < RAIL_HALF_M
 
 
-@numba.njit(cache=True)
-def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float) -> float:
+@numba.njit(cache=True, inline="always")
+def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float) -> float:
     """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them."""
     cells = relief.shape[0] - 1
     row = min(max((x + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
@@ -77,44 +105,44 @@ def ground_height(x: float, y: float, shape: Floats, relief: Floats, z_m: float)
     a, b = row - i, col - j
     height = (relief[i, j] * (1 - a) + relief[i + 1, j] * a) * (1 - b)
     height += (relief[i, j + 1] * (1 - a) + relief[i + 1, j + 1] * a) * b
-    _, v, main, cross, outside = road_distances(x, y, shape)
+    _, v, main, cross, outside = road_distances(x, y, street)
     if outside <= 0.0:
-        height += shape[CAMBER] * min(-main, 4.0) if main < 0 else 0.0
-        if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF] and cross > 3.0:
-            height += shape[KERB]
+        height += street.camber * min(-main, 4.0) if main < 0 else 0.0
+        if street.median_half_m > 0.0 and abs(v) < street.median_half_m and cross > 3.0:
+            height += street.kerb_m
     else:
-        height += shape[KERB] * min(outside / 0.05, 1.0)
-        beyond = outside - shape[WALK]
+        height += street.kerb_m * min(outside / 0.05, 1.0)
+        beyond = outside - street.pavement_m
         if beyond > 0.0 and cross > 2.0:
             away = min((cross - 2.0) / 6.0, 1.0)  # banks and ditches end at a crossing, not as a cliff
-            if shape[DITCH] > 0.0:
-                height -= away * shape[DITCH] * max(1.0 - abs(beyond / DITCH_HALF_M - 1.0), 0.0)
+            if street.ditch_m > 0.0:
+                height -= away * street.ditch_m * max(1.0 - abs(beyond / DITCH_HALF_M - 1.0), 0.0)
                 beyond = max(beyond - 2.0 * DITCH_HALF_M, 0.0)
-            height += away * (shape[BANK_LEFT] if v > 0 else shape[BANK_RIGHT]) * min(beyond, BANK_RUN_M)
-    if shape[RAILS_V] > NO_RAILS:
-        from_middle = abs(v - shape[RAILS_V])
-        if from_middle < shape[BED_HALF] and cross > 1.0:
-            height += shape[BED] * min((shape[BED_HALF] - from_middle) / 0.25, 1.0)
-        if on_rail(from_middle, shape[TRACKS]):
-            height += shape[RAIL_RISE]
+            height += away * (street.bank_left if v > 0 else street.bank_right) * min(beyond, BANK_RUN_M)
+    if street.rails_v_m > NO_RAILS:
+        from_middle = abs(v - street.rails_v_m)
+        if from_middle < street.bed_half_m and cross > 1.0:
+            height += street.bed_m * min((street.bed_half_m - from_middle) / 0.25, 1.0)
+        if on_rail(from_middle, street.tracks):
+            height += street.rail_m
     return z_m + height
 
 
 @numba.njit(cache=True)
-def ground_material(x: float, y: float, shape: Floats) -> int:
+def ground_material(x: float, y: float, street: Street) -> int:
     """Material of the ground at (x, y)."""
-    u, v, main, cross, outside = road_distances(x, y, shape)
-    if shape[RAILS_V] > NO_RAILS:
-        from_middle = abs(v - shape[RAILS_V])
-        if on_rail(from_middle, shape[TRACKS]):
+    u, v, main, cross, outside = road_distances(x, y, street)
+    if street.rails_v_m > NO_RAILS:
+        from_middle = abs(v - street.rails_v_m)
+        if on_rail(from_middle, street.tracks):
             return RAIL
-        if from_middle < shape[BED_HALF] and cross > 1.0:
+        if from_middle < street.bed_half_m and cross > 1.0:
             return BALLAST
     if outside > 0.0:
-        return VERGE if outside > shape[WALK] else PAVEMENT
-    if shape[MEDIAN_HALF] > 0.0 and abs(v) < shape[MEDIAN_HALF]:
+        return VERGE if outside > street.pavement_m else PAVEMENT
+    if street.median_half_m > 0.0 and abs(v) < street.median_half_m:
         return VERGE
-    lane = shape[LANE]
+    lane = street.lane_m
     if lane > 0.0 and main < 0.0 and cross > 0.0:
         to_line = abs(v / lane - np.round(v / lane)) * lane
         if to_line < 0.07 and u - 9.0 * np.floor(u / 9.0) < 4.0:
@@ -137,91 +165,3 @@ def highest_within(relief: Floats) -> Floats:
     for ring in range(1, len(highest)):
         highest[ring] = max(highest[ring], highest[ring - 1])
     return highest
-
-
-@numba.njit(cache=True)
-def cast_ground(shape, relief, materials, z_m, sensor, buffers, grass):  # type: ignore[no-untyped-def]
-    """Walk every ray down to the ground and keep the hit where nothing was nearer. Arguments as in `Ground`;
-    `grass` (K,C) in 0..1 says how far below the blades' tips a ray ends."""
-    slope, origin_z, phase, cos_az, sin_az, _, cast_columns, _ = sensor
-    rho, cosine, reflectance, owner, _, _ = buffers
-    highest = highest_within(relief)
-    rough = shape[ROUGH]
-    group = max(int(GROUP_DEG / 360.0 * len(cos_az)), 1)
-    for k in range(len(slope)):
-        cos_p, sin_p = np.cos(phase[k]), np.sin(phase[k])
-        stretch = np.sqrt(1.0 + slope[k] ** 2)
-        start, ring = 1.5, 0
-        while ring + 1 < len(highest) and origin_z[k] + slope[k] * start > z_m + highest[ring] + shape[RISE]:
-            # Up to the far edge of this ring of cells the ray stays above everything.
-            meet = (z_m + highest[ring] + shape[RISE] - origin_z[k]) / slope[k] if slope[k] < 0.0 else 1e9
-            start = max(start, min(meet, (ring + 1) * RELIEF_STEP_M))
-            if meet <= (ring + 1) * RELIEF_STEP_M:
-                break
-            ring += 1
-        # A neighboring ray of this ring was high above everything up to `clear`; this one starts there. Neighbors
-        # come in small groups, so that a ray does not depend on whether those far from it are cast.
-        clear = start
-        for j in range(len(cos_az)):
-            if not cast_columns[j]:
-                continue
-            if j % group == 0 or not cast_columns[j - 1]:
-                clear = start
-            dx = cos_az[j] * cos_p - sin_az[j] * sin_p
-            dy = sin_az[j] * cos_p + cos_az[j] * sin_p
-            limit = min(rho[k, j], 85.0)
-            near, reach, above = clear, clear, 0.0
-            gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
-            if gap < CLEAR_M:
-                near, reach = start, start
-                gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
-            clear, descending = start, max(-slope[k], 0.0)
-            far_above = descending > 0.03  # flatter rays graze crests that a neighbor may just have missed
-            while gap > 0.0 and reach < limit:
-                near, above = reach, gap
-                far_above &= gap >= CLEAR_M
-                if far_above:
-                    clear = reach
-                # Ground steeper than this is a kerb or a bank, which is wider than the step that passes its foot.
-                # On flat ground half of the way down is quicker; kerbs are lower than what is left above them then.
-                step = max(gap / (0.22 + descending), 0.04 + 0.006 * near)
-                if descending > 0.0:
-                    step = max(step, min(0.5 * gap / descending, 3.0))
-                reach = near + step
-                gap = origin_z[k] + slope[k] * reach - ground_height(reach * dx, reach * dy, shape, relief, z_m)
-            if gap > 0.0:
-                continue
-            for _ in range(10):  # false position, halving the weight of an end that stays
-                if reach - near < 0.004 or above <= 0.0:
-                    break
-                middle = near + (reach - near) * above / (above - gap)
-                here = origin_z[k] + slope[k] * middle - ground_height(middle * dx, middle * dy, shape, relief, z_m)
-                if here > 0.0:
-                    near, above, gap = middle, here, 0.5 * gap
-                else:
-                    reach, gap, above = middle, here, 0.5 * above
-                if abs(here) < 0.001:
-                    reach = middle
-                    break
-            if reach >= limit:
-                continue
-            x, y = reach * dx, reach * dy
-            step = 0.05
-            height = origin_z[k] + slope[k] * reach
-            gx = (ground_height(x + step, y, shape, relief, z_m) - height) / step
-            gy = (ground_height(x, y + step, shape, relief, z_m) - height) / step
-            gx, gy = min(max(gx, -3.0), 3.0), min(max(gy, -3.0), 3.0)
-            facing = abs(slope[k] - gx * dx - gy * dy) / (np.sqrt(1.0 + gx * gx + gy * gy) * stretch)
-            material = ground_material(x, y, shape)
-            if material == VERGE:
-                # Blades of grass end the ray before the soil does, and stand up to it.
-                reach -= rough * grass[k, j] ** 2 / max(0.12, abs(slope[k]))
-                facing = max(facing, 0.08)
-                if reach < 1.5:
-                    continue
-            elif material == RAIL:
-                facing = max(facing, 0.3)
-            rho[k, j] = reach
-            owner[k, j] = GROUND
-            cosine[k, j] = min(max(facing, 0.004), 1.0)
-            reflectance[k, j] = materials[material]

@@ -12,15 +12,18 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.sim.bodies.primitives import Primitives
-from asca_pillars.sim.casting.bodycast import cast_ellipsoids, cast_triangles
-from asca_pillars.sim.casting.groundcast import cast_ground
+from asca_pillars.sim.casting.ellipsoidcast import cast_ellipsoids
+from asca_pillars.sim.casting.grounddescent import cast_ground
+from asca_pillars.sim.casting.rays import NOTHING, no_hits, rays_of
+from asca_pillars.sim.casting.trianglecast import cast_triangles
 from asca_pillars.sim.sensor.lidar import Firings
 from asca_pillars.sim.world.ground import Ground
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
-NOTHING = -3  # owner of a firing that met nothing
+
+__all__ = ["NOTHING", "Bodies", "Hits", "cast"]
 
 
 class Hits(NamedTuple):
@@ -30,7 +33,7 @@ class Hits(NamedTuple):
     cosine: Singles  # (K,C) of the angle of incidence
     reflectance: Singles  # (K,C) of the material at this incidence
     owner: npt.NDArray[np.int32]  # (K,C) object index, BACKGROUND, GROUND or NOTHING
-    alone: Ints  # (objects,) firings in the camera's columns that would hit the object if it stood alone
+    alone: Ints  # (objects,) counted firings that would hit the object if it stood alone
     visible: Ints  # (objects,) those that do hit it
 
 
@@ -48,25 +51,29 @@ class Bodies(NamedTuple):
 def cast(bodies: Bodies, objects: int, ground: Ground | None, firings: Firings, seed: int) -> Hits:
     """Cast every firing at bodies and ground; `objects` is the number of labelled objects."""
     primitives = bodies.primitives
-    rings, columns = len(firings.slope), len(firings.azimuth_rad)
-    rho = np.full((rings, columns), np.inf)
-    cosine = np.zeros((rings, columns), np.float32)
-    reflectance = np.zeros((rings, columns), np.float32)
-    owner = np.full((rings, columns), NOTHING, np.int32)
-    stamp = np.full((rings, columns), -1, np.int32)
-    alone = np.zeros(objects, np.int64)
-    sensor = (firings.slope, firings.origin_z_m, firings.phase_rad, np.cos(firings.azimuth_rad),
-              np.sin(firings.azimuth_rad), firings.first_column, firings.cast, firings.in_camera)  # fmt: skip
-    buffers = (rho, cosine, reflectance, owner, stamp, alone)
+    rays, nearest = rays_of(firings), no_hits(firings, objects)
     key = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
-    cast_triangles(primitives.triangles, primitives.triangle_surface, bodies.tri_owner, bodies.tri_salt,
-                    sensor, buffers, key)  # fmt: skip
-    matrices = primitives.unit_from_world
-    cast_ellipsoids(primitives.centers, matrices, np.linalg.inv(matrices), primitives.ellipsoid_surface,
-                     bodies.ell_owner, bodies.ell_salt, sensor, buffers, key)  # fmt: skip
+    cast_triangles(
+        primitives.triangles,
+        primitives.triangle_surface,
+        bodies.tri_owner,
+        bodies.tri_salt,
+        rays,
+        nearest,
+        key,
+    )
+    cast_ellipsoids(
+        primitives.centers,
+        primitives.unit_from_world,
+        primitives.ellipsoid_surface,
+        bodies.ell_owner,
+        bodies.ell_salt,
+        rays,
+        nearest,
+        key,
+    )
     if ground is not None:
-        grass = np.random.default_rng(seed).random((rings, columns), np.float32)
-        cast_ground(ground.shape, ground.relief, ground.reflectance, ground.z_m, sensor, buffers, grass)
-    seen = owner[:, firings.in_camera]
+        cast_ground(ground.street, ground.relief, ground.reflectance, ground.z_m, rays, nearest, key)
+    seen = nearest.owner[:, firings.counted]
     visible = np.bincount(seen[seen >= 0], minlength=objects).astype(np.int64)
-    return Hits(rho, cosine, reflectance, owner, alone, visible)
+    return Hits(nearest.rho_m, nearest.cosine, nearest.reflectance, nearest.owner, nearest.alone, visible)

@@ -27,6 +27,8 @@ _ASIDE_RAD = np.pi / 12
 def label_statistics(split: KittiSplit, frame_ids: Sequence[str]) -> tuple[dict[str, LabelStatistics], float]:
     """The labels of each of CLASSES that occurs in the frames, and the DontCare areas per frame.
 
+    KITTI labels what stands in the image; in a set that is labelled all around, the others are left out.
+
     Raises:
         DatasetError: a label or calibration file is missing or damaged.
     """
@@ -39,7 +41,7 @@ def label_statistics(split: KittiSplit, frame_ids: Sequence[str]) -> tuple[dict[
         dont_care += sum(item.type == "DontCare" for item in everything)
         calibration = split.calibration(frame_id)
         for name in CLASSES:
-            mine = objects_3d(item for item in everything if item.type == name)
+            mine = objects_3d(item for item in everything if item.type == name and item.bbox[2] > item.bbox[0])
             per_frame[name][index] = len(mine)
             objects[name] += mine
             boxes[name].append(boxes_from_objects(mine, calibration))

@@ -71,7 +71,7 @@ class Lidar:
     zero_share: float = 0.03  # of all returns, reported as 0 for no reason: so the best lasers do on near, bright road
     camera_half_angle_deg: float = 43.0
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012 - a class constant that pydantic reads
+    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
     def __post_init__(self) -> None:
         if list(self.elevation_deg) != sorted(self.elevation_deg, reverse=True) or not self.elevation_deg:
@@ -119,7 +119,7 @@ class Firings:
     azimuth_rad: npt.NDArray[np.float64]  # (C,) of each column, without the phase
     first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
     cast: npt.NDArray[np.bool_]  # (C,) columns that are fired at all
-    in_camera: npt.NDArray[np.bool_]  # (C,) columns that the camera sees
+    counted: npt.NDArray[np.bool_]  # (C,) columns whose firings tell how much of an object is hidden
     hidden: npt.NDArray[np.bool_]  # (K,C) firings that the own car stops
     range_sigma_m: float
     loss_share: float
@@ -131,8 +131,15 @@ class Firings:
         return self.zero_power * self.lidar.lost_share_of_zero_power
 
 
-def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool) -> Firings:
-    """The firings of one scan. `camera_only` leaves every random number as it is and only skips columns."""
+def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool, count_all_around: bool = False) -> Firings:
+    """The firings of one scan.
+
+    Args:
+        lidar: the sensor.
+        rng: of the scan; each call draws the same number of values from it.
+        camera_only: skip the columns that the camera does not see, and leave every random number as it is.
+        count_all_around: how much of an object is hidden is told by all columns, not by the camera's alone.
+    """
     rings, per_block = lidar.rings, lidar.rings // len(lidar.origin_z_m)
     origin_z = np.concatenate([np.linspace(*block, per_block) for block in lidar.origin_z_m])
     elevation = np.asarray(lidar.elevation_deg) + rng.normal(0.0, lidar.elevation_jitter_deg, rings)
@@ -158,7 +165,7 @@ def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool) -> F
         azimuth_rad=azimuth,
         first_column=np.searchsorted(columns, np.arange(lidar.azimuth_counts + 1)),
         cast=in_camera if camera_only else np.ones(len(columns), bool),
-        in_camera=in_camera,
+        counted=np.ones(len(columns), bool) if count_all_around else in_camera,
         hidden=_hidden(lidar, azimuth),
         range_sigma_m=float(rng.uniform(*lidar.range_sigma_m)),
         loss_share=float(rng.uniform(*lidar.loss_share)),

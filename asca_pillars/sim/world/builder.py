@@ -9,7 +9,7 @@ import numpy.typing as npt
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, prisms
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.placement import Occupied
+from asca_pillars.sim.world.occupied import Occupied
 
 Floats = npt.NDArray[np.float64]
 Material = tuple[float, float, float]  # reflectance, gloss, transparency
@@ -83,17 +83,31 @@ class Builder:
         self._bodies.append(body.placed(x, y, z, heading + yaw))
 
     def box(
-        self, along: float, across: float, z: float, size: tuple[float, float, float], material: Material,
-        cross: bool = False, yaw: float = 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        along: float,
+        across: float,
+        z: float,
+        size: tuple[float, float, float],
+        material: Material,
+        cross: bool = False,
+        yaw: float = 0.0,
+    ) -> None:
         """A box of `size` (along, across, up) whose bottom is z above the ground."""
         x, y, heading = self.to_lidar(along, across, cross)
         self._boxes.append((x, y, z, *size, heading + yaw, *material))
 
     def post(
-        self, along: float, across: float, z: float, height: float, radius: float, reflectance: float,
-        cross: bool = False, taper: float = 1.0, lean: tuple[float, float] = (0.0, 0.0),
-    ) -> None:  # fmt: skip
+        self,
+        along: float,
+        across: float,
+        z: float,
+        height: float,
+        radius: float,
+        reflectance: float,
+        cross: bool = False,
+        taper: float = 1.0,
+        lean: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         """A round post whose radius at the top is `taper` times that at the foot, leaning by `lean` metres per metre
         of height along x and y."""
         x, y, _ = self.to_lidar(along, across, cross)
@@ -107,9 +121,16 @@ class Builder:
         self._blobs.append(np.array([[x, y, z, *radii, yaw, reflectance, 0.0]]))
 
     def clouds(
-        self, along: Floats, across: Floats, z: Floats, radii: Floats, reflectance: float, density_per_m: Floats,
-        cross: bool = False, turned: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        along: Floats,
+        across: Floats,
+        z: Floats,
+        radii: Floats,
+        reflectance: float,
+        density_per_m: Floats,
+        cross: bool = False,
+        turned: bool = True,
+    ) -> None:
         """Leaves (N): ellipsoids of radii (N,3) around z above the ground, each turned at random or, for hedges,
         along the road."""
         rows = np.empty((len(along), 9))

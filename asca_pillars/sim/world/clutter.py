@@ -31,6 +31,17 @@ from asca_pillars.sim.world.lookalikes import (
     stack,
     thin_cylinder,
 )
+from asca_pillars.sim.world.markers import (
+    beacon,
+    board,
+    covered_thing,
+    fragments,
+    leaning_board,
+    low_pieces,
+    mast,
+    striped_post,
+    wall_end,
+)
 from asca_pillars.sim.world.vegetation import bush, hedge_block, shrub, tree, weeds
 
 Thing = Callable[[Builder, float, float], None]
@@ -55,6 +66,11 @@ def scatter(builder: Builder) -> None:
             beside = -rng.uniform(0.3, 1.8)
         if not builder.near_junction(along, along):
             things[int(np.searchsorted(upto, rng.random()))](builder, along, float(side * (edge + beside)))
+    for _ in range(rng.poisson(builder.config.far_clutter)):
+        along = float(rng.choice([-1.0, 1.0]) * rng.uniform(28.0, 75.0))
+        across = float(rng.choice([-1.0, 1.0]) * (ground.half_width_m + rng.uniform(0.0, 30.0)))
+        if not builder.near_junction(along, along):
+            FAR[int(rng.integers(len(FAR)))](builder, along, across)
     if ground.cross_half_m > 0 and rng.random() < 0.35:
         reach = ground.cross_half_m + rng.uniform(1.5, 5.0)
         island(builder, ground.cross_u_m + float(rng.choice([-1.0, 1.0])) * reach, 0.0)
@@ -65,10 +81,49 @@ def any_shrub(builder: Builder, along: float, across: float) -> None:
     shrub(builder, along, across, tall=bool(builder.rng.random() < 0.35))
 
 
+FAR: tuple[Thing, ...] = (
+    low_pieces,
+    low_pieces,
+    low_pieces,
+    fragments,
+    weeds,
+    covered_thing,
+    board,
+    mast,
+)  # low and sparse clutter beyond 28 m
 SHARES: dict[Thing, float] = {
-    pole: 0.13, pole_group: 0.04, bollards: 0.07, delineators: 0.04, cabinet: 0.07, bins: 0.06, bench: 0.03,
-    planter: 0.03, shelter: 0.012, billboard: 0.025, barrier_boards: 0.02, low_stones: 0.07,
-    thin_cylinder: 0.035, post_with_box: 0.04, column: 0.025, container: 0.015, heap: 0.03, stack: 0.025,
-    hedge_block: 0.035, parked_bicycles: 0.04, parked_motorbikes: 0.013, any_shrub: 0.11, bush: 0.035, tree: 0.05,
+    pole: 0.09,
+    pole_group: 0.04,
+    bollards: 0.04,
+    delineators: 0.04,
+    cabinet: 0.04,
+    bins: 0.06,
+    bench: 0.03,
+    planter: 0.03,
+    shelter: 0.012,
+    billboard: 0.025,
+    barrier_boards: 0.02,
+    low_stones: 0.05,
+    thin_cylinder: 0.025,
+    post_with_box: 0.04,
+    column: 0.025,
+    container: 0.015,
+    heap: 0.03,
+    stack: 0.025,
+    hedge_block: 0.035,
+    parked_bicycles: 0.04,
+    parked_motorbikes: 0.013,
+    any_shrub: 0.06,
+    bush: 0.035,
+    tree: 0.05,
     weeds: 0.13,
-}  # fmt: skip
+    beacon: 0.06,
+    striped_post: 0.08,
+    board: 0.08,
+    leaning_board: 0.04,
+    mast: 0.10,
+    covered_thing: 0.07,
+    wall_end: 0.03,
+    fragments: 0.05,
+    low_pieces: 0.03,
+}

@@ -18,9 +18,15 @@ def pole(builder: Builder, along: float, across: float) -> None:
         return
     tilt = rng.normal(0.0, 0.015, 2)
     builder.post(
-        along, across, -0.3, float(rng.uniform(2.2, 7.0)), radius, float(rng.uniform(0.1, 0.6)),
-        taper=float(rng.uniform(0.6, 1.0)), lean=(float(tilt[0]), float(tilt[1])),
-    )  # fmt: skip
+        along,
+        across,
+        -0.3,
+        float(rng.uniform(2.2, 7.0)),
+        radius,
+        float(rng.uniform(0.1, 0.6)),
+        taper=float(rng.uniform(0.6, 1.0)),
+        lean=(float(tilt[0]), float(tilt[1])),
+    )
     what = rng.random()
     if what < 0.35:  # signs send back nearly everything; from the side they are a line
         size = float(rng.uniform(0.35, 0.95))

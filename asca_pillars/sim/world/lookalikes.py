@@ -14,9 +14,15 @@ def thin_cylinder(builder: Builder, along: float, across: float) -> None:
     if builder.claim(along, across, 2 * radius, 2 * radius):
         taper, lean = float(rng.uniform(0.5, 1.1)), rng.normal(0.0, 0.05, 2)
         builder.post(
-            along, across, -0.2, float(rng.uniform(0.9, 2.4)), radius, float(rng.uniform(0.08, 0.6)), taper=taper,
+            along,
+            across,
+            -0.2,
+            float(rng.uniform(0.9, 2.4)),
+            radius,
+            float(rng.uniform(0.08, 0.6)),
+            taper=taper,
             lean=(float(lean[0]), float(lean[1])),
-        )  # fmt: skip
+        )
 
 
 def post_with_box(builder: Builder, along: float, across: float) -> None:

@@ -6,15 +6,17 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.sim.bodies import cycles, heavy, people, styles, vehicles
+from asca_pillars.sim.bodies import bicycles, cycles, heavy, people, styles, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.builder import Builder
 from asca_pillars.sim.world.clutter import scatter
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.placement import Occupied, Placer, Target
+from asca_pillars.sim.world.occupied import Occupied
+from asca_pillars.sim.world.placement import Placer, Target
 from asca_pillars.sim.world.roadside import line_streets
+from asca_pillars.sim.world.screens import fill_gaps, hide_partly
 from asca_pillars.sim.world.streets import draw_ground, draw_kind
 
 # Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
@@ -58,6 +60,8 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
         for _ in range(rng.poisson(config.beyond)):
             placer.place_beyond()
     builder = Builder(rng, config, ground, occupied, kind)
+    hide_partly(builder, placer.half_hidden)
+    fill_gaps(builder, placer.targets)
     line_streets(builder)
     scatter(builder)
     return Scene(ground, tuple(placer.targets), builder.primitives(), draw_calibration(rng))
@@ -109,7 +113,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     name = target.type
     if name in ("Car", "Van"):
         # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
-        slack = rng.uniform((0.0, 0.0, -0.03), (0.16, 0.10, 0.09))
+        slack = rng.uniform((0.0, 0.0, -0.03), (0.24, 0.14, 0.09))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.1
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
@@ -127,7 +131,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     elif name == "Person_sitting":
         body = people.sitting_body(rng, height - 0.05)
     else:
-        body = people.cyclist_body(rng, height - 0.08, width, length - 0.04)
+        body = bicycles.cyclist_body(rng, height - 0.08, width, length - 0.04)
     dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
     return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 
@@ -155,6 +159,8 @@ def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: 
         blob_salts.append(first + 8000 + np.arange(len(body.centers)))
     return Bodies(
         Primitives.join(parts),
-        np.concatenate(owners).astype(np.int64), np.concatenate(salts).astype(np.int64),
-        np.concatenate(blob_owners).astype(np.int64), np.concatenate(blob_salts).astype(np.int64),
-    )  # fmt: skip
+        np.concatenate(owners).astype(np.int64),
+        np.concatenate(salts).astype(np.int64),
+        np.concatenate(blob_owners).astype(np.int64),
+        np.concatenate(blob_salts).astype(np.int64),
+    )

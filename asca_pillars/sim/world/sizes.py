@@ -56,6 +56,7 @@ SIZES = {
     ),
 }
 CHILD_SHARE = 0.07
+MICROCAR_SHARE = 0.02  # two-seaters, which the other cars' spread does not reach
 MOTORCYCLE_SHARE = 0.2  # of Misc, whose smallest quarter is two-wheelers
 
 
@@ -63,6 +64,8 @@ def draw_size(rng: np.random.Generator, name: str) -> Floats:
     """Length, width, height of a label box, metres."""
     if name == "Misc" and rng.random() < MOTORCYCLE_SHARE:
         return rng.uniform((1.7, 0.60, 1.45), (2.3, 0.90, 1.85))
+    if name == "Car" and rng.random() < MICROCAR_SHARE:
+        return rng.uniform((2.30, 1.45, 1.45), (2.95, 1.62, 1.60))
     statistics = SIZES[name]
     size = np.array(statistics.mean) + statistics.spread @ rng.standard_normal(3)
     size = np.clip(size, statistics.low, statistics.high)

@@ -6,18 +6,26 @@ import numpy as np
 
 from asca_pillars.sim.casting.groundcast import NO_RAILS, TRACK_SPACING_HALF_M
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.world.ground import Ground, draw_relief, street
+from asca_pillars.sim.world.ground import Ground, draw_relief, make_street
 
 # narrow with parked cars, wide in town, out of town, square or campus, trunk road, alley between walls
 KINDS = ("residential", "urban", "rural", "campus", "road", "alley")
 HALF_WIDTH_M = {
-    "residential": (2.7, 4.3), "urban": (3.6, 8.0), "rural": (3.2, 6.0), "campus": (2.5, 6.0), "road": (4.0, 8.0),
+    "residential": (2.7, 4.3),
+    "urban": (3.6, 8.0),
+    "rural": (3.2, 6.0),
+    "campus": (2.5, 6.0),
+    "road": (4.0, 8.0),
     "alley": (2.2, 3.2),
-}  # fmt: skip
+}
 PAVEMENT_M = {
-    "residential": (1.0, 3.0), "urban": (2.0, 5.0), "rural": (0.3, 2.0), "campus": (1.0, 10.0), "road": (0.2, 1.5),
+    "residential": (1.0, 3.0),
+    "urban": (2.0, 5.0),
+    "rural": (0.3, 2.0),
+    "campus": (1.0, 10.0),
+    "road": (0.2, 1.5),
     "alley": (0.0, 1.0),
-}  # fmt: skip
+}
 DIVIDED_SHARE = {"road": 0.6, "urban": 0.2, "rural": 0.1}
 RAILS_FACTOR = {"urban": 2.0, "road": 2.0, "alley": 0.0, "residential": 0.5}
 STEEP_SHARE = {"rural": 0.35, "road": 0.3}
@@ -41,7 +49,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
     median = half > 6.0 and rng.random() < config.median_share
     turning = kind != "alley" and rng.random() < config.turning_share
     steep = rng.random() < STEEP_SHARE.get(kind, 0.05)
-    shape = street(
+    street = make_street(
         yaw_rad=rng.normal(0.0, config.heading_error_sigma_rad) + (rng.uniform(-0.5, 0.5) if turning else 0.0),
         bend_per_m=rng.normal(0.0, config.bend_sigma_per_m),
         offset_m=offset,
@@ -59,7 +67,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
         rough_m=rng.uniform(*config.grass_m),
         camber=rng.uniform(0.0, 0.035),
         **_beside(config, rng, kind, half),
-    )  # fmt: skip
+    )
     asphalt = float(np.clip(rng.normal(0.22, 0.03), 0.13, 0.33))
     of_asphalt = np.array([1.0, rng.uniform(0.85, 1.25), 0.0, rng.uniform(1.2, 1.9), 0.0, rng.uniform(0.6, 1.2)])
     reflectance = asphalt * of_asphalt + (0.0, 0.0, rng.uniform(0.22, 0.42), 0.0, 0.15, 0.0)
@@ -67,8 +75,8 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
     low, high = config.relief_m
     # Most streets are flat and some are hilly: the square of a uniform draw.
     amplitude = low + (high - low) * rng.random() ** 2
-    relief = draw_relief(rng, slope, amplitude, shape, rng.uniform(*config.bump_m))
-    ground = Ground(shape, relief, reflectance, 0.0)
+    relief = draw_relief(rng, slope, amplitude, street, rng.uniform(*config.bump_m))
+    ground = Ground(street, relief, reflectance, 0.0)
     under_car = float(ground.heights((0.0, 0.0))[0])
     return replace(ground, z_m=-float(rng.uniform(*config.sensor_height_m)) - under_car)
 
@@ -90,9 +98,11 @@ def _beside(config: SceneConfig, rng: np.random.Generator, kind: str, half: floa
             bed_half = (TRACK_SPACING_HALF_M if two else 0.0) + rng.uniform(1.3, 1.8)
             strip = float(2 * bed_half + rng.uniform(0.2, 1.5))
             numbers |= {
-                "rails_v_m": half + strip / 2, "bed_half_m": bed_half,
-                "bed_m": rng.uniform(0.0, 0.25), "rail_m": rng.uniform(0.05, 0.18),
-            }  # fmt: skip
+                "rails_v_m": half + strip / 2,
+                "bed_half_m": bed_half,
+                "bed_m": rng.uniform(0.0, 0.25),
+                "rail_m": rng.uniform(0.05, 0.18),
+            }
         else:
             numbers |= {"rails_v_m": rng.uniform(-0.3, 0.9) * half, "rail_m": rng.uniform(0.01, 0.03)}
     if divided:

@@ -51,9 +51,13 @@ def _leaves_of_hedge(
     count = len(along)
     level = np.tile((np.arange(rows) + 0.5) * height / rows, count // rows)
     radii = np.stack(
-        [step * rng.uniform(0.7, 1.2, count), thick * rng.uniform(0.42, 0.62, count),
-         height / rows * rng.uniform(0.5, 0.75, count)], axis=-1,
-    )  # fmt: skip
+        [
+            step * rng.uniform(0.7, 1.2, count),
+            thick * rng.uniform(0.42, 0.62, count),
+            height / rows * rng.uniform(0.5, 0.75, count),
+        ],
+        axis=-1,
+    )
     z = np.maximum(level + rng.normal(0.0, 0.05, count), 0.6 * radii[:, 2])
     density = rng.uniform(2.5, 7.0) * np.exp(rng.normal(0.0, 0.4, count))
     sideways = np.full(count, across) + rng.normal(0.0, 0.07, count)
@@ -168,17 +172,34 @@ def tree(builder: Builder, along: float, across: float, cross: bool = False, tal
 def trunk(builder: Builder, along: float, across: float, height: float, cross: bool = False) -> bool:
     """A stem, straight or leaning, of one to three boles; whether there was room for it."""
     rng = builder.rng
-    radius = float(np.exp(rng.uniform(np.log(0.06), np.log(0.40))))
+    thick = rng.random() < builder.config.thick_trunks
+    radius = float(rng.uniform(0.175, 0.30) if thick else np.exp(rng.uniform(np.log(0.06), np.log(0.40))))
     if not builder.claim(along, across, 2.4 * radius, 2.4 * radius, cross):
         return False
-    boles = int(rng.choice([1, 1, 1, 2, 3]))
+    boles = 1 if thick else int(rng.choice([1, 1, 1, 2, 3]))
     bark = float(rng.uniform(0.1, 0.4))
+    if thick:
+        flare, tall = radius * float(rng.uniform(1.3, 2.2)), float(rng.uniform(0.3, 0.9))
+        builder.post(along, across, -0.1, tall, flare, bark, cross, taper=radius / flare)
+        if rng.random() < 0.4:  # a low kerb round its bed
+            wide = float(rng.uniform(0.8, 1.8))
+            builder.box(along, across, -0.2, (wide, wide, 0.2 + float(rng.uniform(0.04, 0.16))), (0.3, 0.3, 0.0), cross)
+    if rng.random() < 0.3:  # ivy or shoots round its foot
+        round_it = (radius + float(rng.uniform(0.1, 0.3)), float(rng.uniform(0.4, 0.9)))
+        crown(builder, along, across, 0.9 * round_it[1], round_it, float(rng.uniform(3.0, 8.0)), cross)
     for _ in range(boles):
         lean = rng.normal(0.0, 0.05 if boles == 1 and rng.random() < 0.8 else 0.16, 2)
         builder.post(
-            along, across, -0.3, height + 0.3, radius * (1.15 if boles == 1 else 0.7), bark, cross, taper=0.6,
+            along,
+            across,
+            -0.3,
+            height + 0.3,
+            radius * (1.15 if boles == 1 else 0.7),
+            bark,
+            cross,
+            taper=0.6,
             lean=(float(lean[0]), float(lean[1])),
-        )  # fmt: skip
+        )
     return True
 
 

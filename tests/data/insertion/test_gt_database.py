@@ -38,7 +38,7 @@ def rename(split: KittiSplit, frame_id: str, index: int, name: str) -> None:
 def test_it_holds_every_labelled_object_with_its_points(split: KittiSplit, tmp_path: Path) -> None:
     rename(split, "000001", 0, "Van")  # no class, but a neighbour of one: not in it
     rename(split, "000002", 0, "Truck")
-    database = prepare(split, tmp_path)
+    database = prepare(split, tmp_path / "prepared")
     frames = [read_frame(split, frame_id, TYPES, min_points=0) for frame_id in split.frame_ids]
     kept = [frame.labels >= 0 for frame in frames]
     assert len(database) == 10 and sum(mask.sum() for mask in kept) == 10
@@ -54,7 +54,7 @@ def test_it_holds_every_labelled_object_with_its_points(split: KittiSplit, tmp_p
 
 
 def test_what_is_taken_out_is_a_copy(split: KittiSplit, tmp_path: Path) -> None:
-    database = prepare(split, tmp_path)
+    database = prepare(split, tmp_path / "prepared")
     before = database[0].points.copy()
     database[0].points[:] = 0
     database[0].box[:] = 0
@@ -67,16 +67,16 @@ def test_it_is_built_once_and_again_when_something_changed(
     builds = []
     build = gt_database._build
     monkeypatch.setattr(gt_database, "_build", lambda path, *args: (builds.append(path), build(path, *args)))
-    first = prepare(split, tmp_path)
-    assert prepare(split, tmp_path).path == first.path and len(builds) == 1
-    prepare(split, tmp_path, names=("Pedestrian", "Car"))
-    prepare(split, tmp_path, camera_view=False)
-    prepare(KittiSplit(split.root, "val"), tmp_path)
+    first = prepare(split, tmp_path / "prepared")
+    assert prepare(split, tmp_path / "prepared").path == first.path and len(builds) == 1
+    prepare(split, tmp_path / "prepared", names=("Pedestrian", "Car"))
+    prepare(split, tmp_path / "prepared", camera_view=False)
+    prepare(KittiSplit(split.root, "val"), tmp_path / "prepared")
     assert len(set(builds)) == len(builds) == 4
     os.utime(split.scan_path("000001"), ns=(1, 1))
-    prepare(split, tmp_path)
+    prepare(split, tmp_path / "prepared")
     rename(split, "000001", 0, "Pedestrian")
-    assert prepare(split, tmp_path).labels.tolist().count(1) == 4
+    assert prepare(split, tmp_path / "prepared").labels.tolist().count(1) == 4
     assert len(set(builds)) == len(builds) == 6
     assert first.labels.tolist().count(1) == 3  # what a run uses stays
 
@@ -100,14 +100,14 @@ def test_a_build_that_fails_leaves_nothing_to_be_used(split: KittiSplit, tmp_pat
 
 def test_builders_at_the_same_time_do_not_meet(split: KittiSplit, tmp_path: Path) -> None:
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: prepare(split, tmp_path)[5], range(4)))
+        found = list(pool.map(lambda _: prepare(split, tmp_path / "prepared")[5], range(4)))
     for item in found[1:]:
         assert np.array_equal(item.points, found[0].points) and np.array_equal(item.box, found[0].box)
     assert not list(tmp_path.rglob(".*"))
 
 
 def test_what_goes_to_a_worker_is_the_path(split: KittiSplit, tmp_path: Path) -> None:
-    database = prepare(split, tmp_path)
+    database = prepare(split, tmp_path / "prepared")
     box = database[3].box
     assert len(pickle.dumps(database)) < 1000
     rebuild, arguments = database.__reduce__()  # what the other process does with it
@@ -127,5 +127,5 @@ def test_a_folder_that_cannot_be_written_is_named_before_the_work(
 def test_frames_without_objects(split: KittiSplit, tmp_path: Path) -> None:
     for frame_id in split.frame_ids:
         split.label_path(frame_id).write_text("")
-    database = prepare(split, tmp_path)
+    database = prepare(split, tmp_path / "prepared")
     assert len(database) == 0 and database.boxes.shape == (0, 7) and database.point_counts.shape == (0,)

@@ -22,7 +22,7 @@ from asca_pillars.config import Config, DataConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
-from asca_pillars.data.inspection.measurements import Fate, match, measure_frame, measure_scan
+from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan, stored_points
 from asca_pillars.errors import DatasetError
@@ -134,19 +134,21 @@ def test_positives_are_those_of_the_training_loader(clean: Path) -> None:
 
 @settings(max_examples=30)
 @given(st.integers(0, 2), st.floats(6.5, 23), st.floats(-4.5, 5.5), st.floats(0.5, 1.8), st.floats(-3.1, 3.1))
-def test_an_objects_fate_by_its_overlap_with_every_anchor(
+def test_an_objects_outcome_by_its_overlap_with_every_anchor(
     label: int, x: float, y: float, stretch: float, yaw: float
 ) -> None:
     length, width, height = SIZES[SPEC.class_names[label]]
     box = np.array([[x, y, -0.9, length * stretch, width, height, yaw]], np.float32)
-    fates, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), box, np.array([label])), SPEC)
+    outcomes, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), box, np.array([label])), SPEC)
     own = SPEC.anchors[:, :, 2 * label : 2 * label + 2].reshape(-1, 7)
     best = aligned_bev_iou(own, box).max()
-    assert fates.tolist() == [Fate.OVERLAPPED if best >= SPEC.classes[label].positive_iou else Fate.FORCED]
+    assert outcomes.tolist() == [
+        MatchOutcome.OVERLAPPED if best >= SPEC.classes[label].positive_iou else MatchOutcome.FORCED
+    ]
     assert positives[label] >= 1 and positives.sum() == positives[label]
 
 
-def test_fates_by_hand() -> None:
+def test_outcomes_by_hand() -> None:
     x, y = SPEC.anchors[20, 15, 0, :2]
     car = [x, y, -1.0, 3.9, 1.6, 1.56, 0.0]
     short = [x, y + 5, -1.0, 2.0, 1.6, 1.56, 0.0]  # overlap at most 2.0 / 3.9 = 0.51
@@ -154,19 +156,19 @@ def test_fates_by_hand() -> None:
     beside = [4.79, y, -1.0, 3.9, 1.6, 1.56, 0.0]
     boxes = np.array([car, short, person, person, beside, car], np.float32)
     labels = np.array([0, 0, 1, 1, 0, IGNORED])
-    fates, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), boxes, labels), SPEC)
+    outcomes, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), boxes, labels), SPEC)
     # Of two equal boxes the later has the best anchors, the earlier what else reaches positive_iou.
-    assert fates[[0, 1, 3, 4, 5]].tolist() == [
-        Fate.OVERLAPPED,
-        Fate.FORCED,
-        Fate.OVERLAPPED,
-        Fate.LEFT_OUT,
-        Fate.LEFT_OUT,
+    assert outcomes[[0, 1, 3, 4, 5]].tolist() == [
+        MatchOutcome.OVERLAPPED,
+        MatchOutcome.FORCED,
+        MatchOutcome.OVERLAPPED,
+        MatchOutcome.LEFT_OUT,
+        MatchOutcome.LEFT_OUT,
     ]
     assert positives[2] == 0
     tiny = np.array([[x, y, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2, np.float32)
-    fates, _ = match(LabeledFrame("0", np.empty((0, 4), np.float32), tiny, np.array([1, 1])), SPEC)
-    assert fates.tolist() == [Fate.MISSED, Fate.FORCED]
+    outcomes, _ = match(LabeledFrame("0", np.empty((0, 4), np.float32), tiny, np.array([1, 1])), SPEC)
+    assert outcomes.tolist() == [MatchOutcome.MISSED, MatchOutcome.FORCED]
 
 
 def test_pillars_before_the_limits_agree_with_what_pillarize_drops(clean: Path) -> None:

@@ -121,7 +121,7 @@ def test_of_equal_scores_the_first_of_the_file_goes_to_the_first_object() -> Non
         assert curve is not None and curve.matched == matched
 
 
-def test_ground_truth_is_served_in_file_order_and_ignored_ones_take_their_turn() -> None:
+def test_ground_truth_is_processed_in_file_order_and_ignored_ones_take_their_turn() -> None:
     van = shifted(CAR, 0.1, type="Van")
     other = beside(CAR, 3)
     assert counts([van, CAR, other], [hit(), hit(other)]) == [2, 1, 0, 1]

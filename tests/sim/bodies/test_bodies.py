@@ -7,7 +7,8 @@ import pytest
 
 from asca_pillars.sim.bodies.cycles import motorbike_body, parked_bicycle_body
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, limbs, prisms
-from asca_pillars.sim.bodies.styles import HATCHBACK, Profile, draw_style
+from asca_pillars.sim.bodies.profiles import HATCHBACK, Profile
+from asca_pillars.sim.bodies.styles import draw_style
 from asca_pillars.sim.bodies.vehicles import car_body
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import Target
@@ -29,9 +30,9 @@ def test_a_body_fills_its_label_box_and_stays_in_it(name: str) -> None:
         size = draw_size(rng, name)
         box = np.array([0.0, 0.0, size[2] / 2, *size, 0.0])
         low, high = extent(body_of(Target(name, box), SceneConfig(), rng))
-        # Walking people swing their limbs out of their box now and then, as KITTI's do, and some push a pram;
-        # mirrors stand out of cars.
-        ahead, beside = (1.0, 0.35) if name in ("Pedestrian", "Person_sitting") else (0.2, 0.3)
+        # Walking people swing their limbs out of their box now and then, as KITTI's do, and some push a pram or a
+        # bicycle; mirrors stand out of cars.
+        ahead, beside = (1.1, 0.55) if name in ("Pedestrian", "Person_sitting") else (0.2, 0.3)
         assert (low[:2] > -size[:2] / 2 - (0.6, beside)).all()
         assert (high[:2] < size[:2] / 2 + (ahead, beside)).all()
         assert -0.06 < low[2] < 0.4
@@ -48,7 +49,8 @@ def test_sizes_have_the_mean_and_spread_of_kitti(name: str) -> None:
     statistics = SIZES[name]
     low, high = np.array(statistics.low), np.array(statistics.high)
     if name != "Pedestrian":  # children are smaller
-        assert (sizes >= low - 1e-9).all() and (sizes <= high + 1e-9).all()
+        inside = (sizes >= low - 1e-9).all(axis=1) & (sizes <= high + 1e-9).all(axis=1)
+        assert inside.mean() > (0.96 if name == "Car" else 0.9999)  # two-seaters are shorter than the other cars
     # Clipping a broad distribution moves its mean; that of Misc and Tram most.
     tolerance = 0.25 if name in ("Misc", "Tram") else 0.06
     np.testing.assert_allclose(sizes.mean(axis=0), statistics.mean, rtol=tolerance)

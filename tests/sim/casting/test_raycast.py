@@ -9,7 +9,7 @@ from asca_pillars.sim.bodies.vehicles import car_body
 from asca_pillars.sim.casting.groundcast import GROUND
 from asca_pillars.sim.casting.raycast import NOTHING, Bodies, cast
 from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
-from asca_pillars.sim.world.ground import Ground, draw_relief, street
+from asca_pillars.sim.world.ground import Ground, draw_relief, make_street
 
 
 def bodies(primitives: Primitives, owner: int = BACKGROUND) -> Bodies:
@@ -129,7 +129,7 @@ def test_glass_passes_its_share_of_rays_and_the_wall_behind_gets_them(firings: F
 
 
 def test_flat_ground_is_hit_at_its_height_with_the_right_incidence(firings: Firings) -> None:
-    ground = Ground(street(half_width_m=200.0), np.zeros((49, 49)), np.full(5, 0.3), -1.73)
+    ground = Ground(make_street(half_width_m=200.0), np.zeros((49, 49)), np.full(5, 0.3), -1.73)
     hits = cast(bodies(Primitives.join([])), 0, ground, firings, seed=0)
     z = firings.origin_z_m[:, None] + hits.rho_m * firings.slope[:, None]
     met = hits.owner == GROUND
@@ -144,7 +144,7 @@ def test_flat_ground_is_hit_at_its_height_with_the_right_incidence(firings: Firi
 
 def test_hilly_ground_is_hit_first_where_a_fine_march_hits_it(firings: Firings) -> None:
     relief = draw_relief(np.random.default_rng(4), (0.03, -0.02), 2.5)
-    numbers = street(half_width_m=4.0, kerb_m=0.12, pavement_m=2.0, bank_left=0.15, bank_right=-0.1, yaw_rad=0.1)
+    numbers = make_street(half_width_m=4.0, kerb_m=0.12, pavement_m=2.0, bank_left=0.15, bank_right=-0.1, yaw_rad=0.1)
     ground = Ground(numbers, relief, np.full(5, 0.3), -1.7)
     hits = cast(bodies(Primitives.join([])), 0, ground, firings, seed=0)
     rays = directions(firings)

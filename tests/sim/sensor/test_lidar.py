@@ -13,7 +13,7 @@ from asca_pillars.sim.casting.raycast import Bodies, cast
 from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import Returns, measure
 from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
-from asca_pillars.sim.world.ground import Ground, street
+from asca_pillars.sim.world.ground import Ground, make_street
 
 FOLDER = Path(__file__).parents[3] / "configs/simulation"
 # Rings, highest and lowest elevation, firings per revolution: from the data sheets, not from our files.
@@ -44,7 +44,7 @@ def flat_scan(lidar: Lidar, seed: int = 0) -> Returns:
     none = np.zeros(0, int)
     owner = np.full(len(wall.triangles), -1)
     firings = draw_firings(lidar, np.random.default_rng(seed), camera_only=False)
-    ground = Ground(street(half_width_m=200.0), np.zeros((49, 49)), np.full(8, 0.4), -1.73)
+    ground = Ground(make_street(half_width_m=200.0), np.zeros((49, 49)), np.full(8, 0.4), -1.73)
     hits = cast(Bodies(wall, owner, np.arange(len(owner)), none, none), 0, ground, firings, seed=0)
     return measure(hits, firings, np.random.default_rng(seed))
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.world.placement import Occupied, Target
+from asca_pillars.sim.world.occupied import Occupied
+from asca_pillars.sim.world.placement import Target
 from asca_pillars.sim.world.scene import draw_scene
 
 

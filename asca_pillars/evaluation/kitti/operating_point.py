@@ -1,9 +1,10 @@
-"""Recall and precision at a fixed score: what somebody who runs the detector at its thresholds gets.
+"""Recall and precision at a fixed score: what a user gets who runs the detector at its thresholds.
 
     recall = counted objects found / counted objects
-    precision = detections that found a counted object / those and the false ones
+    precision = true positives / (true positives + false positives)
 
-`verdicts` says what is counted, found, true and false, and how that departs from KITTI's AP. A distance band keeps the
+`score_threshold` says what counts and what matches, and how that departs from KITTI's AP. Recall in 3D at
+easy, moderate and hard is what Table 2 of AV PV-RCNN (2023) lists; the paper names no score. A distance band keeps the
 counted objects in it for the recall and the detections in it for the precision; it changes no match.
 """
 
@@ -15,10 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames
-from asca_pillars.evaluation.kitti.verdicts import Scene, Verdict, judge
+from asca_pillars.evaluation.kitti.score_threshold import MatchInput, ScoreMatches, match_class
 
 Z_95 = 1.959964  # what a standard normal variable exceeds in 2.5 % of all cases
 
@@ -35,9 +35,9 @@ class OperatingPoint:
         band_m: (low, high) of the horizontal distance from the camera in metres, or None for all.
         objects: counted objects in the band, and
         found: how many of them were found.
-        detections: detections in the band that are true or false, and
-        true: how many of them found a counted object.
-        excused: detections in the band that are neither true nor false.
+        detections: detections in the band that are true or false positives, and
+        true_positives: how many of them match a counted object.
+        ignored: detections in the band that are neither.
     """
 
     class_name: str
@@ -51,10 +51,10 @@ class OperatingPoint:
     recall: float
     recall_interval: tuple[float, float]
     detections: int
-    true: int
+    true_positives: int
     precision: float
     precision_interval: tuple[float, float]
-    excused: int
+    ignored: int
 
 
 def operating_points(
@@ -80,29 +80,14 @@ def operating_points(
     Raises:
         ValueError: the frames differ, or `scores` or `min_overlap` lacks a class.
     """
-    scene = Scene.of(truth, detections, class_names, scores, min_overlap)
+    inputs = MatchInput.of(truth, detections, class_names, scores, min_overlap)
     points = []
     for name, difficulty in product(class_names, difficulties):
-        verdict = judge(scene, name, difficulty, metric)
+        matches = match_class(inputs, name, difficulty, metric)
         for band in (None, *bands_m):
-            what = (name, scene.scores[name], scene.min_overlap[name], metric, difficulty, band)
-            points.append(OperatingPoint(*what, *_shares(verdict, scene.frames, band)))
+            what = (name, inputs.scores[name], inputs.min_overlap[name], metric, difficulty, band)
+            points.append(OperatingPoint(*what, *_shares(matches, inputs.frames, band)))
     return points
-
-
-def recall_table(
-    truth: Sequence[FrameObjects],
-    detections: Sequence[FrameObjects],
-    class_names: Sequence[str],
-    *,
-    scores: Mapping[str, float] | float,
-) -> list[OperatingPoint]:
-    """Table 2 of AV PV-RCNN (2023): for every class the recall at easy, moderate and hard, in 3D.
-
-    A find takes an IoU above KITTI's 0.7 for cars and 0.5 for pedestrians and cyclists. The paper names no score: say
-    beside the table which one it was made at.
-    """
-    return operating_points(truth, detections, class_names, scores=scores, difficulties=DIFFICULTIES)
 
 
 def best_scores(
@@ -118,15 +103,15 @@ def best_scores(
 
     A class of which nothing was found is absent. Arguments and errors as for `operating_points`.
     """
-    # A detection's verdict depends on better ones alone: one pass over all of them serves every score.
-    scene = Scene.of(truth, detections, class_names, -inf, min_overlap)
+    # A detection's match depends on those of higher scores alone: one pass over all of them serves every score.
+    inputs = MatchInput.of(truth, detections, class_names, -inf, min_overlap)
     best = {}
     for name in class_names:
-        verdict = judge(scene, name, difficulty, metric)
-        order = np.argsort(-scene.frames.detections.scores, kind="stable")
-        scores = scene.frames.detections.scores[order]
-        true, false = np.cumsum(verdict.true[order]), np.cumsum(verdict.false[order])
-        f1 = 2 * true / np.maximum(verdict.counted.sum() + true + false, 1)
+        matches = match_class(inputs, name, difficulty, metric)
+        order = np.argsort(-inputs.frames.detections.scores, kind="stable")
+        scores = inputs.frames.detections.scores[order]
+        true, false = np.cumsum(matches.true_positive[order]), np.cumsum(matches.false_positive[order])
+        f1 = 2 * true / np.maximum(matches.counted.sum() + true + false, 1)
         f1[:-1][scores[:-1] == scores[1:]] = 0.0  # equal scores are reported together
         if f1.max(initial=0.0) > 0:
             best[name] = float(scores[f1.argmax()])
@@ -144,22 +129,22 @@ def wilson_interval(hits: int, trials: int) -> tuple[float, float]:
     return max(min(center - reach, share), 0.0), min(max(center + reach, share), 1.0)
 
 
-def _shares(verdict: Verdict, frames: Frames, band_m: _Band | None) -> tuple[Any, ...]:
+def _shares(matches: ScoreMatches, frames: Frames, band_m: _Band | None) -> tuple[Any, ...]:
     """The counts and shares of an operating point, in its order."""
     low, high = (0.0, inf) if band_m is None else band_m
-    objects, found, true, false, excused = (
+    objects, found, true, false, ignored = (
         int((mask & (low <= items.distances_m) & (items.distances_m < high)).sum())
         for mask, items in (
-            (verdict.counted, frames.truth),
-            (verdict.found, frames.truth),
-            (verdict.true, frames.detections),
-            (verdict.false, frames.detections),
-            (verdict.excused, frames.detections),
+            (matches.counted, frames.truth),
+            (matches.found, frames.truth),
+            (matches.true_positive, frames.detections),
+            (matches.false_positive, frames.detections),
+            (matches.ignored, frames.detections),
         )
     )
-    judged = true + false
+    detections = true + false
     return (
         *(objects, found, found / objects if objects else nan, wilson_interval(found, objects)),
-        *(judged, true, true / judged if judged else nan, wilson_interval(true, judged)),
-        excused,
+        *(detections, true, true / detections if detections else nan, wilson_interval(true, detections)),
+        ignored,
     )

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.data.kitti.kitti_labels import KittiObject
+from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES
 from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
-from asca_pillars.evaluation.kitti.verdicts import verdicts
-from asca_pillars.evaluation.operating_point import (
+from asca_pillars.evaluation.kitti.operating_point import (
     OperatingPoint,
     best_scores,
     operating_points,
-    recall_table,
     wilson_interval,
 )
+from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
 from asca_pillars.geometry.overlap import bev_iou, iou_3d
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
@@ -46,9 +46,9 @@ def point(
 
 
 def counts(*given: Any, **options: Any) -> tuple[int, int, int, int, int]:
-    """found, objects; true, detections; excused."""
+    """found, objects; true, detections; ignored."""
     made = point(*given, **options)
-    return made.found, made.objects, made.true, made.detections, made.excused
+    return made.found, made.objects, made.true_positives, made.detections, made.ignored
 
 
 def test_found_missed_true_false() -> None:
@@ -56,7 +56,7 @@ def test_found_missed_true_false() -> None:
     found = [item("Car", 0, 10, 0.9), item("Car", -9, 10, 0.5), item("Car", 9, 10, 0.49)]
     result = point(truth, found)
     assert (result.found, result.objects, result.recall) == (1, 2, 0.5)
-    assert (result.true, result.detections, result.precision, result.excused) == (1, 2, 0.5, 0)
+    assert (result.true_positives, result.detections, result.precision, result.ignored) == (1, 2, 0.5, 0)
     assert result.recall_interval == wilson_interval(1, 2) == result.precision_interval
     assert (result.class_name, result.score, result.metric, result.difficulty) == ("Car", 0.5, "3d", "moderate")
     assert (result.min_overlap, result.band_m) == (0.7, None)
@@ -144,7 +144,7 @@ def test_dont_care_areas_excuse() -> None:
     points = operating_points(
         [frame(area(160.0)), frame(name="1")], [frame(), frame(*alone, name="1")], ["Car"], scores=0
     )
-    assert (points[0].detections, points[0].excused) == (1, 0)
+    assert (points[0].detections, points[0].ignored) == (1, 0)
 
 
 def test_bands_judge_objects_and_detections_by_their_own_distance() -> None:
@@ -154,7 +154,7 @@ def test_bands_judge_objects_and_detections_by_their_own_distance() -> None:
         [frame(*truth)], [frame(*found)], ["Car"], scores=0.5, min_overlap={"Car": 0.5}, bands_m=[(0, 13), (13, 99)]
     )
     assert [made.band_m for made in points] == [None, (0, 13), (13, 99)]
-    assert [(made.found, made.objects, made.true, made.detections) for made in points] == [
+    assert [(made.found, made.objects, made.true_positives, made.detections) for made in points] == [
         (1, 2, 1, 2),
         (0, 0, 1, 1),
         (1, 2, 0, 1),
@@ -211,11 +211,13 @@ def test_no_other_score_is_better(seed: int) -> None:
     assert f1(best.get("Car", 1.0)) == pytest.approx(max(f1(score / 10) for score in range(1, 10)))
 
 
-def test_recall_table_has_the_three_difficulties() -> None:
+def test_every_difficulty_has_its_limits() -> None:
     """Easy asks for 40 px and nothing hidden, moderate allows one step of hiding, hard two."""
     truth = [item("Car", 5 * level, 10, occluded=level) for level in range(4)]
     found = [item("Car", 0, 10, 0.9), item("Car", 10, 10, 0.2)]
-    table = recall_table([frame(*truth)], [frame(*found)], ("Car", "Cyclist"), scores=-math.inf)
+    table = operating_points(
+        [frame(*truth)], [frame(*found)], ("Car", "Cyclist"), scores=-math.inf, difficulties=DIFFICULTIES
+    )
     assert [(made.class_name, made.difficulty, made.found, made.objects) for made in table] == [
         ("Car", "easy", 1, 1),
         ("Car", "moderate", 1, 2),
@@ -225,22 +227,26 @@ def test_recall_table_has_the_three_difficulties() -> None:
     assert {(made.metric, made.min_overlap) for made in table} == {("3d", 0.7), ("3d", 0.5)}
 
 
-def test_verdicts_stand_behind_the_points() -> None:
+def test_matches_stand_behind_the_points() -> None:
     hidden = item("Car", -9, 9, occluded=2)
     truth = [frame(hidden, item("Car", 0, 10), item("Pedestrian", 5, 10)), frame(item("Truck", 0, 9), name="1")]
     seen = [item("Pedestrian", 5, 10, 0.9), item("Car", 9, 30, 0.3), item("Car", 0, 10, 0.2)]
     low = item("Cyclist", 3, 60, 0.9, bbox=(0.0, 0.0, 9.0, 9.0))
     found = [frame(*seen), frame(low, item("Cyclist", 3, 60, 0.9), name="1")]
-    first, second = verdicts(truth, found, NAMES, scores={"Car": 0.25, "Pedestrian": 0.5, "Cyclist": 0.5})
+    first, second = matches_at_score(truth, found, NAMES, scores={"Car": 0.25, "Pedestrian": 0.5, "Cyclist": 0.5})
     assert (first.frame_id, second.frame_id) == ("0", "1")
     assert first.missed.tolist() == [False, True, False] and first.found.tolist() == [False, False, True]
-    assert first.uncounted.tolist() == [True, False, False]
-    assert first.true.tolist() == [True, False, False] and first.false.tolist() == [False, True, False]
-    assert first.reported.tolist() == [True, True, False] and first.excused.tolist() == [False] * 3
-    assert second.uncounted.tolist() == [True]
-    assert second.excused.tolist() == [True, False] and second.false.tolist() == [False, True]
+    assert first.not_counted.tolist() == [True, False, False]
+    assert first.true_positive.tolist() == [True, False, False] and first.false_positive.tolist() == [
+        False,
+        True,
+        False,
+    ]
+    assert first.reported.tolist() == [True, True, False] and first.ignored.tolist() == [False] * 3
+    assert second.not_counted.tolist() == [True]
+    assert second.ignored.tolist() == [True, False] and second.false_positive.tolist() == [False, True]
     assert (first.errors, second.errors) == (2, 1)
-    assert verdicts([], [], NAMES, scores=0.5) == []
+    assert matches_at_score([], [], NAMES, scores=0.5) == []
 
 
 def camera_boxes(objects: list[KittiObject]) -> np.ndarray:
@@ -256,7 +262,7 @@ def naive(
     metric: str,
     band: tuple[float, float],
 ) -> tuple[int, int, int, int, int]:
-    """found, objects; true, detections; excused: one object and one detection after the other."""
+    """found, objects; true, detections; ignored: one object and one detection after the other."""
     totals = np.zeros(5, dtype=int)
     neighbor = {"Car": "Van", "Pedestrian": "Person_sitting"}.get(name)
     for labels, seen in frames:
@@ -321,7 +327,7 @@ def test_slow_twin(seed: int, metric: str) -> None:
     band = (0.0, 10.0)
     for made in operating_points(truth, found, NAMES, scores=0.3, metric=metric, bands_m=[band]):  # type: ignore[arg-type]
         expected = naive(frames, made.class_name, 0.3, metric, made.band_m or (0.0, math.inf))
-        assert (made.found, made.objects, made.true, made.detections, made.excused) == expected
+        assert (made.found, made.objects, made.true_positives, made.detections, made.ignored) == expected
 
 
 @pytest.mark.parametrize(

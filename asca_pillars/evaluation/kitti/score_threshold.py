@@ -1,0 +1,174 @@
+"""Matches of objects and detections when only detections of at least some score are reported.
+
+An object is counted or, beyond a limit of the difficulty or of a neighboring type, ignored, as KITTI has it (`states`).
+Each reported detection, the best score first, matches the free object of its class, counted or ignored, that it
+overlaps most, if that is more than the minimum. A matched object that counts is found, and its detection is a true
+positive.
+
+A detection without a match is a false positive unless it is ignored: lower in the image than the difficulty asks for
+(objects so low need no label; nor do those outside the image, where detections have no 2D box), or more than half of
+its 2D box in one DontCare area. One that matches an ignored object is ignored too.
+
+This departs from KITTI's AP, which ranks by score over the whole set: there the objects choose among the detections, an
+object taken by a low detection (of whatever class) is neither found nor missed, DontCare areas count in 2D only, and
+what lies outside a distance band is ignored.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.evaluation.assignment import greedy_matches
+from asca_pillars.evaluation.kitti.average_precision import min_overlap as kitti_min_overlap
+from asca_pillars.evaluation.kitti.objects import FrameObjects
+from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
+from asca_pillars.evaluation.kitti.states import (
+    KittiState,
+    detection_states,
+    is_neighbor,
+    is_type,
+    truth_states,
+)
+
+DONT_CARE_SHARE = 0.5  # of a detection's 2D box: in one DontCare area, more makes it ignored
+
+_Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreMatches:
+    """How N objects and D detections match at a score threshold.
+
+    Attributes:
+        frame_id: of the frame; "" for all frames together.
+        counted: (N,) objects that are to be found.
+        found: (N,) those of them that a detection matches.
+        reported: (D,) detections that reach the score.
+        true_positive: (D,) reported detections that match a counted object.
+        false_positive: (D,) reported detections that match nothing and are not ignored.
+    """
+
+    frame_id: str
+    counted: _Mask
+    found: _Mask
+    reported: _Mask
+    true_positive: _Mask
+    false_positive: _Mask
+
+    @property
+    def missed(self) -> _Mask:
+        """(N,) mask of the counted objects that were not found: the false negatives."""
+        return self.counted & ~self.found
+
+    @property
+    def not_counted(self) -> _Mask:
+        """(N,) mask of the objects that need not be found."""
+        return ~self.counted
+
+    @property
+    def ignored(self) -> _Mask:
+        """(D,) mask of the reported detections that are neither true nor false positives."""
+        return self.reported & ~self.true_positive & ~self.false_positive
+
+    @property
+    def errors(self) -> int:
+        """Number of missed objects and false positives."""
+        return int(self.missed.sum() + self.false_positive.sum())
+
+
+def matches_at_score(
+    truth: Sequence[FrameObjects],
+    detections: Sequence[FrameObjects],
+    class_names: Sequence[str],
+    *,
+    scores: Mapping[str, float] | float,
+) -> list[ScoreMatches]:
+    """The matches behind `operating_points`, frame by frame: all classes together, moderate, in 3D.
+
+    Raises:
+        ValueError: the frames differ, or `scores` lacks a class.
+    """
+    inputs = MatchInput.of(truth, detections, class_names, scores, None)
+    classes = [match_class(inputs, name, "moderate", "3d") for name in class_names]
+    starts = np.cumsum([0, *(len(frame) for frame in truth)])[:-1], inputs.frames.detection_starts[:-1]
+    parts = [
+        np.split(np.any([getattr(matches, name) for matches in classes], axis=0), starts[side])[1:]
+        for name, side in (("counted", 0), ("found", 0), ("reported", 1), ("true_positive", 1), ("false_positive", 1))
+    ]
+    return [ScoreMatches(frame.frame_id, *masks) for frame, *masks in zip(truth, *parts, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class MatchInput:
+    """All frames, and what depends on no difficulty: N objects and D detections, one frame after the other.
+
+    Attributes:
+        frames: all of them as one.
+        pairs: objects and detections of one frame that overlap enough for some class.
+        in_dont_care: (D,) detections that lie in a DontCare area.
+        scores: of every class the least score of a detection.
+        min_overlap: of every class the intersection over union that a match must exceed.
+
+    Raises:
+        ValueError: from `of`, if the frames differ, or `scores` or `min_overlap` lacks a class.
+    """
+
+    frames: Frames
+    pairs: Pairs
+    in_dont_care: _Mask
+    scores: Mapping[str, float]
+    min_overlap: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls,
+        truth: Sequence[FrameObjects],
+        detections: Sequence[FrameObjects],
+        class_names: Sequence[str],
+        scores: Mapping[str, float] | float,
+        min_overlap: Mapping[str, float] | None,
+    ) -> "MatchInput":
+        """Overlaps and DontCare areas of the same frames, given in the same order; KITTI's minimum overlap if None."""
+        if [frame.frame_id for frame in truth] != [frame.frame_id for frame in detections]:
+            raise ValueError("ground truth and detections must be of the same frames, in the same order")
+        if min_overlap is None:
+            min_overlap = {name: kitti_min_overlap(name) for name in class_names}
+        if not isinstance(scores, Mapping):
+            scores = dict.fromkeys(class_names, float(scores))
+        if missing := [name for name in class_names if name not in min_overlap or name not in scores]:
+            raise ValueError(f"no score or no minimum overlap is given for {', '.join(missing)}")
+        frames = Frames.join(truth, detections)
+        related = [is_type(frames.truth, name) | is_neighbor(frames.truth, name) for name in class_names]
+        lowest = min(min_overlap[name] for name in class_names)
+        pairs = overlapping_pairs(frames, np.any(related, axis=0), lowest)
+        return cls(frames, pairs, dont_care_shares(frames) > DONT_CARE_SHARE, scores, min_overlap)
+
+
+def match_class(inputs: MatchInput, class_name: str, difficulty: str, metric: str) -> ScoreMatches:
+    """The matches of one class over all frames.
+
+    Args:
+        inputs: N objects and D detections.
+        difficulty: "easy", "moderate" or "hard".
+        metric: "bev" or "3d", whose overlap decides.
+    """
+    objects, detections = inputs.frames.truth, inputs.frames.detections
+    states = truth_states(objects, class_name, difficulty)
+    reported = is_type(detections, class_name) & (detections.scores >= inputs.scores[class_name])
+    pairs = inputs.pairs
+    able = (states[pairs.truth] != KittiState.ABSENT) & reported[pairs.detection]
+    pairs = pairs.where(able & (pairs.overlaps[metric] > inputs.min_overlap[class_name]))
+    best = np.lexsort((-pairs.overlaps[metric], pairs.detection, -detections.scores[pairs.detection]))
+    matched = best[greedy_matches(pairs.detection[best], pairs.truth[best])]
+
+    counted = states == KittiState.COUNTED
+    hits = matched[counted[pairs.truth[matched]]]
+    found, true_positive = np.zeros_like(counted), np.zeros_like(reported)
+    found[pairs.truth[hits]] = True
+    true_positive[pairs.detection[hits]] = True
+    low = detection_states(detections, class_name, difficulty) == KittiState.IGNORED
+    false_positive = reported & ~low & ~inputs.in_dont_care
+    false_positive[pairs.detection[matched]] = False
+    return ScoreMatches("", counted, found, reported, true_positive, false_positive)

@@ -1,0 +1,50 @@
+"""Footprints that are taken, so that nothing stands in anything else."""
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass
+class Occupied:
+    """Footprints that are taken: rows x, y, length, width, yaw. Grows as things are placed."""
+
+    rows: Floats = field(default_factory=lambda: np.zeros((2048, 5)))
+    count: int = 0
+
+    def take(self, x: float, y: float, length: float, width: float, yaw: float, margin_m: float = 0.0) -> bool:
+        """Take a footprint if it is free with a margin around it; whether it was. A negative margin lets the edges of
+        two footprints overlap."""
+        row = np.array([x, y, max(length + 2 * margin_m, 0.05), max(width + 2 * margin_m, 0.05), yaw])
+        if not _is_free(row, self.rows, self.count) or self.count == len(self.rows):
+            return False
+        row[2:4] = length, width
+        self.rows[self.count] = row
+        self.count += 1
+        return True
+
+
+@numba.njit(cache=True)
+def _is_free(row: Floats, rows: Floats, count: int) -> bool:
+    """Whether a footprint overlaps none of the first `count` (separating axes of two rectangles)."""
+    for i in range(count):
+        dx, dy = rows[i, 0] - row[0], rows[i, 1] - row[1]
+        if max(abs(dx), abs(dy)) > (row[2] + row[3] + rows[i, 2] + rows[i, 3]) / 2:
+            continue  # farther than half the diagonals reach
+        apart = False
+        for one, other in ((row, rows[i]), (rows[i], row)):
+            cos, sin = np.cos(one[4]), np.sin(one[4])
+            c, s = abs(np.cos(other[4] - one[4])), abs(np.sin(other[4] - one[4]))
+            along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
+            if (
+                along > (one[2] + other[2] * c + other[3] * s) / 2
+                or across > (one[3] + other[2] * s + other[3] * c) / 2
+            ):
+                apart = True
+        if not apart:
+            return False
+    return True

@@ -1,0 +1,201 @@
+"""Every reader against damaged input: scans, settings, labels, calibrations, predictions, lists, manifests.
+
+    python -m benchmarks.fuzz --minutes 20 --seed 7
+
+Valid small files are changed at random (bits, bytes, numbers, pieces left out, repeated, swapped between files) and
+read as a command would. Reading has to succeed or to be refused with one AscaError. The exit code is 1 if anything else
+happened; what did is printed with the number of the input, and `--first NUMBER --inputs 1` reads that one again.
+"""
+
+import json
+import math
+import re
+import signal
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from asca_pillars.errors import AscaError
+from benchmarks.fuzz_inputs import Kind, kinds
+
+OUTCOMES = ("read", "refused", "traceback", "slow", "not finite", "too many points")
+BAD = OUTCOMES[2:]
+SLOW_S = 5.0
+_NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
+_WORDS = (
+    *(b"0", b"-1", b"1e400", b"nan", b"inf", b"-inf", b"1e308", b"9" * 18, b"9" * 5000, b"2147483648", b"1_0"),
+    *(b"", b" ", b"\n", b"\x00", b"\xff\xfe", b"[", b"{a: ", b"&a *a", b"*a", b"!!python/name:os.system", b"null"),
+    *(b'"', b"[" * 3000, b"{a: " * 3000, b"true", b"2026-99-99", b"<<: {a: 1}", b"x" * 3000, b"\x1b[2J", b"../" * 9),
+)
+
+
+class _Slow(BaseException):
+    """Reading took too long."""
+
+
+def main(
+    minutes: Annotated[float, typer.Option(min=0, help="Stop after so many.")] = 1.0,
+    inputs: Annotated[int | None, typer.Option(min=1, help="Stop after so many inputs.")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    first: Annotated[int, typer.Option(min=0, help="Number of the first input.")] = 0,
+    kind: Annotated[str | None, typer.Option(help="Only kinds whose name contains this.")] = None,
+    out: Annotated[Path | None, typer.Option("--json", help="Also write the counts to this file.")] = None,
+) -> None:
+    """Read damaged files, count what came of it."""
+    console = Console(markup=False, highlight=False)
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="asca-fuzz-") as folder:
+        counts, failures = fuzz(Path(folder), seed, first, inputs, minutes * 60, kind, console)
+    total = sum(counts.values())
+    table = Table(title=f"{total} inputs, seed {seed}, {time.perf_counter() - start:.0f} s")
+    for column in ("kind", *OUTCOMES):
+        table.add_column(column, justify="left" if column == "kind" else "right")
+    for name in sorted({name for name, _ in counts}):
+        table.add_row(name, *(str(counts[name, outcome]) for outcome in OUTCOMES))
+    console.print(table)
+    for text in failures[:20]:
+        console.print(text)
+    if out is not None:
+        rows = [{"kind": name, "outcome": outcome, "inputs": count} for (name, outcome), count in counts.items()]
+        out.write_text(json.dumps({"seed": seed, "inputs": total, "counts": rows}, indent=1) + "\n", encoding="utf-8")
+    raise typer.Exit(int(any(counts[name, outcome] for name, outcome in counts if outcome in BAD)))
+
+
+def fuzz(
+    folder: Path,
+    seed: int,
+    first: int = 0,
+    inputs: int | None = None,
+    seconds: float = math.inf,
+    only: str | None = None,
+    console: Console | None = None,
+) -> tuple[Counter[tuple[str, str]], list[str]]:
+    """Read damaged files until `inputs` or `seconds` are over.
+
+    Input number n of a seed is the same whatever came before it.
+
+    Returns:
+        how many inputs of each kind had each outcome, and a description of each bad one.
+    """
+    chosen = [kind for kind in kinds(folder) if only is None or only in kind.name]
+    shares = np.array([kind.share for kind in chosen])
+    counts: Counter[tuple[str, str]] = Counter()
+    failures: list[str] = []
+    end = time.perf_counter() + seconds
+    with Progress(console=console, transient=True, disable=console is None) as progress:
+        task = progress.add_task("inputs", total=inputs)
+        number = first
+        while (inputs is None or number < first + inputs) and time.perf_counter() < end:
+            rng = np.random.default_rng([seed, number])
+            kind = chosen[int(rng.choice(len(chosen), p=shares / shares.sum()))]
+            content = damaged(kind, rng)
+            outcome, text = read(kind, content)
+            counts[kind.name, outcome] += 1
+            if outcome in BAD:
+                failures.append(f"input {number}, {kind.name}: {outcome}: {text}")
+            number += 1
+            if number % 1000 == 0:
+                progress.update(task, completed=number - first)
+    return counts, failures
+
+
+def damaged(kind: Kind, rng: np.random.Generator) -> bytes:
+    """One of the kind's valid files with one to four random changes."""
+    content = bytearray(kind.seeds[rng.integers(len(kind.seeds))])
+    for _ in range(rng.integers(1, 5)):
+        start, stop = sorted(rng.integers(0, len(content) + 1, 2).tolist())
+        stop = min(stop, start + 64)
+        change = rng.integers(8)
+        if change == 0 and content:
+            content[start % len(content)] ^= 1 << int(rng.integers(8))
+        elif change == 1 and content:
+            content[start % len(content)] = int(rng.integers(256))
+        elif change == 2:
+            del content[start:stop]
+        elif change == 3:
+            content[start:start] = content[start:stop] * int(rng.integers(1, 20))
+        elif change == 4:
+            del content[stop:]
+        elif change == 5:
+            other = kind.seeds[rng.integers(len(kind.seeds))]
+            content[start:stop] = other[start:stop]
+        elif change == 6 and (numbers := list(_NUMBER.finditer(content))):
+            match = numbers[rng.integers(len(numbers))]
+            content[match.start() : match.end()] = _WORDS[rng.integers(len(_WORDS))]
+        else:
+            content[start : start + int(rng.integers(2))] = _WORDS[rng.integers(len(_WORDS))]
+    return bytes(content)
+
+
+def read(kind: Kind, content: bytes) -> tuple[str, str]:
+    """What came of reading `content` as a file of a kind, and a description if it should not have."""
+    kind.path.parent.mkdir(exist_ok=True)
+    kind.path.write_bytes(content)
+    start = time.perf_counter()
+    try:
+        with _alarm(), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # NumPy's, of sums that overflow
+            result = kind.read(kind.path)
+    except AscaError:
+        outcome, text = "refused", ""
+    except _Slow:
+        return "slow", f"no answer in {SLOW_S:g} s"
+    except Exception:
+        return "traceback", traceback.format_exc()[-600:]
+    else:
+        outcome, text = _judge(kind, result, len(content))
+    if (took := time.perf_counter() - start) > SLOW_S:
+        return "slow", f"{took:.1f} s"
+    return outcome, text
+
+
+def _judge(kind: Kind, result: Any, size: int) -> tuple[str, str]:
+    if not _finite(result):
+        return "not finite", repr(result)[:200]
+    # The densest is a compressed PCD of three bytes a point, of which three bytes of LZF give 264.
+    if kind.is_scan and len(result) > 88 * size:
+        return "too many points", f"{len(result)} of {size} bytes"
+    return "read", ""
+
+
+def _finite(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return bool(np.isfinite(value).all())
+    if isinstance(value, dict):
+        return all(map(_finite, value.values()))
+    if isinstance(value, (list, tuple)):
+        return all(map(_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+@contextmanager
+def _alarm() -> Iterator[None]:
+    """Raise `_Slow` in what runs longer than SLOW_S."""
+
+    def ring(_number: int, _frame: FrameType | None) -> None:
+        raise _Slow
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, SLOW_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+if __name__ == "__main__":
+    typer.run(main)

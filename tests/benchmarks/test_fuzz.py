@@ -1,0 +1,42 @@
+"""A short fuzz run over every reader, and that its judge can tell bad from good."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import fuzz
+from benchmarks.fuzz_inputs import Kind, kinds
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_damaged_input_is_read_or_refused(tmp_path: Path, seed: int) -> None:
+    counts, failures = fuzz.fuzz(tmp_path, seed, inputs=400)
+    assert not failures, failures
+    assert {outcome for _, outcome in counts} == {"read", "refused"}
+
+
+def test_every_kind_accepts_its_undamaged_files(tmp_path: Path) -> None:
+    for kind in kinds(tmp_path):
+        for seed in kind.seeds:
+            if seed or kind.name in ("labels", "predictions"):
+                assert fuzz.read(kind, seed) == ("read", "")
+
+
+def test_bad_outcomes_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz, "SLOW_S", 0.05)
+
+    def outcome(result: object) -> str:
+        def reader(_: Path) -> object:
+            if isinstance(result, Exception):
+                raise result
+            return time.sleep(1) if isinstance(result, str) else result
+
+        return fuzz.read(Kind("scan", tmp_path / "a.bin", (b"x",), reader, is_scan=True), b"x")[0]
+
+    assert outcome(ValueError()) == "traceback"
+    assert outcome(np.array([[np.nan] * 4])) == "not finite"
+    assert outcome(np.zeros((100, 4))) == "too many points"
+    assert outcome("sleep") == "slow"
+    assert outcome(np.zeros((1, 4))) == "read"
