@@ -29,6 +29,7 @@ class SceneConfig:
     empty_share: float = 0.12  # scenes without any labelled type
     reach_m: float = 79.0
 
+    alongside: float = 0.05  # share of all that stands beside the car, up to 7 m before or behind it
     # Shares of vehicles by where they are: parked, by the kind of street; of those that are not: in yards and drives,
     # on the crossing road; the others are on their way.
     parked_residential: float = 0.64
@@ -100,7 +101,7 @@ class SceneConfig:
     behind_gaps: float = 0.4  # share of vehicles behind whose ends something narrow stands
     thick_trunks: float = 0.45  # share of trees with a trunk of 0.35 to 0.6 m that spreads towards its roots
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
-    dark_paint_share: float = 0.52
+    dark_paint_share: float = 0.42
 
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
     min_points: int = 2
@@ -117,6 +118,11 @@ class SceneConfig:
                     raise ConfigError(f"{item.name} is {value}: the lower bound comes first")
             elif value < 0:
                 raise ConfigError(f"{item.name} is {value}: it must not be negative")
+        if self.pedestrian_uniform_heading + self.pedestrian_across_sight > 1.0:
+            raise ConfigError(
+                f"pedestrian_uniform_heading is {self.pedestrian_uniform_heading} and pedestrian_across_sight "
+                f"{self.pedestrian_across_sight}: shares of the same people must not add up to more than 1"
+            )
         if self.people_dispersion <= 0:
             raise ConfigError(f"people_dispersion is {self.people_dispersion}: it must be positive")
         kinds = self.residential + self.urban + self.rural + self.campus + self.road + self.alley

@@ -40,11 +40,11 @@ class Placer:
     half_hidden: list[Target] = field(default_factory=list)  # those of `targets` before which something shall stand
 
     def __post_init__(self) -> None:
-        self._habits = Habits(self.rng, self.config, self.ground, self.kind)
+        self.habits = Habits(self.rng, self.config, self.ground, self.kind)
 
     def place(self, name: str, ahead: bool) -> None:
         """Place one object of a class, or give up after some tries."""
-        habits = self._habits
+        habits = self.habits
         draw: Callable[[Floats, float], Candidate] = {
             "Pedestrian": habits.pedestrian,
             "Person_sitting": habits.sitting,
