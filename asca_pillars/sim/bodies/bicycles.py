@@ -50,15 +50,15 @@ def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -
     if rng.random() < REFLECTOR_SHARE:
         lamps = ((frame.hub_x - 0.1, 0.78), (-frame.hub_x - frame.wheel_radius + 0.04, 0.62))
         more = footprint_m
-        rows += [(x, 0, z - more / 2, 0.05 + more, 0.08 + more, 0.08 + more, 0, *REFLECTOR.row) for x, z in lamps]
+        rows += [(x, 0, z - more / 2, 0.04 + more, 0.05 + more, 0.05 + more, 0, *REFLECTOR.row) for x, z in lamps]
         rows += [
             (
                 hub + 0.6 * frame.wheel_radius * np.cos(turn),
                 0,
                 frame.wheel_radius * (1 + 0.6 * np.sin(turn)) - 0.03,
-                0.06 + more,
+                0.03 + more,
                 0.03,
-                0.05 + more,
+                0.03 + more,
                 0,
                 *REFLECTOR.row,
             )
@@ -74,7 +74,7 @@ def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
     angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
     ring = frame.wheel_radius * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
     rubber = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.3)))), 0.3)
-    sidewall = Surface(float(rng.uniform(0.5, 1.3)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
+    sidewall = Surface(float(rng.uniform(0.45, 0.95)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
     spokes = Surface(float(rng.uniform(0.05, 0.3)), 0.2, float(rng.uniform(0.5, 0.75)))
     a, b, side = ring[:-1], ring[1:], np.array([0.0, 0.035, 0.0])
     faces = np.stack(
@@ -159,7 +159,7 @@ def _rider(rng: np.random.Generator, neck: Floats, width: float, bar_x: float) -
         (_offset(hips, -0.02, 0, -0.06), _offset(hips, 0.06, 0, 0.08), 0.16 * bulk, 0.13 * bulk, lower),
     ]
     if rng.random() < VEST_SHARE:
-        foil = np.array([rng.uniform(0.8, 2.0), 0.3, 0.0])
+        foil = np.array([rng.uniform(0.5, 1.1), 0.3, 0.0])
         middle = 0.5 * (hips + neck)
         rows.append((_offset(middle, 0, 0, -0.06), _offset(middle, 0.02, 0, 0.08), 1.04 * shoulder, 0.14 * bulk, foil))
     if rng.random() < 0.4:  # a jacket that hangs over the hips

@@ -208,11 +208,11 @@ def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface, footprint_m
     nose, tail = length / 2 - 0.55 * hull.nose_bow, -length / 2 + 0.6 * hull.tail_bow
     mirror = (0.5 - profile.cabin[0] - 0.05) * length
     stands_out = float(rng.uniform(0.03, 0.08))
-    lamp_m = float(rng.uniform(0.10, 0.25))  # height of the rear ones
+    lamp_m = float(rng.uniform(0.08, 0.2))  # height of the rear ones
     for sign in (1, -1):
         rows += [
-            (tail, sign * width * 0.40, 0.5 * height, 0.08, 0.13 + more, lamp_m + more, 0, *rear_lamp),
-            (tail - 0.03, sign * width * 0.38, 0.24 * height, 0.06, 0.10 + more, 0.04 + more, 0, 2.5, 0.4, 0),
+            (tail, sign * width * 0.40, 0.5 * height, 0.08, 0.10 + more, lamp_m + more, 0, *rear_lamp),
+            (tail - 0.03, sign * width * 0.38, 0.24 * height, 0.06, 0.06 + more, 0.03 + more, 0, 2.5, 0.4, 0),
             (nose - 0.02 * length, sign * width * 0.38, 0.38 * height, 0.08, 0.24 + more, 0.11 + more, 0, *front_lamp),
             (mirror, sign * (width / 2 + stands_out), profile.belt * height, 0.10, 0.17, 0.13, 0, *paint.row),
         ]

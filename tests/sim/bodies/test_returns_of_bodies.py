@@ -12,6 +12,7 @@ from asca_pillars.sim.bodies.burdens import SHARES, draw_burden
 from asca_pillars.sim.bodies.people import pedestrian_body
 from asca_pillars.sim.bodies.styles import draw_style
 from asca_pillars.sim.bodies.vehicles import car_body
+from asca_pillars.sim.world.scene import BEAM_M_PER_M
 from tests.sim.bodies.single_body import view
 
 SEEDS = range(24)
@@ -19,7 +20,9 @@ BRIGHT = 0.5
 
 
 def cyclists(distance_m: float, yaw_rad: float) -> list[np.ndarray]:
-    return [view(cyclist_body(np.random.default_rng(s), 1.66, 0.6, 1.72), distance_m, yaw_rad, s) for s in SEEDS]
+    footprint_m = BEAM_M_PER_M * distance_m
+    bodies = [cyclist_body(np.random.default_rng(seed), 1.66, 0.6, 1.72, footprint_m) for seed in SEEDS]
+    return [view(body, distance_m, yaw_rad, seed) for seed, body in zip(SEEDS, bodies, strict=True)]
 
 
 def pedestrians(distance_m: float, yaw_rad: float) -> list[np.ndarray]:
@@ -30,7 +33,7 @@ def cars(distance_m: float) -> list[np.ndarray]:
     seen = []
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
-        body = car_body(rng, 4.0, 1.65, 1.5, draw_style(rng, 4.0, 1.5), dark_share=0.5)
+        body = car_body(rng, 4.0, 1.65, 1.5, draw_style(rng, 4.0, 1.5), 0.42, BEAM_M_PER_M * distance_m)
         seen.append(view(body, distance_m, 0.1 + 0.03 * seed, seed))
     return seen
 
