@@ -98,10 +98,9 @@ class Habits:
     def _turned(self, heading: float, u: float, v: float) -> float:
         """A walker's heading against the street: as given, anyhow, or across the line of sight."""
         rng, config = self.rng, self.config
-        draw = rng.random()
-        if draw < config.pedestrian_uniform_heading:
+        if rng.random() < config.pedestrian_uniform_heading:
             return float(rng.uniform(-np.pi, np.pi))
-        if draw < config.pedestrian_uniform_heading + config.pedestrian_across_sight:
+        if rng.random() < config.pedestrian_across_sight:
             x, y, along = self.ground.to_lidar(u, v)
             return float(np.arctan2(y, x) - along + rng.choice([-1.0, 1.0]) * np.pi / 2 + rng.normal(0.0, 0.35))
         return heading
