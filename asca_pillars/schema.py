@@ -77,6 +77,8 @@ def _type_at(type_: Any, location: list[Any]) -> Any:
     for part in location:
         if isinstance(part, int):
             type_ = get_args(type_)[0]
+        elif not dataclasses.is_dataclass(type_):  # a mapping
+            type_ = get_args(type_)[-1]
         else:
             type_ = next(field.type for field in dataclasses.fields(type_) if field.name == part)
         if not dataclasses.is_dataclass(type_) and get_args(type_):

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from asca_deploy.benchmark import (
     measure_throughput,
 )
 from asca_deploy.benchmark.matrix import ON_THE_CPU
+from asca_deploy.providers import Precision, Provider
 from asca_pillars.commands import bench_tables as show
 from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.errors import ConfigError, ScanError
@@ -64,7 +65,12 @@ def run(
     bundles = _named([bundle, *parts.compare])
     for folder in bundles.values():
         load_bundle(folder)  # a damaged one is said now and not after minutes
-    detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
+    detector = Detector(
+        bundle,
+        provider=cast("Provider", provider),  # checked by Detector, as the precision is
+        precision=cast("Precision | None", precision),
+        threads=threads,
+    )
     result = _measure(detector, points, rounds, parts, bundles, console)
     if report_path is not None:
         with atomic_path(report_path) as temporary:

@@ -3,8 +3,9 @@
 import json
 import logging
 import statistics
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -15,7 +16,8 @@ from rich.table import Table
 
 from asca_deploy import Detections, Detector, FrameReport, sample_scan_path
 from asca_deploy.auto import summary
-from asca_pillars.data.kitti import Calibration, objects_from_boxes, read_calibration, write_labels
+from asca_deploy.providers import Precision, Provider
+from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.files import atomic_path
 from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
@@ -36,15 +38,21 @@ def run(
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     paths = find_scans(sample_scan_path() if scans is None else scans)
-    detector = Detector(bundle, provider=provider, precision=precision, threads=threads, score_threshold=score)
+    detector = Detector(
+        bundle,
+        provider=cast("Provider", provider),  # checked by Detector, as the precision is
+        precision=cast("Precision | None", precision),
+        threads=threads,
+        score_threshold=score,
+    )
     if detector.candidates:
-        console.print(summary(detector.provider, detector.precision, detector.candidates), soft_wrap=True)
+        console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     reports: list[FrameReport] = []
     results: list[tuple[Path, Detections]] = []
     for path in track(paths, "Detecting", console=console, disable=len(paths) == 1):
         scan = read_scan(path)
         detections = detector(scan.points)
-        reports.append(_report(detector))
+        reports.append(detections.report)
         results.append((path, detections))
         _write(out, path, scan.points, detections, detector)
     console.print(_table_of_boxes(*results[0]) if len(results) == 1 else _table_of_scans(results, reports))
@@ -52,8 +60,7 @@ def run(
         for warning in report.warnings:
             console.print(f"{path.name}: {warning}", style="yellow")
     while len(reports) < TIMED_FRAMES:
-        detector(scan.points)
-        reports.append(_report(detector))
+        reports.append(detector(scan.points).report)
     console.print(_timing(reports[1:], detector))
     console.print(f"Pictures and results: {out}/")
 
@@ -61,7 +68,7 @@ def run(
 def _write(out: Path, path: Path, points: NDArray[np.float32], detections: Detections, detector: Detector) -> None:
     """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
     with atomic_path(out / f"{path.stem}.json") as temporary:
-        temporary.write_text(json.dumps(_to_json(path, detections, _report(detector)), indent=1), encoding="utf-8")
+        temporary.write_text(json.dumps(_to_json(path, detections), indent=1), encoding="utf-8")
     write_png(out / f"{path.stem}_bev.png", draw_bev(points, detections, detector.spec.ranges))
     calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
     if path.parent.name != "velodyne" or not calib_path.exists():
@@ -77,29 +84,21 @@ def _write(out: Path, path: Path, points: NDArray[np.float32], detections: Detec
 
 def _write_kitti(path: Path, detections: Detections, calibration: Calibration, image: Any) -> None:
     """What the camera sees, as KITTI's tools want it: they know no boxes outside the image."""
-    size = {} if image is None else {"image_size_wh": (image.shape[1], image.shape[0])}
-    objects = objects_from_boxes(detections.boxes, detections.names, calibration, scores=detections.scores, **size)
-    write_labels(path, [item for item in objects if item.bbox[2] > item.bbox[0]])
+    size_wh = None if image is None else (image.shape[1], image.shape[0])
+    with atomic_path(path) as temporary:
+        temporary.write_text(detections.to_kitti(calibration, size_wh), encoding="utf-8")
 
 
-def _to_json(path: Path, detections: Detections, report: FrameReport) -> dict[str, Any]:
-    keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
-    boxes = [
-        {"class": name, "score": round(float(score), 4)}
-        | {key: round(float(value), 4) for key, value in zip(keys, box, strict=True)}
-        for name, score, box in zip(detections.names, detections.scores, detections.boxes, strict=True)
-    ]
-    counts = report.counts
+def _to_json(path: Path, detections: Detections) -> dict[str, Any]:
+    report = detections.report
     return {
         "scan": path.name,
         "frame": "lidar: x forward, y left, z up; box centers; yaw counter-clockwise from x",
-        "boxes": boxes,
-        "points": counts.points,
+        "boxes": detections.to_dicts(),
+        **asdict(report.counts),
         "points_not_finite": report.non_finite_points,
-        "points_outside_range": counts.points_outside,
-        "points_over_limit": counts.points_over_limit,
-        "pillars": counts.pillars,
-        "pillars_over_limit": counts.pillars_over_limit,
+        "reflectances_clipped": report.clipped_reflectances,
+        "outputs_not_finite": report.non_finite_outputs,
         "warnings": list(report.warnings),
     }
 
@@ -137,10 +136,5 @@ def _timing(reports: list[FrameReport], detector: Detector) -> str:
     stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
     return (
         f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan (median of {len(reports)} warm frames, "
-        f"{detector.provider} {detector.precision}, {detector.threads} threads): {stages} ms"
+        f"{detector.runs_on}, {detector.threads} threads): {stages} ms"
     )
-
-
-def _report(detector: Detector) -> FrameReport:
-    assert detector.last_frame is not None, "the detector has run"
-    return detector.last_frame

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import torch
 
 from asca_pillars.config import Config
+from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.schema import parse
@@ -17,6 +18,8 @@ class Checkpoint(NamedTuple):
     config: Config
     detector: PillarDetector
     steps: int
+    expected_input: ExpectedInput | None = None
+    """What the training scans looked like; None in checkpoints that do not say so."""
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -43,4 +46,6 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({reason})") from error
-    return Checkpoint(config, detector.eval(), int(content["global_step"]))
+    expected = content["hyper_parameters"].get("expected_input")
+    expected_input = None if expected is None else parse(ExpectedInput, expected, str(path))
+    return Checkpoint(config, detector.eval(), int(content["global_step"]), expected_input)
