@@ -80,7 +80,7 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
     import torch
 
     from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.models.pillar.scan_detector import ScanDetector
+    from asca_pillars.models.scan_detector import ScanDetector
 
     if threads is not None and threads < 1:
         raise ConfigError(f"threads {threads} must be at least 1")
@@ -93,7 +93,8 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
     device = "cpu" if provider == "cpu" or not torch.cuda.is_available() else "cuda"
     if threads is not None:
         torch.set_num_threads(threads)
-    config, network, steps = load_checkpoint(path)
+    loaded = load_checkpoint(path)
+    config, network, steps = loaded.config, loaded.detector, loaded.steps
     about = {
         "name": config.name,
         "checkpoint": str(path),

@@ -28,6 +28,7 @@ from asca_export.parity import prove_parity
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.schema import to_dict
 from asca_pillars.system import cpu_model, git_revision, package_versions
 
@@ -64,7 +65,9 @@ def export_bundle(
     """
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
-    config, detector, steps = checkpoint
+    config, detector, steps = checkpoint.config, checkpoint.detector, checkpoint.steps
+    if not isinstance(detector, PillarDetector):
+        raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
     say("Exporting and proving parity")
     with atomic_directory(out) as folder:
         graphs.export_encoder(detector, folder / ENCODER)
