@@ -81,7 +81,8 @@ class PillarModel(Strict):
 
 def _family(settings: Any) -> Any:
     """The `kind` of a model's section; one that says nothing is of pillars, as all were before there were others."""
-    return settings.get("kind", "pillar") if isinstance(settings, dict) else getattr(settings, "kind", settings)
+    kind = settings.get("kind", "pillar") if isinstance(settings, dict) else getattr(settings, "kind", None)
+    return None if kind is None else str(kind)
 
 
 # A family joins as `| Annotated[OtherModel, Tag("other")]`; `models.build` is where it is built.
@@ -127,6 +128,10 @@ class AugmentConfig(Strict):
         object_rotation_rad: each object turns about its own axis by up to this angle either way.
         object_shift_m: standard deviation of each object's shift along x, y and z.
         point_dropout: largest share of a frame's points that is dropped at random.
+        object_reflectance_gain: (lowest, highest) factor of each object's reflectance.
+        object_jitter_m: standard deviation of the noise of each point of an object along x, y and z.
+        object_cut_probability: of each object to lose a sector of azimuth or of elevation, as if partly hidden.
+        reflectance_loss_probability: of a sample whose points lose their reflectance, some of them or all.
     """
 
     insert: InsertConfig = field(default_factory=InsertConfig)
@@ -137,12 +142,20 @@ class AugmentConfig(Strict):
     object_rotation_rad: float = 0.15708
     object_shift_m: float = 0.25
     point_dropout: float = 0.0
+    object_reflectance_gain: tuple[float, float] = (1.0, 1.0)
+    object_jitter_m: float = 0.0
+    object_cut_probability: float = 0.0
+    reflectance_loss_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        _require("augment", self, ("flip_probability", "point_dropout"), low=0, high=1)
-        _require("augment", self, ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m"), low=0)
-        if not 0 < self.scale[0] <= self.scale[1] < math.inf:
-            raise ConfigError(f"augment.scale = {list(self.scale)}: must be two positive numbers, the smaller first")
+        shares = ("flip_probability", "point_dropout", "object_cut_probability", "reflectance_loss_probability")
+        _require("augment", self, shares, low=0, high=1)
+        noise = ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m", "object_jitter_m")
+        _require("augment", self, noise, low=0)
+        for name in ("scale", "object_reflectance_gain"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high < math.inf:
+                raise ConfigError(f"augment.{name} = {[low, high]}: must be two positive numbers, the smaller first")
 
 
 @dataclass(frozen=True)

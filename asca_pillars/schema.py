@@ -59,6 +59,10 @@ def _explain(type_: type, error: Any) -> str:
         return f"unknown key `{key}`; {advice}"
     if error["type"] in ("missing", "missing_argument"):
         return f"missing key `{key}`"
+    if error["type"] == "union_tag_invalid":  # every union here is told apart by its members' `kind`
+        return f"`{key}.kind` = {error['ctx']['tag']!r:.80}: input should be {error['ctx']['expected_tags']}"
+    if error["type"] == "union_tag_not_found":
+        return f"`{key}`: input should be a dictionary"
     return f"`{key}` = {error['input']!r}: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 

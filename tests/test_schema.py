@@ -142,5 +142,5 @@ def test_a_tagged_union_is_read_by_its_kind_and_blamed_without_its_tag() -> None
         parse(Holder, {"shape": {"radus_m": 1}}, "f")
     with pytest.raises(ConfigError, match=r"^f: unknown key `shape.sid_m`; did you mean `side_m`\?$"):
         parse(Holder, {"shape": {"kind": "square", "sid_m": 1}}, "f")
-    with pytest.raises(ConfigError, match=r"^f: `shape` = .*'triangle'.*'round', 'square'"):
+    with pytest.raises(ConfigError, match=r"^f: `shape.kind` = 'triangle': input should be 'round', 'square'"):
         parse(Holder, {"shape": {"kind": "triangle"}}, "f")
