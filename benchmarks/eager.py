@@ -31,6 +31,7 @@ from asca_pillars.data.scans.scan_reader import find_scans, read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.system import cpu_model, default_threads, package_versions
 from benchmarks.padded import PaddedDetector
 from benchmarks.random_weights import random_weights
@@ -96,6 +97,7 @@ def main(
 
 def _forms(model: Checkpoint) -> dict[str, PaddedDetector]:
     network, spec = model.detector, model.config.model.spec
+    assert isinstance(network, PillarDetector), "padded forms are of pillar detectors"
     reordered = copy.deepcopy(network).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return {
         "eager, padded": PaddedDetector(network, spec),

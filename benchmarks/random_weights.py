@@ -21,7 +21,8 @@ from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.config import load_config
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_pillar_detector
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
+from asca_pillars.models.pillar.pillar_preparation import batch_pillars
 
 
 def main(

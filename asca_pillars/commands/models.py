@@ -86,7 +86,7 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
     import torch
 
     from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.models.pillar.scan_detector import ScanDetector
+    from asca_pillars.models.scan_detector import ScanDetector
 
     if threads is not None:
         check_threads(threads)

@@ -44,14 +44,14 @@ def measure_expected_input(scans: Iterable[NDArray[np.float32]], camera_view: bo
     """Measure training scans.
 
     Args:
-        scans: each (N, 4) x, y, z in metres, LiDAR frame, and reflectance 0..1, with at least one point; as the
+        scans: each (N, 4) x, y, z in metres, LiDAR frame, and reflectance 0..1, empty ones are left out; as the
             network gets them before augmentation, hence cropped if `camera_view`. Read once, one after the other.
         camera_view: whether they are cropped to the camera's image.
 
     Raises:
-        ValueError: there is no scan.
+        ValueError: there is no scan with a point.
     """
-    measured = [(len(points), float(points[:, 3].mean()), ground_z_m(points)) for points in scans]
+    measured = [(len(points), float(points[:, 3].mean()), ground_z_m(points)) for points in scans if len(points)]
     grounds = [ground for _, _, ground in measured if ground is not None]
     return ExpectedInput(
         points_per_scan=(min(m[0] for m in measured), max(m[0] for m in measured)),

@@ -19,6 +19,7 @@ from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.system import cpu_model, default_threads, git_revision, package_versions
 
 MIN_SCANS = 8
@@ -57,6 +58,8 @@ def export_bundle(
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
+    if not isinstance(detector, PillarDetector):
+        raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
     say("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         graphs.export_encoder(detector, graphs.graph_path(folder, ENCODER))

@@ -15,7 +15,8 @@ from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.models.pillar.pillar_detector import PillarDetector, batch_pillars
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.pillar.pillar_preparation import batch_pillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
