@@ -7,9 +7,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import yaml
+from pydantic import Discriminator, Tag
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -79,7 +80,14 @@ class PillarModel(Strict):
     loss: LossConfig = field(default_factory=LossConfig)
 
 
-ModelConfig: TypeAlias = PillarModel  # families to come join by `|`, told apart by their `kind`
+def _family(settings: Any) -> Any:
+    """The `kind` of a model's section; one that says nothing is of pillars, as all were before there were others."""
+    kind = settings.get("kind", "pillar") if isinstance(settings, dict) else getattr(settings, "kind", None)
+    return None if kind is None else str(kind)
+
+
+# A family joins as `| Annotated[OtherModel, Tag("other")]`; `models.build` is where it is built.
+ModelConfig: TypeAlias = Annotated[Annotated[PillarModel, Tag("pillar")], Discriminator(_family)]
 
 
 @dataclass(frozen=True)
@@ -121,6 +129,10 @@ class AugmentConfig(Strict):
         object_rotation_rad: each object turns about its own axis by up to this angle either way.
         object_shift_m: standard deviation of each object's shift along x, y and z.
         point_dropout: largest share of a frame's points that is dropped at random.
+        object_reflectance_gain: (lowest, highest) factor of each object's reflectance.
+        object_jitter_m: standard deviation of the noise of each point of an object along x, y and z.
+        object_cut_probability: of each object to lose a sector of azimuth or of elevation, as if partly hidden.
+        reflectance_loss_probability: of a sample whose points lose their reflectance, some of them or all.
     """
 
     insert: InsertConfig = field(default_factory=InsertConfig)
@@ -131,12 +143,20 @@ class AugmentConfig(Strict):
     object_rotation_rad: float = 0.15708
     object_shift_m: float = 0.25
     point_dropout: float = 0.0
+    object_reflectance_gain: tuple[float, float] = (1.0, 1.0)
+    object_jitter_m: float = 0.0
+    object_cut_probability: float = 0.0
+    reflectance_loss_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        _require("augment", self, ("flip_probability", "point_dropout"), low=0, high=1)
-        _require("augment", self, ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m"), low=0)
-        if not 0 < self.scale[0] <= self.scale[1] < math.inf:
-            raise ConfigError(f"augment.scale = {list(self.scale)}: must be two positive numbers, the smaller first")
+        shares = ("flip_probability", "point_dropout", "object_cut_probability", "reflectance_loss_probability")
+        _require("augment", self, shares, low=0, high=1)
+        noise = ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m", "object_jitter_m")
+        _require("augment", self, noise, low=0)
+        for name in ("scale", "object_reflectance_gain"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high < math.inf:
+                raise ConfigError(f"augment.{name} = {[low, high]}: must be two positive numbers, the smaller first")
 
 
 @dataclass(frozen=True)
@@ -171,6 +191,8 @@ class TrainConfig(Strict):
             `learning_rate` and falls to almost nothing over the run, step by step.
         gradient_clip: largest norm of the whole gradient; 0 leaves it as it is.
         precision: `fp32` or `bf16`.
+        ema: decay of an exponential moving average of the weights, such as 0.999, that is validated, saved and
+            exported in their place; 0 for none.
         checkpoint_steps: also save every so many steps, so that a kill costs minutes, not an epoch.
     """
 
@@ -183,12 +205,15 @@ class TrainConfig(Strict):
     decay_epochs: int = 15
     gradient_clip: float = 10.0
     precision: Literal["fp32", "bf16"] = "fp32"
+    ema: float = 0.0
     checkpoint_steps: int = 500
     seed: int = 0
 
     def __post_init__(self) -> None:
         _require("train", self, ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"), low=1)
         _require("train", self, ("learning_rate", "weight_decay", "decay", "gradient_clip", "seed"), low=0)
+        if not 0 <= self.ema < 1:
+            raise ConfigError(f"train.ema = {self.ema:g}: must be at least 0 and less than 1, such as 0.999")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import reprlib
 from functools import cache
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 
 import pydantic
 
@@ -58,28 +58,57 @@ def _adapter(type_: Any) -> pydantic.TypeAdapter[Any]:
 
 def _explain(type_: type, error: Any) -> str:
     unknown = error["type"] in _UNKNOWN_KEY
-    location = list(error["loc"])
+    location = _without_tags(type_, list(error["loc"]))
     if location[-1:] == ["[key]"] and not unknown:  # pydantic's mark of a mapping's key, as against its value
         location.pop()
     key = ".".join(str(part) for part in location)
     if unknown:
-        names = [field.name for field in dataclasses.fields(_type_at(type_, location[:-1]))]
+        names = [field.name for field in dataclasses.fields(_type_at(type_, list(error["loc"])[:-1]))]
         nearest = difflib.get_close_matches(str(location[-1]), names, n=1, cutoff=0.5)
         advice = f"did you mean `{nearest[0]}`?" if nearest else f"known keys: {', '.join(names)}"
         return f"unknown key `{key}`; {advice}"
     if error["type"] in ("missing", "missing_argument"):
         return f"missing key `{key}`"
+    if error["type"] == "union_tag_invalid":  # every union here is told apart by its members' `kind`
+        return f"`{key}.kind` = {_QUOTE.repr(error['ctx']['tag'])}: input should be {error['ctx']['expected_tags']}"
+    if error["type"] == "union_tag_not_found":
+        return f"`{key}`: input should be a dictionary"
     return f"`{key}` = {_QUOTE.repr(error['input'])}: {error['msg'][0].lower()}{error['msg'][1:]}"
+
+
+def _without_tags(type_: Any, location: list[Any]) -> list[Any]:
+    """The path that a person would write: pydantic puts the tag of a union's member after the union's own key."""
+    for index, part in enumerate(location[:-1]):
+        if not dataclasses.is_dataclass(type_):
+            break
+        type_ = next((field.type for field in dataclasses.fields(type_) if field.name == part), None)
+        if (tag := location[index + 1]) in _members(type_):
+            return [*location[: index + 1], *_without_tags(_members(type_)[tag], location[index + 2 :])]
+    return location
+
+
+def _members(type_: Any) -> dict[Any, Any]:
+    """The dataclasses of a tagged union by tag; none for any other type."""
+    if get_origin(type_) is not Annotated:
+        return {}
+    first, *notes = get_args(type_)
+    if tags := [note.tag for note in notes if isinstance(note, pydantic.Tag)]:
+        return {tags[0]: first}
+    return {tag: member for option in get_args(first) for tag, member in _members(option).items()}
 
 
 def _type_at(type_: Any, location: list[Any]) -> Any:
     """The dataclass that the path `location` leads to from `type_`."""
     for part in location:
-        if isinstance(part, int):
+        if part in (members := _members(type_)):
+            type_ = members[part]
+        elif isinstance(part, int):
             type_ = get_args(type_)[0]
+        elif not dataclasses.is_dataclass(type_):  # a mapping
+            type_ = get_args(type_)[-1]
         else:
             type_ = next(field.type for field in dataclasses.fields(type_) if field.name == part)
-        if not dataclasses.is_dataclass(type_) and get_args(type_):
+        if not dataclasses.is_dataclass(type_) and get_args(type_) and not _members(type_):
             options = [option for option in get_args(type_) if dataclasses.is_dataclass(option)]
             type_ = type_ if not options or type_.__class__.__name__ == "GenericAlias" else options[0]
     return type_

@@ -10,6 +10,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from asca_pillars.errors import ConfigError
+
 PROC = Path("/proc")
 CGROUP = Path("/sys/fs/cgroup")
 PACKAGES = (
@@ -38,6 +40,20 @@ def default_threads() -> int:
     except (OSError, AttributeError):  # not Linux
         return os.cpu_count() or 1
     return max(1, min(physical_cores(cpuinfo, allowed), math.floor(min(cpu_quota(), 1e6))))
+
+
+def check_threads(threads: int | None) -> int:
+    """The number of CPU threads to use: as asked for, or `default_threads` for None.
+
+    Raises:
+        ConfigError: less than one, or more than four for each CPU of the machine, which only wait for each other.
+    """
+    if threads is None:
+        return default_threads()
+    cpus = os.cpu_count() or 1
+    if not 1 <= threads <= 4 * cpus:
+        raise ConfigError(f"threads {threads} must lie between 1 and {4 * cpus}: this machine has {cpus} CPUs")
+    return threads
 
 
 def physical_cores(cpuinfo: str, allowed: set[int]) -> int:

@@ -32,6 +32,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.system import cpu_model, default_threads, package_versions
 from benchmarks.padded import PaddedDetector
 from benchmarks.random_weights import random_weights
@@ -97,6 +98,7 @@ def main(
 
 def _forms(model: Checkpoint) -> dict[str, PaddedDetector]:
     network, spec = model.detector, model.config.model.spec
+    assert isinstance(network, PillarDetector), "padded forms are of pillar detectors"
     reordered = copy.deepcopy(network).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return {
         "eager, padded": PaddedDetector(network, spec),
@@ -111,8 +113,7 @@ def map_difference(runtime: Detector, form: PaddedDetector, scans: Scans) -> tup
     """Largest absolute difference of any head map over the scans, and the smallest standard deviation of a map."""
     worst, spread = 0.0, np.inf
     for points in scans:
-        pillars = runtime.pillarize(points)
-        maps = runtime.neck_and_head(runtime.scatter(runtime.encode(pillars), pillars.cells))
+        maps = runtime.pipeline.infer(runtime.pipeline.prepare(points, []), [])
         expected = form.head_maps(points)
         for name, ours, theirs in zip(HeadMaps._fields, maps, expected, strict=True):
             if ours.shape != tuple(theirs.shape):

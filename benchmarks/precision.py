@@ -99,8 +99,8 @@ def _column(
 
 
 def _maps(detector: Detector, points: NDArray[np.float32]) -> HeadMaps[NDArray[np.float32]]:
-    pillars = detector.pillarize(points)
-    return detector.neck_and_head(detector.scatter(detector.encode(pillars), pillars.cells))
+    pipeline = detector.pipeline
+    return pipeline.infer(pipeline.prepare(points, []), [])
 
 
 def _best_anchors(logits: NDArray[np.float32]) -> tuple[NDArray[np.int64], ...]:

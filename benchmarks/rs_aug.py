@@ -32,10 +32,10 @@ from rich.progress import track
 from rich.table import Table
 from shapely.geometry import MultiPoint, Polygon
 
-from asca_pillars.config import Config, load_config
+from asca_pillars.config import Config, InsertMethod, load_config
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.insertion.free_space import FreeSpace
-from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
+from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
 from asca_pillars.pictures.drawing import BACKGROUND
@@ -83,7 +83,7 @@ def main(
     tallies: dict[str, Tally] = {}
     milliseconds: dict[str, list[float]] = {}
     for method, title in METHODS.items():
-        inserter = prepare_inserter(split, _with_method(settings, method))
+        inserter = _inserter(split, settings, method)
         tallies[method], milliseconds[method] = Tally(), []
         counts[method] = np.zeros((2, len(settings.model.spec.classes)), np.int64)
         for number, frame_id in enumerate(track(split.frame_ids[:limit], title, console=console)):
@@ -103,9 +103,9 @@ def main(
         _draw(picture, split, settings, picture_frame or split.frame_ids[0])
 
 
-def _with_method(settings: Config, method: str) -> Config:
-    insert = replace(settings.augment.insert, method=method)  # type: ignore[arg-type]
-    return replace(settings, augment=replace(settings.augment, insert=insert))
+def _inserter(split: KittiSplit, settings: Config, method: InsertMethod) -> Inserter:
+    insert = replace(settings.augment.insert, method=method)
+    return prepare_inserter(split, settings.model.spec, settings.data, insert)
 
 
 def _read(split: KittiSplit, frame_id: str, settings: Config) -> LabeledFrame:
@@ -254,7 +254,7 @@ def _draw(path: Path, split: KittiSplit, settings: Config, frame_id: str) -> Non
     for method in ("none", *METHODS):
         shown = frame
         if method != "none":
-            inserter = prepare_inserter(split, _with_method(settings, method))
+            inserter = _inserter(split, settings, method)
             shown = insert_objects(frame, inserter, np.random.default_rng((0, 0, 0, 1)))
         boxes, labels = shown.boxes[len(frame.boxes) :], shown.labels[len(frame.boxes) :]
         layers = [

@@ -1,9 +1,10 @@
 """Plain data to typed settings: every mistake at every depth becomes one line that names the key."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
+from pydantic import Discriminator, Tag
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.schema import Strict, parse, to_dict
@@ -110,3 +111,36 @@ def test_round_trip() -> None:
         "notes": {"a": "b"},
     }
     assert parse(Vehicle, plain, "car.yaml") == vehicle
+
+
+@dataclass(frozen=True)
+class Round(Strict):
+    kind: str = "round"
+    radius_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class Square(Strict):
+    kind: str = "square"
+    side_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class Holder(Strict):
+    shape: Annotated[
+        Annotated[Round, Tag("round")] | Annotated[Square, Tag("square")],
+        Discriminator(lambda value: value.get("kind", "round") if isinstance(value, dict) else value.kind),
+    ] = field(default_factory=Round)
+
+
+def test_a_tagged_union_is_read_by_its_kind_and_blamed_without_its_tag() -> None:
+    assert parse(Holder, {"shape": {"radius_m": 2}}, "f").shape == Round(radius_m=2)
+    assert parse(Holder, {"shape": {"kind": "square", "side_m": 2}}, "f").shape == Square(side_m=2)
+    with pytest.raises(ConfigError, match=r"^f: `shape.side_m` = 'wide': input should be a valid number"):
+        parse(Holder, {"shape": {"kind": "square", "side_m": "wide"}}, "f")
+    with pytest.raises(ConfigError, match=r"^f: unknown key `shape.radus_m`; did you mean `radius_m`\?$"):
+        parse(Holder, {"shape": {"radus_m": 1}}, "f")
+    with pytest.raises(ConfigError, match=r"^f: unknown key `shape.sid_m`; did you mean `side_m`\?$"):
+        parse(Holder, {"shape": {"kind": "square", "sid_m": 1}}, "f")
+    with pytest.raises(ConfigError, match=r"^f: `shape.kind` = 'triangle': input should be 'round', 'square'"):
+        parse(Holder, {"shape": {"kind": "triangle"}}, "f")

@@ -30,9 +30,8 @@ def stages_table(report: BenchmarkReport) -> Table:
 def summary_lines(report: BenchmarkReport) -> list[str]:
     """FPS, the share outside the graphs, start and memory."""
     memory = "" if report.peak_memory_mib is None else f", peak memory {report.peak_memory_mib:.0f} MiB"
-    cold = "" if report.cold_ms is None else f", first scan {report.cold_ms:.0f} ms"
     return [
-        f"{report.fps:.1f} FPS; loaded in {report.load_s:.2f} s{cold}{memory}",
+        f"{report.fps:.1f} FPS; loaded in {report.load_s:.2f} s, first scan {report.cold_ms:.0f} ms{memory}",
         f"outside the graphs: {report.outside_ms.p50:.1f} ms (p95 {report.outside_ms.p95:.1f}), "
         f"{report.outside_share:.0%}",
     ]
@@ -41,7 +40,7 @@ def summary_lines(report: BenchmarkReport) -> list[str]:
 def machine_line(report: BenchmarkReport) -> str:
     """What the figures belong to."""
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    return f"{report.cpu}, {report.threads} threads, {report.provider} {report.precision}; {versions}"
+    return f"{report.cpu}, {report.threads} threads, {report.runs_on}; {versions}"
 
 
 def roofline_line(found: Roofline) -> str:

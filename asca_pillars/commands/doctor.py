@@ -35,7 +35,7 @@ def _provider(name: str) -> str:
 
 def _bundled_model() -> str:
     detector = Detector(provider=AUTO)
-    return f"ok, {summary(detector.provider, detector.precision, detector.candidates)}"
+    return f"ok, {summary(detector.runs_on, detector.candidates)}"
 
 
 def _check(console: Console, name: str, attempt: Callable[[], str]) -> None:

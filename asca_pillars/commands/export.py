@@ -45,6 +45,11 @@ def run(
     loaded = loaded._replace(config=replace(loaded.config, model=replace(loaded.config.model, spec=spec)))
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
+    if loaded.expected_input is None and scans is None:
+        raise ConfigError(
+            f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
+            "give some of them with --scans"
+        )
     points = _scans(scans, console, PARITY_SCANS, PARITY_SEED)
     # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
     view: View = "camera" if loaded.config.data.camera_view else "full"
@@ -66,12 +71,16 @@ def run(
         f"{out}: parity on {parity.scans} scans: head maps within {parity.head_maps_max_abs_error:.2g}, "
         f"boxes within {parity.box_max_error_m:.2g} m and {np.rad2deg(parity.yaw_max_error_rad):.2g} degrees"
     )
+    if bundle.expected_input_from == "export":
+        console.print("The checkpoint does not describe its training scans: expected_input is measured on --scans")
     if bundle.quantization is not None:
         _show(bundle.quantization, console)
 
 
 def _show(report: Quantization, console: Console) -> None:
     table = Table(title=f"In 8 bits, calibrated on {report.calibration_scans} scans")
+    if report.dropped_scans:
+        console.print(f"{report.dropped_scans} calibration scans left out: parity is proven on the same ones")
     table.add_column("layer")
     table.add_column("logit error if it alone stays float", justify="right")
     table.add_column("kept float")

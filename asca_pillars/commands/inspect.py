@@ -2,17 +2,20 @@
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.config import Config, load_config
+from asca_pillars.config import load_config
 from asca_pillars.data.frames import NEIGHBOR_TYPES
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread, inspect_dataset
+from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
+from asca_pillars.pillars.pillarize import PillarLimits
 
 
 def run(data: Path, config: Path, split: str | None, frames: int, report_path: Path | None) -> None:
@@ -23,19 +26,22 @@ def run(data: Path, config: Path, split: str | None, frames: int, report_path: P
     """
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
-    inspection = inspect_dataset(data, settings, split=split, frames=frames, progress=True)
-    found = findings(inspection, settings)
+    spec, min_points, view = settings.model.spec, settings.data.min_points, settings.data.camera_view
+    frames_of = KittiSplit(data, settings.data.train_set if split is None else split)
+    inspection = inspect_dataset(frames_of, spec, settings.data, frames=frames, progress=True)
+    found = findings(inspection, spec, min_points)
     if report_path is not None:
-        report = dataclasses.asdict(inspection) | {"findings": [finding._asdict() for finding in found]}
+        report = {"config": settings.name} | dataclasses.asdict(inspection)
+        report |= {"findings": [finding._asdict() for finding in found]}
         with atomic_path(report_path) as temporary:
             temporary.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     console.print(
-        f"{data}, split {inspection.split}, against {inspection.config}: {inspection.frames} of "
+        f"{data}, split {inspection.split}, against {settings.name}: {inspection.frames} of "
         f"{inspection.frames_in_split} frames{', evenly spaced' if inspection.sampled else ''}; "
         f"{inspection.frames_without_objects} without an object"
     )
-    console.print(_types(inspection, settings), _objects(inspection, settings), _sizes(inspection), sep="\n")
-    console.print(_matching(inspection), _scans(inspection, settings), sep="\n")
+    console.print(_types(inspection, spec.class_names), _objects(inspection, min_points), _sizes(inspection), sep="\n")
+    console.print(_matching(inspection), _scans(inspection, spec.limits, view), sep="\n")
     errors = [finding for finding in found if finding.level == "error"]
     for finding in found:
         if finding not in errors[:1]:  # the first one is what the command fails with, below all of them
@@ -48,8 +54,7 @@ def run(data: Path, config: Path, split: str | None, frames: int, report_path: P
         console.print("Nothing to warn of.")
 
 
-def _types(inspection: Inspection, config: Config) -> Table:
-    names = config.model.spec.class_names
+def _types(inspection: Inspection, names: Sequence[str]) -> Table:
     neighbors = {NEIGHBOR_TYPES[name]: name for name in names if name in NEIGHBOR_TYPES}
     table = _table("Labels", "type", "count", "per frame", "in training")
     for kind, count in inspection.types.items():
@@ -58,8 +63,8 @@ def _types(inspection: Inspection, config: Config) -> Table:
     return table
 
 
-def _objects(inspection: Inspection, config: Config) -> Table:
-    few = f"< {config.data.min_points}"
+def _objects(inspection: Inspection, min_points: int) -> Table:
+    few = f"< {min_points}"
     title = (
         "Objects: points inside a box (10 % / median / 90 %); boxes with 0 or few, out of the grid, cut by z_range_m"
     )
@@ -99,13 +104,13 @@ def _matching(inspection: Inspection) -> Table:
     return table
 
 
-def _scans(inspection: Inspection, config: Config) -> Table:
-    scans, limits = inspection.scans, config.model.spec.limits
+def _scans(inspection: Inspection, limits: PillarLimits, camera_view: bool) -> Table:
+    scans = inspection.scans
     low, high = scans.reflectance_stored
     ground = "not seen" if scans.ground_z_m is None else _spread(scans.ground_z_m, 2)
     bottoms = " to ".join(f"{bottom:.2f}" for bottom in scans.anchor_bottoms_m)
     over = _share(scans.scans_over_max_pillars, inspection.frames)
-    view = "in the camera's view" if config.data.camera_view else "per scan"
+    view = "in the camera's view" if camera_view else "per scan"
     table = _table("Scans: 10 % / median / 90 %", "", "found", "expected")
     table.add_row(f"points {view}", _spread(scans.points), "")
     table.add_row("points outside the grid", f"{100 * scans.outside_share:.1f} %", "")

@@ -4,15 +4,17 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
+from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.commands.extras import require
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.system import check_threads
 
 
 @dataclass(frozen=True)
@@ -51,28 +53,32 @@ def _open_bundle(
     path: Path | None, min_score: float, provider: str, precision: str | None, threads: int | None
 ) -> Model:
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are collected below
-    detector = Detector(path, provider=provider, precision=precision, threads=threads, score_threshold=min_score)
+    detector = Detector(
+        path,
+        provider=cast("Provider", provider),  # checked by Detector, as the precision is
+        precision=cast("Precision | None", precision),
+        threads=threads,
+        score_threshold=min_score,
+    )
     bundle = detector.bundle
     unlike: list[str] = []
 
     def detect(points: NDArray[np.float32]) -> Detections:
         detections = detector(points)
-        assert detector.last_frame is not None, "the detector has run"
-        unlike.extend(detector.last_frame.warnings[:1])
+        unlike.extend(detections.report.warnings[:1])
         return detections
 
     about = {
         "name": bundle.name,
         "bundle": str(detector.folder),
-        "sha256": {"encoder": bundle.graphs.encoder.sha256, "backbone": bundle.graphs.backbone.sha256},
+        "sha256": {name: graph.sha256 for name, graph in bundle.graphs.items()},
         "trained_on": bundle.provenance.trained_on,
         "provider": detector.provider,
-        "precision": detector.precision,
+        "precision": arithmetic(bundle.precision, detector.precision),
         "threads": detector.threads,
         "min_score": min_score,
     }
-    # Bundles do not say which view they were trained on; KITTI labels the camera's, and so is what is scored.
-    return Model(bundle.name, detect, bundle.spec, camera_view=True, about=about, unlike=unlike)
+    return Model(bundle.name, detect, bundle.spec, bundle.expected_input.camera_view, about, unlike)
 
 
 def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str | None, threads: int | None) -> Model:
@@ -80,10 +86,10 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
     import torch
 
     from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.models.pillar.scan_detector import ScanDetector
+    from asca_pillars.models.scan_detector import ScanDetector
 
-    if threads is not None and threads < 1:
-        raise ConfigError(f"threads {threads} must be at least 1")
+    if threads is not None:
+        check_threads(threads)
     if provider not in ("cpu", "cuda", "auto"):
         raise ConfigError(f"provider {provider} does not run checkpoints: choose cpu, cuda or auto, or give a bundle")
     if precision not in (None, "float32"):
@@ -93,11 +99,12 @@ def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str
     device = "cpu" if provider == "cpu" or not torch.cuda.is_available() else "cuda"
     if threads is not None:
         torch.set_num_threads(threads)
-    config, network, steps = load_checkpoint(path)
+    loaded = load_checkpoint(path)
+    config, network = loaded.config, loaded.detector
     about = {
         "name": config.name,
         "checkpoint": str(path),
-        "steps": steps,
+        "steps": loaded.steps,
         "provider": f"torch {device}",
         "threads": torch.get_num_threads(),
         "min_score": min_score,

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import AugmentConfig
+from asca_pillars.data.corruption import corrupt_objects, lose_reflectance
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import bev_intersection
@@ -14,12 +15,14 @@ OBJECT_TRIES = 10  # draws of one object's new pose before it stays where it is
 
 
 def augment(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Generator) -> LabeledFrame:
-    """Per-object noise, flip, rotation, scaling, height shift and point dropout, in this order.
+    """Per-object noise, corruption, flip, rotation, scaling, height shift and point dropout, in this order.
 
     The frame that is passed in stays as it was.
     """
     frame = replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
     move_objects(frame, config, rng)
+    frame = replace(frame, points=corrupt_objects(frame.points, frame.boxes, config, rng))
+    lose_reflectance(frame.points, config, rng)
     if rng.random() < config.flip_probability:
         flip_y(frame)
     rotate(frame, rng.uniform(-config.rotation_rad, config.rotation_rad))

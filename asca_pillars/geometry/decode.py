@@ -60,8 +60,8 @@ def decode(
     """Detections of one scan, best first.
 
     Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
-    rotated NMS seen from above. Then the best `max_detections` of all classes. Boxes that are not finite,
-    from a network whose numbers overflowed, are left out: nobody can use them.
+    rotated NMS seen from above. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
+    from a network that overflowed, are left out and counted (`Detections.non_finite`): nobody can use them.
 
     Args:
         maps: logits and residuals on the head's map.
@@ -80,10 +80,11 @@ def decode(
     anchor, cell = _candidates(maps.scores, classes, post.candidates)
     logits = maps.scores.reshape(count, -1)[anchor, cell]
     residuals = maps.boxes.reshape(count, 7, -1)[anchor, :, cell]
-    direction = maps.directions.reshape(count, 2, -1)[anchor, :, cell].argmax(axis=-1)
+    directions = maps.directions.reshape(count, 2, -1)[anchor, :, cell]
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
-        boxes = decode_boxes(residuals, direction, anchors.reshape(-1, count, 7)[cell, anchor])
-    usable = np.isfinite(boxes).all(axis=1)
+        boxes = decode_boxes(residuals, directions.argmax(axis=-1), anchors.reshape(-1, count, 7)[cell, anchor])
+    usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)
+    dropped = np.count_nonzero(~usable & np.isfinite(logits))
     boxes, logits, labels = boxes[usable], logits[usable], anchor[usable] // len(ANCHOR_YAWS_RAD)
 
     kept = []
@@ -92,7 +93,13 @@ def decode(
         kept.append(own[rotated_nms(boxes[own], logits[own], post.nms_iou, post.max_detections)])
     survivors = np.concatenate(kept)
     best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
-    return Detections(boxes[best], _sigmoid(logits[best]), labels[best], tuple(spec.name for spec in classes))
+    return Detections(
+        boxes[best],
+        _sigmoid(logits[best]),
+        labels[best],
+        tuple(spec.name for spec in classes),
+        non_finite=int(maps.scores.size - np.count_nonzero(np.isfinite(maps.scores)) + dropped),
+    )
 
 
 def _candidates(

@@ -17,7 +17,8 @@ def ground_z_m(points: NDArray[np.float32]) -> float | None:
     Takes finite points (N, >=3) in the LiDAR frame; None if the ring holds too few of them to tell.
     """
     x, y = points[:, 0], points[:, 1]
-    squared_range = x * x + y * y
+    with np.errstate(over="ignore"):  # infinitely far is not near
+        squared_range = x * x + y * y
     ring = np.flatnonzero((squared_range > RING_M[0] ** 2) & (squared_range < RING_M[1] ** 2))
     near_z = points[:, 2].take(ring)
     return float(np.percentile(near_z, PERCENTILE)) if len(near_z) >= MIN_POINTS else None

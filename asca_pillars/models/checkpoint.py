@@ -6,21 +6,33 @@ from typing import Any, NamedTuple
 import torch
 
 from asca_pillars.config import Config
+from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
+from asca_pillars.models.build import build_model
+from asca_pillars.models.trainable import Trainable
 from asca_pillars.schema import parse
 
 
 class Checkpoint(NamedTuple):
-    """A trained detector in evaluation mode, its configuration, and the optimizer steps behind it."""
+    """A trained detector in evaluation mode and where it comes from.
+
+    Attributes:
+        config: of its training run.
+        detector: its network.
+        steps: optimizer steps behind it.
+        expected_input: of the scans that it was trained on; None in checkpoints made before this was measured.
+    """
 
     config: Config
-    detector: PillarDetector
+    detector: Trainable
     steps: int
+    expected_input: ExpectedInput | None = None
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
     """Read a checkpoint of `asca train`, weights only: nothing in the file is executed.
+
+    last.ckpt, best.ckpt and weights.ckpt are read alike; with `train.ema` the weights are the averaged ones.
 
     Raises:
         TrainingError: not a checkpoint, damaged, or made by an incompatible version.
@@ -31,16 +43,18 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     try:
         content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         config = parse(Config, content["hyper_parameters"]["config"], str(path))
-        detector = build_pillar_detector(config.model)
+        detector = build_model(config.model)
         weights = {
             name.removeprefix("detector."): value
             for name, value in content["state_dict"].items()
             if name.startswith("detector.")
         }
         detector.load_state_dict(weights)
+        measured = content["hyper_parameters"].get("expected_input")
+        expected = None if measured is None else parse(ExpectedInput, measured, str(path))
     except ConfigError as error:
         raise TrainingError(f"{error}; the checkpoint was made by another version of asca-pillars") from None
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({reason})") from error
-    return Checkpoint(config, detector.eval(), int(content["global_step"]))
+    return Checkpoint(config, detector.eval(), int(content["global_step"]), expected)

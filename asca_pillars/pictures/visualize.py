@@ -35,10 +35,14 @@ def class_color(name: str) -> Color:
 
 
 def write_png(path: str | Path, image: Image) -> None:
-    """Write an image (H, W, 3) as PNG."""
-    encoded = cv2.imencode(".png", image)[1]
+    """Write an image (H, W, 3), blue, green, red, as PNG."""
     with atomic_path(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+        temporary.write_bytes(png_bytes(image))
+
+
+def png_bytes(image: Image) -> bytes:
+    """An image (H, W, 3), blue, green, red, as the bytes of a PNG file."""
+    return cv2.imencode(".png", image)[1].tobytes()
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,10 @@ from asca_pillars.pillars.fitting import HEAD_STRIDE, MAX_ZONES, NECK_STRIDE, fi
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
 
+# Beyond these a mistyped number asks for more memory than there is.
+_FARTHEST_M = 10_000.0
+_MOST_PILLARS = 20_000  # along one axis
+
 
 class GridTables(NamedTuple):
     """What turns a point into a cell: the x range in slices of the finest depth, whose borders include every column's.
@@ -70,11 +74,23 @@ class PillarGrid:
             low, high = getattr(self, name)
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise ConfigError(f"{name} [{low:g}, {high:g}] must be two finite numbers, the smaller first")
+            if max(-low, high) > _FARTHEST_M:
+                raise ConfigError(
+                    f"{name} [{low:g}, {high:g}] leads farther than {_FARTHEST_M:g} m, which no LiDAR sees"
+                )
         for name in ("v_max_m", "v_y_m"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"{name} {getattr(self, name):g} must be a positive size in metres")
         if not 1 <= self.zones <= MAX_ZONES:
             raise ConfigError(f"zones {self.zones} must lie between 1 and {MAX_ZONES}")
+        finest_m = self.v_max_m / 2 ** (self.zones - 1)
+        for name, size_m in (("x_range_m", finest_m), ("y_range_m", self.v_y_m)):
+            low, high = getattr(self, name)
+            if (high - low) / size_m > _MOST_PILLARS:
+                raise ConfigError(
+                    f"{name} [{low:g}, {high:g}] in pillars of {size_m:g} m has more than {_MOST_PILLARS} of them; "
+                    "choose larger pillars"
+                )
         if not fits(self.x_range_m, self.v_max_m, self.zones):
             raise ConfigError(x_advice(self.x_range_m, self.v_max_m, self.zones))
         if not fits(self.y_range_m, self.v_y_m):

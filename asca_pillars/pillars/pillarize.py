@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.grid import PillarGrid
 
@@ -37,15 +38,9 @@ class PillarLimits:
 
 
 @dataclass(frozen=True)
-class PillarCounts:
-    """What became of a scan's points: points = kept + points_outside + points_over_limit."""
+class PillarCounts(ScanCounts):
+    """What became of a scan's points on the grid; points that are not finite count as outside."""
 
-    points: int
-    """Points of the scan."""
-    points_outside: int
-    """Points outside the grid's ranges, or not finite."""
-    points_over_limit: int
-    """Points inside that either limit dropped."""
     pillars: int
     """Pillars kept."""
     pillars_over_limit: int

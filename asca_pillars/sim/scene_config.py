@@ -29,6 +29,7 @@ class SceneConfig:
     empty_share: float = 0.12  # scenes without any labelled type
     reach_m: float = 79.0
 
+    alongside: float = 0.05  # share of all that stands beside the car, up to 7 m before or behind it
     # Shares of vehicles by where they are: parked, by the kind of street; of those that are not: in yards and drives,
     # on the crossing road; the others are on their way.
     parked_residential: float = 0.64
@@ -47,9 +48,10 @@ class SceneConfig:
     in_queue: float = 0.30
     oncoming: float = 0.45
 
-    # Shares of walkers by heading; the others walk along the street.
     pedestrian_uniform_heading: float = 0.45
-    pedestrian_across_sight: float = 0.30  # of the sensor, at a right angle give or take 20 degrees
+    # Of the others, those who cross the sensor's line of sight at a right angle, give or take 20 degrees; what is left
+    # walks along the street.
+    pedestrian_across_sight: float = 0.55
     in_company: float = 0.42
     side_by_side: float = 0.6  # of those in company; the others walk behind or meet
     side_by_side_m: tuple[float, float] = (0.45, 0.80)
@@ -100,7 +102,7 @@ class SceneConfig:
     behind_gaps: float = 0.4  # share of vehicles behind whose ends something narrow stands
     thick_trunks: float = 0.45  # share of trees with a trunk of 0.35 to 0.6 m that spreads towards its roots
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
-    dark_paint_share: float = 0.52
+    dark_paint_share: float = 0.38
 
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
     min_points: int = 2

@@ -1,4 +1,4 @@
-"""Training samples: frames of a KITTI-layout folder as pillars with targets, and batches of them."""
+"""Training samples: frames of a KITTI-layout folder, augmented and prepared for a family of detectors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,113 +6,160 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch.utils.data import Dataset
 
-from asca_pillars.config import Config
+from asca_pillars.config import AugmentConfig, Config
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.geometry.targets import Targets, assign_targets
-from asca_pillars.models.pillar.loss import TargetBatch
-from asca_pillars.models.pillar.pillar_detector import PillarBatch, batch_pillars
-from asca_pillars.pillars.pillarize import Pillars
+from asca_pillars.errors import AscaError
+from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.models.build import build_preparation
+from asca_pillars.models.trainable import Movable, Preparation
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One frame, ready for the network: its pillars, and the targets of its anchors."""
+    """One frame, and what the detector's `Preparation` made of it."""
 
     frame: LabeledFrame
-    pillars: Pillars
-    targets: Targets
+    prepared: Any
 
 
+@dataclass
 class Batch:
-    """Samples of B frames as tensors.
+    """Samples of B frames.
 
     Attributes:
         frame_ids: names of the frames.
-        pillars: input of `PillarDetector`.
-        targets: input of `detection_loss`.
-        boxes, labels: the labelled boxes of each frame, NumPy, for evaluation.
+        boxes: (M, 7) labelled boxes of each frame, NumPy, LiDAR frame, metres and radians; for evaluation.
+        labels: (M,) class indices of each frame's boxes, or IGNORED.
+        inputs: input and targets of the network, tensors.
     """
 
-    def __init__(self, samples: Sequence[Sample]) -> None:
-        self.frame_ids = [sample.frame.frame_id for sample in samples]
-        self.boxes = [sample.frame.boxes for sample in samples]
-        self.labels = [sample.frame.labels for sample in samples]
-        self.pillars = batch_pillars([sample.pillars for sample in samples])
-        self.targets = _collate_targets([sample.targets for sample in samples])
+    frame_ids: list[str]
+    boxes: list[np.ndarray]
+    labels: list[np.ndarray]
+    inputs: Movable
 
     def to(self, device: Any) -> "Batch":
         """Move the tensors, in place, as Lightning expects of a batch."""
-        pillars = self.pillars
-        self.pillars = PillarBatch(
-            pillars.features.to(device),
-            pillars.pillar_index.to(device),
-            pillars.point_counts.to(device),
-            pillars.cells.to(device),
-            pillars.frame_pillars,
-        )
-        self.targets = TargetBatch(*(part.to(device) for part in self.targets))
+        self.inputs = self.inputs.to(device)
         return self
 
 
-class KittiDataset(Dataset[Sample]):
-    """Frames of one ImageSets list, augmented when `training`; the object database is built here if it is missing.
+@dataclass(frozen=True)
+class Collate:
+    """Samples to a `Batch`; an object, because loader processes pickle it.
+
+    An error in the place of a sample stands for the whole batch: torch wraps what a loader process raises into the
+    text of its traceback, and the loop is to raise the one line itself.
+    """
+
+    preparation: Preparation
+
+    def __call__(self, samples: Sequence[Sample | AscaError]) -> Batch | AscaError:
+        """Make a batch, or give the first error."""
+        good = []
+        for sample in samples:
+            if isinstance(sample, AscaError):
+                return sample
+            good.append(sample)
+        return Batch(
+            frame_ids=[sample.frame.frame_id for sample in good],
+            boxes=[sample.frame.boxes for sample in good],
+            labels=[sample.frame.labels for sample in good],
+            inputs=self.preparation.collate([sample.prepared for sample in good]),
+        )
+
+
+class KittiDataset(Dataset[Sample | AscaError]):
+    """Frames of one ImageSets list, augmented where `augmentation` is given.
 
     What a sample holds depends on the seed, the epoch and the frame alone, not on the number of workers or on what
     was drawn before it: a resumed run sees what an unbroken one would have seen. An index is therefore a pair
     (epoch, frame number), see `EpochSampler`.
 
-    Raises:
-        DatasetError: a missing list, scan, label or calibration file; a class to insert that no frame has.
+    Args:
+        split: the list.
+        spec: classes that are labels, and ranges outside of which a box is no target.
+        preparation: of the detector that is trained.
+        camera_view: keep only the points that the camera sees.
+        min_points: an object with fewer points inside its box is IGNORED.
+        augmentation: random changes; None for validation.
+        inserter: puts objects of other frames in, before anything else is changed.
+        seed: of all that is drawn.
     """
 
-    def __init__(self, root: str | Path, config: Config, *, training: bool) -> None:
-        self.config = config
-        self.training = training
-        self.split = KittiSplit(root, config.data.train_set if training else config.data.val_set)
-        self.frame_ids = self.split.frame_ids
-        self.inserter: Inserter | None = None
-        if training and config.augment.insert.method != "none":
-            self.inserter = prepare_inserter(self.split, config)
+    def __init__(
+        self,
+        split: KittiSplit,
+        spec: DetectorSpec,
+        preparation: Preparation,
+        *,
+        camera_view: bool,
+        min_points: int,
+        augmentation: AugmentConfig | None = None,
+        inserter: Inserter | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.split, self.spec, self.preparation = split, spec, preparation
+        self.camera_view, self.min_points = camera_view, min_points
+        self.augmentation, self.inserter, self.seed = augmentation, inserter, seed
+        self.frame_ids = split.frame_ids
 
     def __len__(self) -> int:
         return len(self.frame_ids)
 
-    def __getitem__(self, index: tuple[int, int]) -> Sample:
-        epoch, number = index
-        rng = np.random.default_rng((self.config.train.seed, epoch, number)) if self.training else None
-        data, spec = self.config.data, self.config.model.spec
+    def __getitem__(self, index: tuple[int, int]) -> Sample | AscaError:
+        """The sample (epoch, frame number), or what is wrong with the files of that frame."""
+        try:
+            return self.sample(*index)
+        except AscaError as error:
+            return error
+
+    def sample(self, epoch: int, number: int) -> Sample:
+        """One sample.
+
+        Raises:
+            DatasetError, ScanError: a file of the frame is missing or damaged.
+        """
+        rng = None if self.augmentation is None else np.random.default_rng((self.seed, epoch, number))
         frame = read_frame(
             self.split,
             self.frame_ids[number],
-            spec.class_names,
-            camera_view=data.camera_view,
-            min_points=data.min_points,
+            self.spec.class_names,
+            camera_view=self.camera_view,
+            min_points=self.min_points,
         )
         if self.inserter is not None:
             # A generator of its own: all other draws stay what they are without insertion.
-            frame = insert_objects(
-                frame, self.inserter, np.random.default_rng((self.config.train.seed, epoch, number, 1))
-            )
-        if rng is not None:
-            frame = augment(frame, self.config.augment, rng)
-        frame = within_ranges(frame, spec.ranges)
-        pillars = spec.pillarize(frame.points, rng)
-        return Sample(frame, pillars, assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels))
+            frame = insert_objects(frame, self.inserter, np.random.default_rng((self.seed, epoch, number, 1)))
+        if self.augmentation is not None and rng is not None:
+            frame = augment(frame, self.augmentation, rng)
+        frame = within_ranges(frame, self.spec.ranges)
+        return Sample(frame, self.preparation.prepare(frame, rng))
 
 
-def _collate_targets(frames: Sequence[Targets]) -> TargetBatch:
-    anchors_per_frame = frames[0].state.size
-    return TargetBatch(
-        state=torch.from_numpy(np.stack([frame.state for frame in frames])),
-        positives=torch.from_numpy(
-            np.concatenate([frame.positives + i * anchors_per_frame for i, frame in enumerate(frames)])
-        ),
-        residuals=torch.from_numpy(np.concatenate([frame.residuals for frame in frames])),
-        directions=torch.from_numpy(np.concatenate([frame.directions for frame in frames])),
+def open_dataset(root: str | Path, config: Config, *, training: bool) -> KittiDataset:
+    """The training or the validation frames that `config` asks for; the object database is built if it is missing.
+
+    Raises:
+        DatasetError: a missing list, scan, label or calibration file; a class to insert that no frame has.
+    """
+    data, spec, insert = config.data, config.model.spec, config.augment.insert
+    split = KittiSplit(root, data.train_set if training else data.val_set)
+    inserter = None
+    if training and insert.method != "none":
+        inserter = prepare_inserter(split, spec, data, insert)
+    return KittiDataset(
+        split,
+        spec,
+        build_preparation(config.model),
+        camera_view=data.camera_view,
+        min_points=data.min_points,
+        augmentation=config.augment if training else None,
+        inserter=inserter,
+        seed=config.train.seed,
     )

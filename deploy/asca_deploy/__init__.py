@@ -4,13 +4,13 @@ from asca_deploy.bundle import (
     Bundle,
     default_bundle_path,
     find_bundle,
-    load_bundle,
     sample_scan_path,
     shipped_bundles,
 )
 from asca_deploy.detector import Detector
-from asca_deploy.frame import FrameReport
+from asca_deploy.manifest import load_bundle
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.frame_report import FrameReport
 
 __all__ = [
     "Bundle",

@@ -2,19 +2,20 @@
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
-REFERENCE = ("cpu", "float32")
+REFERENCE: tuple[Provider, Precision] = ("cpu", "float32")
 
 # How far a box may be from its partner. On 13 scans bfloat16 leaves the boxes of the bundle that ships at an IoU of at
 # least 0.86, their scores within 0.005; results that are wrong miss boxes, invent them or turn them round.
@@ -36,34 +37,37 @@ Network = TypeVar("Network")
 class Candidate:
     """How one provider did in one precision."""
 
-    provider: str
-    precision: str
+    provider: Provider
+    precision: Precision
     median_ms: float | None
-    """From the pseudo-image to the boxes, warm; None if it was not timed."""
+    """From the points to the boxes, warm; None if it was not timed."""
     verdict: str
     """AGREES, or why it could not be taken."""
+    weights: str = "float32"
+    """The bundle's own precision, float32 or int8."""
 
     def __str__(self) -> str:
         time_ms = "" if self.median_ms is None else f" {self.median_ms:.1f} ms"
-        return f"{self.provider} {self.precision}{time_ms} {self.verdict}"
+        return f"{self.provider} {arithmetic(self.weights, self.precision)}{time_ms} {self.verdict}"
 
 
 class Choice(NamedTuple, Generic[Network]):
     """What was taken, and how all of them did."""
 
     network: Network
-    provider: str
-    precision: str
+    provider: Provider
+    precision: Precision
     candidates: tuple[Candidate, ...]
 
 
 def choose(
-    names: Iterable[tuple[str, str]],
-    open_network: Callable[[str, str], Network],
+    names: Iterable[tuple[Provider, Precision]],
+    open_network: Callable[[Provider, Precision], Network],
     detect: Callable[[Network], Detections],
     spec: PillarSpec,
-    precision: str | None = None,
+    precision: Precision | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    weights: str = "float32",
 ) -> Choice[Network]:
     """Open, compare and time one after the other; the fastest that agrees, float32 where that is about as fast.
 
@@ -74,6 +78,7 @@ def choose(
         spec: whose thresholds those boxes had to reach.
         precision: the only one that may be taken; None for any.
         clock: seconds.
+        weights: the bundle's own precision, for the report.
 
     Raises:
         ProviderError: nothing in the precision that was asked for can be taken; says why.
@@ -82,7 +87,7 @@ def choose(
     start = clock()
     reference = open_network(*REFERENCE)
     expected = detect(reference)
-    candidates = [Candidate(*REFERENCE, _median_ms(detect, reference, clock), AGREES)]
+    candidates = [Candidate(*REFERENCE, _median_ms(detect, reference, clock), AGREES, weights)]
     best: tuple[Candidate, Network] | None = (candidates[0], reference)
     if precision not in (None, REFERENCE[1]):
         best = None
@@ -91,9 +96,10 @@ def choose(
         if name == REFERENCE or precision not in (None, name[1]):
             continue
         if reason := _left_out(name[0], clock() - start):
-            candidates.append(Candidate(*name, None, reason))
+            candidates.append(Candidate(*name, None, reason, weights))
             continue
         trial = _try(name, open_network, detect, expected, spec, clock)
+        trial = trial._replace(candidate=replace(trial.candidate, weights=weights))
         candidates.append(trial.candidate)
         if trial.network is not None and (best is None or _cost(trial.candidate) < _cost(best[0])):
             best = trial.candidate, trial.network
@@ -103,9 +109,9 @@ def choose(
     return Choice(best[1], best[0].provider, best[0].precision, tuple(candidates))
 
 
-def summary(provider: str, precision: str, candidates: Iterable[Candidate]) -> str:
-    """One line that says what was taken and why."""
-    return f"auto takes {provider} {precision}: {'; '.join(map(str, candidates))}"
+def summary(runs_on: str, candidates: Iterable[Candidate]) -> str:
+    """One line that says what was taken (`Detector.runs_on`) and why."""
+    return f"auto takes {runs_on}: {'; '.join(map(str, candidates))}"
 
 
 def disagreement(expected: Detections, found: Detections, spec: PillarSpec) -> str | None:
@@ -131,8 +137,8 @@ class _Trial(NamedTuple, Generic[Network]):
 
 
 def _try(
-    name: tuple[str, str],
-    open_network: Callable[[str, str], Network],
+    name: tuple[Provider, Precision],
+    open_network: Callable[[Provider, Precision], Network],
     detect: Callable[[Network], Detections],
     expected: Detections,
     spec: PillarSpec,

@@ -1,55 +1,94 @@
 """A model bundle: the folder that `asca export` writes and the detector runs, and nothing else is needed.
 
-    encoder.onnx    points of pillars -> pillar features
-    backbone.onnx   pseudo-image, channels last -> head maps
+    *.onnx          the family's graphs
     bundle.json     everything that must agree with the graphs, and where they come from
 
-docs/BUNDLE.md describes the files for readers in other languages.
+docs/BUNDLE.md describes the files for readers in other languages; `manifest` reads, verifies and writes bundle.json.
 """
 
-import hashlib
-import json
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from asca_deploy.canvas import CanvasFormat
-from asca_deploy.input_check import ExpectedInput
-from asca_deploy.layout import difference, layout_of
-from asca_pillars.errors import AscaError, BundleError
-from asca_pillars.files import atomic_path
+from asca_pillars.data.expected_input import ExpectedInput
+from asca_pillars.errors import BundleError, ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.schema import Strict, parse, to_dict
+from asca_pillars.schema import Strict
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
-ENCODER = "encoder.onnx"
-BACKBONE = "backbone.onnx"
+ENCODER = "encoder"
+BACKBONE = "backbone"
+PILLAR_GRAPHS = (ENCODER, BACKBONE)
 
-_EXPORT_AGAIN = "export the bundle again with `asca export`"
+_LONGEST_NAME = 100
+_MOST_CHANNELS = 4096
 
 
 @dataclass(frozen=True)
 class GraphFile(Strict):
-    """One ONNX file of the bundle."""
+    """One ONNX file of the bundle.
+
+    Raises:
+        ConfigError: the name may lead out of the folder, or the hash is none.
+    """
 
     file: str
     """Name inside the bundle's folder."""
     sha256: str
 
+    def __post_init__(self) -> None:
+        name = self.file
+        if name in ("", ".", "..") or len(name) > _LONGEST_NAME or not name.isprintable() or set(name) & set("/\\:"):
+            raise ConfigError(f"graph {name[:_LONGEST_NAME]!r} is not a file name")
+        if not re.fullmatch("[0-9a-f]{64}", self.sha256):
+            raise ConfigError(f"sha256 {self.sha256[:_LONGEST_NAME]!r} of graph {name} is no SHA-256")
+
 
 @dataclass(frozen=True)
-class Graphs(Strict):
-    """The two networks; the scatter stands between them, in NumPy."""
+class CanvasFormat(Strict):
+    """What backbone.onnx takes for a pseudo-image, and encoder.onnx gives for a pillar.
 
-    encoder: GraphFile
-    backbone: GraphFile
+    Raises:
+        ConfigError: a value that the type cannot hold.
+    """
 
-    @classmethod
-    def of(cls, folder: str | Path) -> "Graphs":
-        """The files encoder.onnx and backbone.onnx as they lie in `folder`."""
-        return cls(*(GraphFile(name, file_sha256(Path(folder) / name)) for name in (ENCODER, BACKBONE)))
+    type: Literal["float32", "uint8"] = "float32"
+    """Of one value; uint8 is in the steps of the quantized graph, which saves it the conversion."""
+    empty: tuple[int, ...] = ()
+    """Value of each channel (C,) where there is no pillar; () stands for zeros. A quantized channel has a zero of its
+    own, because attention makes features negative."""
+
+    def __post_init__(self) -> None:
+        if wrong := [value for value in self.empty if not 0 <= value <= 255]:
+            raise ConfigError(f"canvas.empty holds {str(wrong[0])[:20]}, which is not within 0..255")
+
+
+@dataclass(frozen=True)
+class PillarSection(Strict):
+    """What only bundles of kind pillar have.
+
+    Raises:
+        ConfigError: channels and canvas do not fit each other.
+    """
+
+    cpa: str
+    """Reading of the correlative point attention in the encoder; the runtime need not know, people do."""
+    channels: int
+    """C, features of one pillar."""
+    canvas: CanvasFormat
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.channels <= _MOST_CHANNELS:
+            raise ConfigError(f"channels {str(self.channels)[:20]} must lie between 1 and {_MOST_CHANNELS}")
+        allowed = (self.channels,) if self.canvas.type == "uint8" else (0, self.channels)
+        if len(self.canvas.empty) not in allowed:
+            raise ConfigError(
+                f"canvas.empty holds {len(self.canvas.empty)} values where {self.channels} channels need one each"
+            )
 
 
 @dataclass(frozen=True)
@@ -80,6 +119,8 @@ class Quantization(Strict):
     """How the 8-bit backbone was made, and how far it is from the float one on scans it was not calibrated on."""
 
     calibration_scans: int
+    dropped_scans: int | None
+    """Scans that were not calibrated on because they are among the compared ones; None of a bundle of schema 2."""
     compared_scans: int
     layers: tuple[LayerQuantization, ...]
     logit_rms_error: float
@@ -113,25 +154,26 @@ class Provenance(Strict):
 
 @dataclass(frozen=True)
 class Bundle(Strict):
-    """The contents of bundle.json."""
+    """The contents of bundle.json, but for `pillar.layout`, which follows from `spec`."""
 
     name: str
+    kind: Literal["pillar"]
+    """The family of detectors; the section of that name holds what only this family has."""
     spec: PillarSpec
-    cpa: str
-    """Reading of the correlative point attention in the encoder; the runtime need not know, people do."""
-    channels: int
-    """C, features of one pillar."""
+    pillar: PillarSection
     precision: Literal["float32", "int8"]
-    """What backbone.onnx computes in."""
-    canvas: CanvasFormat
+    """What the slowest graph, backbone.onnx, computes in."""
     backbone_gmac: float
     """Multiply-accumulates of backbone.onnx, 10^9."""
-    graphs: Graphs
+    graphs: Mapping[str, GraphFile]
+    """By name; a pillar detector has PILLAR_GRAPHS."""
     parity: Parity | None
     """None only while the export is still proving it; of a quantized bundle, the float graphs it was made from."""
     quantization: Quantization | None
     """None in float32."""
     expected_input: ExpectedInput
+    expected_input_from: Literal["training", "export"]
+    """The scans that `expected_input` was measured on: those trained on, or those given to the export."""
     provenance: Provenance
     license: str
     schema_version: int = SCHEMA_VERSION
@@ -170,85 +212,3 @@ def find_bundle(bundle: str | Path | None) -> Path:
 def sample_scan_path() -> Path:
     """The simulated scan that comes with the package, KITTI .bin."""
     return Path(str(resources.files("asca_deploy") / "samples" / "street.bin"))
-
-
-def load_bundle(folder: str | Path) -> Bundle:
-    """Read and verify a bundle: schema version, every key, both graphs' SHA-256, the derived layout.
-
-    Raises:
-        BundleError: the bundle is missing, damaged, mixed up with another or made for another version;
-            one line that names the file, the value and the remedy.
-    """
-    manifest = Path(folder) / MANIFEST
-    data = _read_manifest(manifest)
-    layout = data.pop("layout", None)
-    try:
-        bundle = parse(Bundle, data, str(manifest))
-    except AscaError as error:
-        # The grid and the classes check themselves and do not know the file they were read from.
-        where = "" if str(manifest) in str(error) else f"{manifest}: "
-        raise BundleError(f"{where}{error}; {_EXPORT_AGAIN}") from None
-    for graph in (bundle.graphs.encoder, bundle.graphs.backbone):
-        _verify_graph(Path(folder), graph)
-    if differs := difference(layout, layout_of(bundle.spec)):
-        raise BundleError(
-            f"{manifest}: `layout.{differs}` is not what this version derives from `spec`; {_EXPORT_AGAIN}"
-        )
-    return bundle
-
-
-def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
-    """Write bundle.json beside the graphs in `folder`, which must lie there already."""
-    for graph in (bundle.graphs.encoder, bundle.graphs.backbone):
-        _verify_graph(Path(folder), graph)
-    with atomic_path(Path(folder) / MANIFEST) as path:
-        path.write_text(json.dumps(bundle_to_json(bundle), indent=1) + "\n", encoding="utf-8")
-
-
-def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
-    """What bundle.json holds: the bundle's fields, and the `layout` that readers in other languages need."""
-    return {"schema_version": bundle.schema_version, **to_dict(bundle), "layout": layout_of(bundle.spec)}
-
-
-def file_sha256(path: str | Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _read_manifest(manifest: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(manifest.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise BundleError(
-            f"{manifest.parent} is no model bundle, it holds no {MANIFEST}; make one with `asca export`"
-        ) from None
-    except OSError as error:
-        raise BundleError(f"{manifest}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # of the JSON, or of its UTF-8
-        raise BundleError(f"{manifest} is damaged ({error}); {_EXPORT_AGAIN}") from None
-    version = data.get("schema_version") if isinstance(data, dict) else None
-    if type(version) is not int:
-        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {version!r}; {_EXPORT_AGAIN}")
-    if version > SCHEMA_VERSION:
-        raise BundleError(
-            f"{manifest}: schema_version {version} is newer than {SCHEMA_VERSION}, which this version reads; "
-            "upgrade with `pip install --upgrade asca-pillars`"
-        )
-    if version < SCHEMA_VERSION:
-        raise BundleError(f"{manifest}: schema_version {version} is no longer read; {_EXPORT_AGAIN}")
-    return dict(data)
-
-
-def _verify_graph(folder: Path, graph: GraphFile) -> None:
-    path = folder / graph.file
-    if graph.file in ("", ".", "..") or any(mark in graph.file for mark in "/\\:"):
-        raise BundleError(f"{folder / MANIFEST}: graph {graph.file!r} is not a file name; {_EXPORT_AGAIN}")
-    if not path.is_file():
-        raise BundleError(f"{path} is missing; copy the whole folder, or {_EXPORT_AGAIN}")
-    found = file_sha256(path)
-    if found != graph.sha256:
-        raise BundleError(
-            f"{path} is damaged or belongs to another bundle: its SHA-256 is {found[:12]}..., {MANIFEST} says"
-            f" {graph.sha256[:12]}...; copy the whole folder again, or {_EXPORT_AGAIN}"
-        )

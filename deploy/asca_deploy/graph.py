@@ -1,6 +1,6 @@
-"""One ONNX graph of a bundle, checked against what the bundle says of it, on whichever backend runs it."""
+"""What a backend makes of an ONNX graph of a bundle, and whether that is what the bundle says of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -27,32 +27,29 @@ class Session(Protocol):
     def outputs(self) -> Mapping[str, Tensor]:
         """What the graph returns."""
 
-    def run(self, inputs: Mapping[str, NDArray[Any]], outputs: Sequence[str]) -> list[NDArray[Any]]:
-        """The named outputs, in that order; the arrays are the caller's to keep. Several threads may call it."""
+    @property
+    def run(self) -> Callable[[Sequence[str], Mapping[str, NDArray[Any]]], list[NDArray[Any]]]:
+        """(names of outputs, inputs by name) -> these outputs, in that order; the arrays are the caller's to keep.
+
+        Several threads may call it.
+        """
 
 
-class Graph:
-    """A session with known inputs and outputs.
+def check_interface(
+    path: Path, session: Session, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
+) -> Session:
+    """The session, if its graph takes no other inputs than these and returns these outputs.
 
     Raises:
-        BundleError: the graph's inputs and outputs are not the expected ones.
+        BundleError: it does not; names the file, the input or output and the remedy.
     """
-
-    def __init__(
-        self, path: Path, session: Session, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
-    ) -> None:
-        self._session = session
-        self._inputs, self._outputs = list(session.inputs), list(outputs)
-        _compare(path, "input", session.inputs, inputs)
-        found = session.outputs
-        for name in outputs:
-            if name not in found:
-                raise BundleError(f"{path} has no output `{name}`, only {', '.join(found)}; export the bundle again")
-        _compare(path, "output", {name: found[name] for name in outputs}, outputs)
-
-    def run(self, **inputs: NDArray[Any]) -> list[NDArray[Any]]:
-        """Outputs in the order in which they were expected; the arrays are the caller's to keep."""
-        return self._session.run({name: inputs[name] for name in self._inputs}, self._outputs)
+    _compare(path, "input", session.inputs, inputs)
+    found = session.outputs
+    for name in outputs:
+        if name not in found:
+            raise BundleError(f"{path} has no output `{name}`, only {', '.join(found)}; export the bundle again")
+    _compare(path, "output", {name: found[name] for name in outputs}, outputs)
+    return session
 
 
 def _compare(path: Path, kind: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:

@@ -80,7 +80,7 @@ class OpenVinoSession:
             raise BundleError(f"{path}: its outputs have no fixed shapes, which OpenVINO needs; choose provider cpu")
         self._results = [(tuple(port.shape), port.element_type.to_dtype()) for port in model.outputs]
 
-    def run(self, inputs: Mapping[str, NDArray[Any]], outputs: Sequence[str]) -> list[NDArray[Any]]:
+    def run(self, outputs: Sequence[str], inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """See `graph.Session.run`; OpenVINO writes into new arrays, so that nothing is copied."""
         found = [np.empty(shape, kind) for shape, kind in self._results]
         with self._lock:  # a request refuses a second caller, and one network keeps all cores busy

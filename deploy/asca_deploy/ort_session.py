@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,13 +100,10 @@ class OrtSession:
     """
 
     def __init__(self, path: Path, provider: str, precision: str, threads: int) -> None:
-        self._session = _open(path, provider, precision, threads)
-        self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
-        self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
-
-    def run(self, inputs: Mapping[str, NDArray[Any]], outputs: Sequence[str]) -> list[NDArray[Any]]:
-        """See `graph.Session.run`."""
-        return self._session.run(outputs, inputs)
+        session = _open(path, provider, precision, threads)
+        self.inputs = {node.name: _tensor(node) for node in session.get_inputs()}
+        self.outputs = {node.name: _tensor(node) for node in session.get_outputs()}
+        self.run: Callable[[Sequence[str], Mapping[str, NDArray[Any]]], list[NDArray[Any]]] = session.run
 
 
 def _tensor(node: Any) -> Tensor:

@@ -13,14 +13,30 @@ A provider that was asked for and cannot run is an error, never a silent fallbac
 """
 
 from pathlib import Path
+from typing import Literal, get_args
 
 from asca_deploy import openvino_session, ort_session
 from asca_deploy.graph import Session
 from asca_pillars.errors import ProviderError
 
-PRECISIONS = ("float32", "reduced")
-PROVIDERS = (*ort_session.ORT_PROVIDERS, "openvino")
-AUTO = "auto"
+Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
+Precision = Literal["float32", "reduced"]
+
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+PROVIDERS: tuple[Provider, ...] = get_args(Provider)
+AUTO: Literal["auto"] = "auto"
+
+
+def arithmetic(weights: str, precision: str) -> str:
+    """What a network computes in, in words.
+
+    Args:
+        weights: the bundle's own precision, float32 or int8.
+        precision: of the provider; in an int8 bundle it concerns only what the export left in floating point.
+    """
+    if weights == "float32":
+        return precision
+    return weights if precision == "float32" else f"{weights}, rest {precision}"
 
 
 def require(provider: str, precision: str = "float32") -> None:
@@ -38,9 +54,9 @@ def require(provider: str, precision: str = "float32") -> None:
         ort_session.require(provider, precision)
 
 
-def at_hand() -> list[tuple[str, str]]:
+def at_hand() -> list[tuple[Provider, Precision]]:
     """Every (provider, precision) that is installed; the faster precision of a provider first."""
-    found = []
+    found: list[tuple[Provider, Precision]] = []
     for provider in PROVIDERS:
         for precision in reversed(PRECISIONS):
             try:
@@ -51,7 +67,7 @@ def at_hand() -> list[tuple[str, str]]:
     return found
 
 
-def open_session(path: Path, provider: str, precision: str, threads: int) -> Session:
+def open_session(path: Path, provider: Provider, precision: Precision, threads: int) -> Session:
     """Open an ONNX file with a provider and precision that `require` allows.
 
     Raises:

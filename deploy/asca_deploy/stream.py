@@ -2,7 +2,7 @@
 
     caller      decode 1 | decode 2 | decode 3        boxes are handed out
     network       net 2  |  net 3   |  net 4
-    host         scan 3  | scan 4   | scan 5          read, input, pillarize, encode, scatter into the other canvas
+    host         scan 3  | scan 4   | scan 5          read, and prepared on memory of its own
 
 There are more scans per second than one after the other, and each is a little later, for it waits for the one before.
 """
@@ -19,11 +19,11 @@ Result = TypeVar("Result")
 
 def overlapped(
     scans: Iterable[Scan],
-    prepare: Callable[[Scan, int], Ready],
+    prepare: Callable[[Scan], Ready],
     infer: Callable[[Ready], Maps],
     finish: Callable[[Maps], Result],
 ) -> Generator[Result, None, None]:
-    """`finish(infer(prepare(scan, slot)))` of each scan, in order; the three run at once, for different scans.
+    """`finish(infer(prepare(scan)))` of each scan, in order; the three run at once, for different scans.
 
     `scans` is read in a thread of its own, so that reading files or waiting for a sensor overlaps too, and never more
     than one scan ahead of the one that is asked for. Closing the iterator waits for the stages that run, and for the
@@ -31,7 +31,7 @@ def overlapped(
 
     Args:
         scans: read in the host's thread.
-        prepare: runs in the host's thread; may use the memory of `slot`, 0 or 1, until `infer` is done with it.
+        prepare: runs in the host's thread, at most one scan ahead of `infer`.
         infer: runs in the network's thread.
         finish: runs in the caller's thread.
 
@@ -51,12 +51,9 @@ def overlapped(
 class _Ahead(Generic[Scan, Ready, Maps]):
     """Two threads, each of which does its own stage of scan after scan."""
 
-    def __init__(
-        self, scans: Iterable[Scan], prepare: Callable[[Scan, int], Ready], infer: Callable[[Ready], Maps]
-    ) -> None:
+    def __init__(self, scans: Iterable[Scan], prepare: Callable[[Scan], Ready], infer: Callable[[Ready], Maps]) -> None:
         self._scans = iter(scans)
         self._prepare, self._infer = prepare, infer
-        self._read = 0
         self._ended = False
         self._host = ThreadPoolExecutor(1, "asca-host")
         self._network = ThreadPoolExecutor(1, "asca-network")
@@ -81,8 +78,7 @@ class _Ahead(Generic[Scan, Ready, Maps]):
             scan = next(self._scans)
         except StopIteration:
             return ()
-        ready = self._prepare(scan, self._read % 2)
-        self._read += 1
+        ready = self._prepare(scan)
         self._ended = False
         return (ready,)
 

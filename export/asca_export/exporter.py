@@ -8,29 +8,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import (
-    BACKBONE,
-    ENCODER,
-    MANIFEST,
-    SCHEMA_VERSION,
-    Bundle,
-    Graphs,
-    Provenance,
-    write_bundle_manifest,
-)
-from asca_deploy.canvas import CanvasFormat
-from asca_deploy.detector import Detector
-from asca_deploy.input_check import expected_input
-from asca_deploy.layout import layout_of
+from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, Bundle, CanvasFormat, PillarSection, Provenance
+from asca_deploy.manifest import load_bundle, write_bundle_manifest
+from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
 from asca_export.int8 import quantize_bundle
 from asca_export.parity import prove_parity
+from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.schema import to_dict
-from asca_pillars.system import cpu_model, git_revision, package_versions
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.system import cpu_model, default_threads, git_revision, package_versions
 
 MIN_SCANS = 8
 LICENSE = "Apache-2.0"
@@ -54,10 +44,12 @@ def export_bundle(
     Args:
         checkpoint: from `load_checkpoint`.
         out: the bundle's folder.
-        scans: at least MIN_SCANS scans (N, 4) like those trained on; the runtime later warns of scans unlike them.
+        scans: at least MIN_SCANS scans (N, 4), metres, LiDAR frame, and reflectance. If the checkpoint does not say
+            what its training scans looked like, these stand in for them, and the manifest says so.
         trained_on: what the weights have seen, in words, for the manifest.
         command: the command that trained them.
-        calibration: scans, others than `scans`, that set the ranges of an 8-bit bundle.
+        calibration: scans (N, 4) that set the ranges of an 8-bit bundle; those that are among `scans` are left out
+            and counted.
         say: told what is being done.
 
     Raises:
@@ -65,47 +57,41 @@ def export_bundle(
     """
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
-    config, detector, steps = checkpoint
+    config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
+    if not isinstance(detector, PillarDetector):
+        raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
     say("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
-        graphs.export_encoder(detector, folder / ENCODER)
-        graphs.export_backbone(FastBackbone(detector), detector.grid, folder / BACKBONE)
-        essentials = {
-            "schema_version": SCHEMA_VERSION,
-            "name": config.name,
-            "cpa": config.model.network.cpa,
-            "license": LICENSE,
-            "spec": to_dict(config.model.spec),
-            "layout": layout_of(config.model.spec),
-        }
-        for name in (ENCODER, BACKBONE):
-            graphs.stamp(folder / name, essentials)
+        graphs.export_encoder(detector, graphs.graph_path(folder, ENCODER))
+        graphs.export_backbone(FastBackbone(detector), detector.grid, graphs.graph_path(folder, BACKBONE))
         draft = Bundle(
             name=config.name,
+            kind="pillar",
             spec=config.model.spec,
-            cpa=config.model.network.cpa,
-            channels=config.model.network.pillar_channels,
+            pillar=PillarSection(config.model.network.cpa, config.model.network.pillar_channels, CanvasFormat()),
             precision="float32",
-            canvas=CanvasFormat(),
-            backbone_gmac=graphs.multiply_accumulates(folder / BACKBONE) / 1e9,
-            graphs=Graphs.of(folder),
+            backbone_gmac=graphs.multiply_accumulates(graphs.graph_path(folder, BACKBONE)) / 1e9,
+            graphs={},
             parity=None,
             quantization=None,
-            expected_input=expected_input(scans),
+            expected_input=expected or measure_expected_input(scans, config.data.camera_view),
+            expected_input_from="training" if expected else "export",
             provenance=Provenance(
                 command=command,
                 created=datetime.datetime.now(datetime.UTC).date().isoformat(),
                 git_revision=git_revision(),
                 trained_on=trained_on,
                 seed=config.train.seed,
-                steps=steps,
+                steps=checkpoint.steps,
                 versions=package_versions(),
                 machine=cpu_model(),
             ),
             license=LICENSE,
         )
+        draft = graphs.sign(folder, draft)
         write_bundle_manifest(folder, draft)
-        bundle = dataclasses.replace(draft, parity=prove_parity(detector, Detector(folder), scans))
+        pipeline = PillarPipeline(folder, load_bundle(folder), threads=default_threads())
+        bundle = dataclasses.replace(draft, parity=prove_parity(detector, pipeline, scans))
         write_bundle_manifest(folder, bundle)
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, say)

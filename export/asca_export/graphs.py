@@ -1,10 +1,11 @@
 """PyTorch modules -> the two ONNX graphs of a bundle. The scatter between them is not exported: it is an assignment."""
 
+import dataclasses
 import json
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ import torch
 from onnxscript import opset20 as op
 from torch import Tensor, nn
 
+from asca_deploy.bundle import PILLAR_GRAPHS, Bundle
+from asca_deploy.manifest import essentials, graph_files
 from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
@@ -78,18 +81,20 @@ def multiply_accumulates(path: Path) -> int:
     return total
 
 
-def stamp(path: Path, properties: Mapping[str, Any]) -> None:
-    """Write properties into the metadata of a graph, each as JSON, for whoever meets the file alone."""
-    model = onnx.load(path)
-    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in properties.items()})
-    onnx.save(model, path)
+def graph_path(folder: Path, name: str) -> Path:
+    """Where the graph of that name lies in a bundle's folder."""
+    return folder / f"{name}.onnx"
 
 
-def copy_properties(source: Path, target: Path) -> None:
-    """Give `target` the metadata of `source`."""
-    model = onnx.load(target)
-    model.metadata_props.extend(onnx.load(source).metadata_props)
-    onnx.save(model, target)
+def sign(folder: Path, bundle: Bundle) -> Bundle:
+    """Stamp the graphs in `folder` with what they must not be separated from; the bundle with their SHA-256."""
+    properties = {key: json.dumps(value) for key, value in essentials(bundle).items()}
+    for name in PILLAR_GRAPHS:
+        path = graph_path(folder, name)
+        model = onnx.load(path)
+        onnx.helper.set_model_props(model, properties)
+        onnx.save(model, path)
+    return dataclasses.replace(bundle, graphs=graph_files(folder))
 
 
 def _export(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:

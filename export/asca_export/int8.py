@@ -1,6 +1,7 @@
 """A proven float bundle becomes an 8-bit one that says how far it is from it."""
 
 import copy
+import hashlib
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -11,18 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from asca_deploy.bundle import (
-    BACKBONE,
-    ENCODER,
-    Bundle,
-    Graphs,
-    LayerQuantization,
-    Quantization,
-    write_bundle_manifest,
-)
-from asca_deploy.canvas import Canvas, CanvasFormat
+from asca_deploy.bundle import BACKBONE, ENCODER, Bundle, CanvasFormat, LayerQuantization, Quantization
 from asca_deploy.detector import Detector
+from asca_deploy.manifest import write_bundle_manifest
 from asca_deploy.ort_session import OrtSession
+from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
 from asca_export import graphs, qdq
 from asca_export.fast_forms import CanvasSteps, FastBackbone
 from asca_export.parity import COMPARED_ANCHORS
@@ -72,18 +66,23 @@ def quantize_bundle(
     Args:
         folder: a proven float bundle.
         detector: what it was exported from, in evaluation mode.
-        calibration: scans (N, 4) that set the ranges, at least MIN_CALIBRATION of them with points on the grid.
-        scans: others, to measure on.
+        calibration: scans (N, 4) that set the ranges, at least MIN_CALIBRATION of them with points on the grid; those
+            that are among `scans` are left out, or the comparison would be with what it was fitted to.
+        scans: to measure on.
         say: told what is being done.
 
     Raises:
         ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
     """
     runtime = Detector(folder)
-    encoded = [each for each in (_encode(runtime, points) for points in calibration) if len(each.cells)]
+    pipeline, shown = runtime.pipeline, {_digest(points) for points in scans}
+    own = [points for points in calibration if _digest(points) not in shown]
+    encoded = [each for each in (_encode(pipeline, points) for points in own) if len(each.cells)]
     if len(encoded) < MIN_CALIBRATION:
         raise ExportError(
-            f"{len(encoded)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are needed"
+            f"{len(encoded)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are "
+            f"needed; {len(calibration) - len(own)} were left out because parity is proven on them: "
+            "give other scans to --calibrate"
         )
     say("Calibrating")
     steps = canvas_steps(each.features for each in encoded)
@@ -96,27 +95,30 @@ def quantize_bundle(
     round_weights(exact, [], moments)
     round_weights(rounded, layers, moments)
 
-    compared = [_encode(runtime, points) for points in scans]
-    expected = [runtime.neck_and_head(runtime.scatter(*each)) for each in compared]
+    compared = [_encode(pipeline, points) for points in scans]
+    canvas = pipeline.new_canvas()
+    expected = [pipeline.neck_and_head(canvas.scatter(*each)) for each in compared]
     boxes = [runtime(points) for points in scans]
     with tempfile.TemporaryDirectory() as work:
         template, trial = Path(work) / "template.onnx", Path(work) / "trial.onnx"
         graphs.export_backbone(exact, detector.grid, template)
-        graphs.copy_properties(folder / BACKBONE, template)
 
         def error_of(eight_bit: Sequence[str]) -> float:
             qdq.quantize_backbone(template, trial, eight_bit, _parameters(exact, rounded, eight_bit))
             session = OrtSession(trial, "cpu", "float32", runtime.threads)
             canvases = _canvases(compared, bundle, form, steps)
-            logits = (session.run({"canvas": canvas}, ["scores"])[0] for canvas in canvases)
+            logits = (session.run(["scores"], {"canvas": canvas})[0] for canvas in canvases)
             return _logit_error(expected, logits, len(bundle.spec.classes))
 
         found = _sweep(layers, error_of, say)
         eight_bit = [layer for layer in layers if layer not in found.kept_float]
-        qdq.quantize_backbone(template, folder / BACKBONE, eight_bit, _parameters(exact, rounded, eight_bit))
-    qdq.quantize_encoder(folder / ENCODER, steps)
+        qdq.quantize_backbone(
+            template, graphs.graph_path(folder, BACKBONE), eight_bit, _parameters(exact, rounded, eight_bit)
+        )
+    qdq.quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
     report = Quantization(
         calibration_scans=len(encoded),
+        dropped_scans=len(calibration) - len(own),
         compared_scans=len(scans),
         layers=tuple(LayerQuantization(name, found.alone[name], name in found.kept_float) for name in layers),
         logit_rms_error=found.total,
@@ -128,10 +130,10 @@ def quantize_bundle(
         bundle,
         name=f"{bundle.name}_int8",
         precision="int8",
-        canvas=form,
-        graphs=Graphs.of(folder),
+        pillar=replace(bundle.pillar, canvas=form),
         quantization=report,
     )
+    draft = graphs.sign(folder, draft)
     write_bundle_manifest(folder, draft)
     quantized = replace(draft, quantization=_count_boxes(report, boxes, list(map(Detector(folder), scans))))
     write_bundle_manifest(folder, quantized)
@@ -167,16 +169,20 @@ def _count_boxes(report: Quantization, expected: Sequence[Detections], found: Se
     return replace(report, boxes_matched=matched, boxes_added=added)
 
 
-def _encode(runtime: Detector, points: Points) -> _Encoded:
-    pillars = runtime.pillarize(points)
-    return _Encoded(runtime.encode(pillars), pillars.cells)
+def _digest(points: Points) -> bytes:
+    return hashlib.sha256(points.tobytes()).digest()
+
+
+def _encode(pipeline: PillarPipeline, points: Points) -> _Encoded:
+    pillars = pipeline.pillarize(points)
+    return _Encoded(pipeline.encode(pillars), pillars.cells)
 
 
 def _canvases(
     encoded: Sequence[_Encoded], bundle: Bundle, form: CanvasFormat, steps: CanvasSteps
 ) -> Iterator[NDArray[np.uint8]]:
     """The canvas of each scan, valid until the next."""
-    canvas = Canvas(bundle.channels, bundle.spec.grid, form)
+    canvas = Canvas(bundle.pillar.channels, bundle.spec.grid, form)
     scale, empty = steps.scale.numpy(), steps.empty.numpy()
     for features, cells in encoded:
         counted = np.clip(np.round(features / scale + empty), 0, STEPS)

@@ -9,13 +9,14 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
-from asca_deploy.detector import Detector
+from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.models.pillar.pillar_detector import PillarDetector, batch_pillars
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.pillar.pillar_preparation import batch_pillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
@@ -33,7 +34,7 @@ class BoxDifference(NamedTuple):
     yaw_rad: float
 
 
-def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[NDArray[np.float32]]) -> Parity:
+def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Sequence[NDArray[np.float32]]) -> Parity:
     """Compare the PyTorch detector with the exported one.
 
     Args:
@@ -44,7 +45,7 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
     Raises:
         ExportError: they differ; names the first stage that does, and the scan.
     """
-    spec = runtime.spec
+    spec, canvas = runtime.spec, runtime.new_canvas()
     worst_map = worst_box = worst_yaw = 0.0
     for number, points in enumerate(scans):
         pillars = spec.pillarize(points)
@@ -54,13 +55,13 @@ def prove_parity(detector: PillarDetector, runtime: Detector, scans: Sequence[ND
             pseudo_image = detector.scatter(expected_features, batch.cells, batch.frame_pillars)
             expected_maps: Maps = HeadMaps(*(m[0].numpy() for m in detector.head(detector.neck(pseudo_image))))
         features = runtime.encode(pillars)
-        canvas = runtime.scatter(features, pillars.cells)
-        maps = runtime.neck_and_head(canvas)
+        image = canvas.scatter(features, pillars.cells)
+        maps = runtime.neck_and_head(image)
         # Features have no unit, and some readings of the attention sum over thousands of pillars: their scale counts.
         allowed = MAP_TOLERANCE * max(1.0, float(expected_features.abs().max()) if len(expected_features) else 0.0)
         _require_close("encode", expected_features.numpy(), features, allowed, number)
         expected_canvas = np.pad(pseudo_image.numpy().transpose(0, 2, 3, 1), ((0, 0), (1, 0), (1, 0), (0, 0)))
-        _require_close("scatter", expected_canvas, canvas, allowed, number)
+        _require_close("scatter", expected_canvas, image, allowed, number)
         for name, expected, found in zip(HeadMaps._fields, expected_maps, maps, strict=True):
             error = _require_close(f"head `{name}`", expected, found, MAP_TOLERANCE, number)
             worst_map = max(worst_map, error)

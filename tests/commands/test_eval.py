@@ -190,10 +190,12 @@ def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
 def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path, root: Path) -> None:
     torch.manual_seed(0)
     content = to_dict(CONFIG)
-    names = [item["name"] for item in content["detector"]["classes"]]
-    for item, name in zip(content["detector"]["classes"], ("Forklift", "Pallet", "Crane")[: len(names)], strict=True):
+    names = [item["name"] for item in content["model"]["spec"]["classes"]]
+    for item, name in zip(
+        content["model"]["spec"]["classes"], ("Forklift", "Pallet", "Crane")[: len(names)], strict=True
+    ):
         item["name"] = name
-    weights = {f"detector.{name}": value for name, value in build_detector(CONFIG).state_dict().items()}
+    weights = {f"detector.{name}": value for name, value in build_pillar_detector(CONFIG.model).state_dict().items()}
     torch.save(
         {"hyper_parameters": {"config": content}, "state_dict": weights, "global_step": 7}, tmp_path / "last.ckpt"
     )

@@ -1,7 +1,9 @@
 """A tiny bundle made without PyTorch: two small graphs with random weights behind a real bundle.json."""
 
 import importlib.util
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from asca_deploy.bundle import Bundle, Graphs, Provenance, write_bundle_manifest
-from asca_deploy.canvas import CanvasFormat
-from asca_deploy.input_check import ExpectedInput
+from asca_deploy.bundle import Bundle, CanvasFormat, PillarSection, Provenance
+from asca_deploy.manifest import essentials, graph_files, write_bundle_manifest
+from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
@@ -27,7 +29,9 @@ SPEC = PillarSpec(
     grid=PillarGrid(x_range_m=(2.0, 9.68), y_range_m=(-1.28, 2.56), z_range_m=(-3.0, 1.0)),
     limits=PillarLimits(max_pillars=300, max_points=8),
 )
-EXPECTED_INPUT = ExpectedInput(points_per_scan=(900, 1100), reflectance_mean=(0.2, 0.6), ground_z_m=(-1.9, -1.6))
+EXPECTED_INPUT = ExpectedInput(
+    points_per_scan=(900, 1100), reflectance_mean=(0.2, 0.6), ground_z_m=(-1.9, -1.6), camera_view=False
+)
 
 
 def encoder_graph(uses_counts: bool) -> onnx.ModelProto:
@@ -107,21 +111,30 @@ def write_bundle(folder: Path, uses_counts: bool = True) -> Path:
     )
     bundle = Bundle(
         name="tiny",
+        kind="pillar",
         spec=SPEC,
-        cpa="none",
-        channels=CHANNELS,
+        pillar=PillarSection("none", CHANNELS, CanvasFormat()),
         precision="float32",
-        canvas=CanvasFormat(),
         backbone_gmac=0.1,
-        graphs=Graphs.of(folder),
+        graphs={},
         parity=None,
         quantization=None,
         expected_input=EXPECTED_INPUT,
+        expected_input_from="training",
         provenance=provenance,
         license="Apache-2.0",
     )
-    write_bundle_manifest(folder, bundle)
+    sign(folder, bundle)
     return folder
+
+
+def sign(folder: Path, bundle: Bundle) -> None:
+    """Stamp the graphs in `folder` with the essentials of `bundle`, and write it with their SHA-256."""
+    for name in ("encoder.onnx", "backbone.onnx"):
+        model = onnx.load(folder / name)
+        helper.set_model_props(model, {key: json.dumps(value) for key, value in essentials(bundle).items()})
+        onnx.save(model, folder / name)
+    write_bundle_manifest(folder, replace(bundle, graphs=graph_files(folder)))
 
 
 @pytest.fixture(scope="session")

@@ -148,7 +148,7 @@ def test_the_fastest_that_agrees_is_taken() -> None:
     assert "misses a Pedestrian" in found["cuda_reduced"]
     assert "ask for it by name" in found["tensorrt_reduced"] and ("tensorrt", "reduced") not in machine.opened
     assert found["openvino_float32"] == "does not run: no AVX"
-    line = auto.summary(*choice[1:])
+    line = auto.summary(f"{choice.provider} {choice.precision}", choice.candidates)
     assert line.startswith("auto takes cuda float32: cpu float32 70.0 ms agrees; ") and "\n" not in line
 
 
@@ -191,7 +191,7 @@ def test_a_graph_that_the_reference_cannot_run_is_an_error() -> None:
 def test_the_detector_says_what_auto_took(tiny_bundle: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "asca_deploy"):
         detector = Detector(tiny_bundle, provider="auto")
-    assert caplog.messages == [auto.summary(detector.provider, detector.precision, detector.candidates)]
+    assert caplog.messages == [auto.summary(detector.runs_on, detector.candidates)]
     assert (detector.provider, detector.precision) in {(c.provider, c.precision) for c in detector.candidates}
     assert Detector(tiny_bundle).candidates == ()
 

@@ -10,7 +10,8 @@ import torch
 from asca_pillars.config import CpaReading, NetworkConfig
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_pillar_detector
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
+from asca_pillars.models.pillar.pillar_preparation import batch_pillars
 from benchmarks.memory import crops
 from benchmarks.padded import PaddedDetector
 from tests.scenes import make_scene

@@ -1,4 +1,5 @@
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector, load_bundle
-from asca_deploy.frame import STAGES
+from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_pillars.errors import BundleError, ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.pillars.pillarize import PillarCounts
+from tests.deploy.conftest import make_scan
 
 Points = NDArray[np.float32]
 
@@ -56,8 +59,7 @@ def test_stream_yields_in_order(tiny_bundle: Path, scans: list[Points]) -> None:
     detector = Detector(tiny_bundle)
     streamed = []
     for points, detections in zip(scans, detector.stream(iter(scans)), strict=True):
-        assert detector.last_frame is not None
-        assert detector.last_frame.counts.points == len(points)
+        assert detections.report.counts.points == len(points)
         streamed.append(detections)
     assert all(same(a, Detector(tiny_bundle)(p)) for a, p in zip(streamed, scans, strict=True))
 
@@ -68,29 +70,28 @@ def test_no_point_on_the_grid(bundle_without_counts: Path, points: Points) -> No
     detections = detector(points)
     assert len(detections) == 0  # the scores' bias of -3 stays below every threshold on an empty canvas
     assert detections.boxes.shape == (0, 7)
-    assert detector.last_frame is not None
-    assert detector.last_frame.counts.pillars == 0
-    assert detector.last_frame.counts.points_outside == len(points)
+    assert detections.report.counts == PillarCounts(len(points), len(points), 0, 0, 0)
 
 
 def test_one_point(tiny_bundle: Path) -> None:
     detector = Detector(tiny_bundle, score_threshold=0.0)
     point = np.array([[5.0, 0.3, -1.0, 0.5]], np.float32)
-    assert same(detector(point), Detector(tiny_bundle, score_threshold=0.0)(point))
-    assert detector.last_frame is not None
-    assert detector.last_frame.counts.pillars == 1
+    detections = detector(point)
+    assert same(detections, Detector(tiny_bundle, score_threshold=0.0)(point))
+    assert detections.report.counts == PillarCounts(1, 0, 0, 1, 0)
 
 
 def test_two_million_points(tiny_bundle: Path, scan: Points) -> None:
     detector = Detector(tiny_bundle)
-    mostly_far = np.concatenate([scan, np.full((2_000_000 - len(scan), 4), 900.0, np.float32)])
-    assert same(detector(mostly_far), detect_by_hand(tiny_bundle, mostly_far))
-    assert detector.last_frame is not None
-    assert detector.last_frame.counts.points_outside == 2_000_000 - len(scan)
+    mostly_far = np.concatenate([scan, np.full((2_000_000 - len(scan), 4), [900, 900, 900, 0.5], np.float32)])
+    detections = detector(mostly_far)
+    assert same(detections, detect_by_hand(tiny_bundle, mostly_far))
+    assert detections.report.counts.points_outside == 2_000_000 - len(scan)
 
     crowded = np.tile(scan, (2000, 1))
-    assert same(detector(crowded), detect_by_hand(tiny_bundle, crowded))
-    counts = detector.last_frame.counts
+    detections = detector(crowded)
+    assert same(detections, detect_by_hand(tiny_bundle, crowded))
+    counts = detections.report.counts
     limits = detector.spec.limits
     assert counts.points == 2_000_000
     kept = counts.points - counts.points_outside - counts.points_over_limit
@@ -102,18 +103,17 @@ def test_non_finite_points_are_dropped_and_counted(tiny_bundle: Path, scan: Poin
     bad[[0, 1, 2, 3], [0, 1, 2, 3]] = [np.nan, np.inf, -np.inf, np.nan]
     detector = Detector(tiny_bundle)
     clean = detector(scan)
-    assert detector.last_frame is not None
-    assert detector.last_frame.non_finite_points == 0
-    assert same(detector(np.concatenate([bad[:2], scan, bad[2:]])), clean)
-    assert detector.last_frame.non_finite_points == 4
-    assert detector.last_frame.counts.points == len(scan)
+    assert clean.report.non_finite_points == 0
+    repaired = detector(np.concatenate([bad[:2], scan, bad[2:]]))
+    assert same(repaired, clean)
+    assert repaired.report.non_finite_points == 4
+    assert repaired.report.counts.points == len(scan)
 
 
 def test_a_value_beyond_float32_counts_as_non_finite(tiny_bundle: Path) -> None:
     detector = Detector(tiny_bundle)
-    detector(np.array([[1e300, 0.0, 0.0, 0.5], [5.0, 0.0, -1.0, 0.5]]))
-    assert detector.last_frame is not None
-    assert detector.last_frame.non_finite_points == 1
+    detections = detector(np.array([[1e300, 0.0, 0.0, 0.5], [5.0, 0.0, -1.0, 0.5]]))
+    assert detections.report.non_finite_points == 1
 
 
 def test_any_real_array_will_do_and_is_not_changed(tiny_bundle: Path, scan: Points) -> None:
@@ -135,6 +135,11 @@ def test_any_real_array_will_do_and_is_not_changed(tiny_bundle: Path, scan: Poin
         (np.zeros((1, 5, 4)), r"shape \(1, 5, 4\)"),
         (np.array([["a"] * 4]), "not an array of numbers"),
         (None, "shape|not an array of numbers"),
+        ([[10**400, 0, 0, 0]], "not an array of numbers"),
+        ([[1, 2, 3, 4], [1, 2]], "not an array of numbers"),
+        (np.zeros((5, 4), complex), "not an array of numbers, but of type complex128"),
+        (np.zeros((5, 4), "M8[s]"), "not an array of numbers"),
+        (np.ma.masked_equal(np.zeros((5, 4)), 0), "masked array"),
         (np.zeros(3, [("x", "f4"), ("y", "f4")]), "not an array of numbers"),
     ],
 )
@@ -153,7 +158,13 @@ def test_score_threshold_overrides_every_class(tiny_bundle: Path, scan: Points) 
 
 
 @pytest.mark.parametrize(
-    ("options", "name"), [({"score_threshold": 1.5}, "score_threshold 1.5"), ({"threads": 0}, "threads 0")]
+    ("options", "name"),
+    [
+        ({"score_threshold": 1.5}, "score_threshold 1.5"),
+        ({"threads": 0}, "threads 0 must lie between 1 and"),
+        ({"threads": 100_000}, "threads 100000 must lie between 1 and"),
+        ({"threads": 99_999_999_999}, "threads 99999999999 must lie"),
+    ],
 )
 def test_options_out_of_range_are_refused(tiny_bundle: Path, options: dict[str, Any], name: str) -> None:
     with pytest.raises(ConfigError, match=name):
@@ -166,13 +177,10 @@ def test_the_number_of_threads_does_not_change_the_boxes(tiny_bundle: Path, scan
 
 def test_report(tiny_bundle: Path, scan: Points) -> None:
     detector = Detector(tiny_bundle)
-    assert detector.last_frame is None
     assert detector.load_s > 0
-    assert detector.provider == "cpu"
-    detector(scan)
-    report = detector.last_frame
-    assert report is not None
-    assert tuple(report.times_ms) == STAGES
+    assert (detector.provider, detector.runs_on) == ("cpu", "cpu float32")
+    report = detector(scan).report
+    assert tuple(report.times_ms) == ("input", *PillarPipeline.stages)
     assert all(time_ms > 0 for time_ms in report.times_ms.values())
     assert report.total_ms == pytest.approx(sum(report.times_ms.values()))
     assert report.counts == load_bundle(tiny_bundle).spec.pillarize(scan).stats
@@ -188,12 +196,77 @@ def test_odd_scans_are_reported_each_time_and_logged_once(
     scan[:, 3] *= 255
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
-            detector(scan)
-            assert detector.last_frame is not None
-            (warning,) = detector.last_frame.warnings
-            assert "divide it by 255" in warning
-    assert len(caplog.records) == 1
+            warning, repair = detector(scan).report.warnings
+            assert "divide it by 255" in warning and "set to the nearer end" in repair
+    assert len(caplog.records) == 2
     assert "divide it by 255" in caplog.text
+
+
+@pytest.mark.parametrize("reflectance", [1.02, 255.0, 65535.0, 1e10, 3e38, -1e6, -0.01])
+def test_reflectances_outside_the_unit_range_are_clipped_and_counted(
+    tiny_bundle: Path, scan: Points, reflectance: float
+) -> None:
+    detector = Detector(tiny_bundle)
+    odd, clipped = scan.copy(), scan.copy()
+    odd[5, 3], clipped[5, 3] = reflectance, np.clip(reflectance, 0, 1)
+    detections = detector(odd)
+    assert same(detections, detector(clipped))
+    assert detections.report.clipped_reflectances == 1
+    assert any("1 reflectances lie outside 0..1" in warning for warning in detections.report.warnings)
+    assert odd[5, 3] == np.float32(reflectance)  # the caller's array stays as it is
+
+
+@pytest.mark.parametrize("far", [1e5, 1e20, 3e38, -3e38])
+def test_absurd_coordinates_are_outside(tiny_bundle: Path, far: float) -> None:
+    detector, scan = Detector(tiny_bundle), make_scan(0, 150)  # within the limits: no subset is drawn
+    odd = np.concatenate([scan, np.array([[far, far, 0, 0.5], [5, 0, far, 0.5]], np.float32)])
+    detections = detector(odd)
+    assert same(detections, detector(scan))
+    assert detections.report.counts.points_outside == detector(scan).report.counts.points_outside + 2
+
+
+def test_what_is_not_finite_in_the_networks_answer_is_left_out_and_counted(
+    tiny_bundle: Path, scan: Points, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detector = Detector(tiny_bundle)
+    clean = detector(scan)
+    infer = detector.pipeline.infer
+
+    def overflow(*arguments: Any) -> Any:
+        maps = infer(*arguments)
+        maps.scores[0, 0, :3] = np.nan, np.inf, -np.inf
+        best = np.unravel_index(maps.scores[:, 1:].argmax(), maps.scores[:, 1:].shape)
+        maps.boxes[7 * best[0], best[1] + 1, best[2]] = np.nan
+        return maps
+
+    monkeypatch.setattr(detector.pipeline, "infer", overflow)
+    detections = detector(scan)
+    assert detections.report.non_finite_outputs == detections.non_finite == 4
+    assert "not finite at 4 anchors" in detections.report.warnings[-1]
+    assert np.isfinite(detections.boxes).all() and np.isfinite(detections.scores).all()
+    assert not same(detections, clean)
+
+
+def test_one_detector_in_eight_threads_gives_each_its_own_boxes(tiny_bundle: Path) -> None:
+    detector = Detector(tiny_bundle)
+    scans = [make_scan(seed, 400 + 60 * seed) for seed in range(10)]
+    expected = [detector(points) for points in scans]
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(detector, scans * 20))
+    for detections, alone in zip(found, expected * 20, strict=True):
+        assert same(detections, alone)
+        assert detections.report.counts == alone.report.counts
+
+
+def test_the_points_are_remembered_as_long_as_the_caller_keeps_them(tiny_bundle: Path) -> None:
+    points = make_scan()
+    detections = Detector(tiny_bundle)(points)
+    assert detections._repr_png_() is not None and "<img" in detections._repr_html_()
+    with_points = detections.plot()
+    np.testing.assert_array_equal(detections.plot(points), with_points)
+    del points
+    assert detections._repr_png_() is None and "<img" not in detections._repr_html_()
+    assert detections.plot().shape[2] == 3 and not np.array_equal(detections.plot(), with_points)
 
 
 def test_only_declared_inputs_are_fed(tiny_bundle: Path, bundle_without_counts: Path, scan: Points) -> None:

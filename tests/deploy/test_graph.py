@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.bundle import Graphs, load_bundle, write_bundle_manifest
+from asca_deploy.manifest import load_bundle
 from asca_pillars.errors import BundleError
-from tests.deploy.conftest import needs_openvino
+from tests.deploy.conftest import needs_openvino, sign
 
 by_provider = pytest.mark.parametrize("provider", ["cpu", pytest.param("openvino", marks=needs_openvino)])
 
@@ -21,7 +21,7 @@ def respoil(bundle: Path, graph: str, spoil: Callable[[onnx.ModelProto], None]) 
     model = onnx.load(bundle / graph)
     spoil(model)
     onnx.save(model, bundle / graph)
-    write_bundle_manifest(bundle, replace(good, graphs=Graphs.of(bundle)))
+    sign(bundle, good)
     return bundle
 
 
@@ -75,10 +75,10 @@ def test_outputs_are_found_by_name_not_by_order(
 def test_graphs_of_another_model(bundle_copy: Path, field: str, value: float, message: str) -> None:
     good = load_bundle(bundle_copy)
     if field == "channels":
-        other = replace(good, channels=int(value))
+        other = replace(good, pillar=replace(good.pillar, channels=int(value)))
     else:
         other = replace(good, spec=replace(good.spec, grid=replace(good.spec.grid, x_range_m=(2.0, value))))
-    write_bundle_manifest(bundle_copy, other)
+    sign(bundle_copy, other)
     with pytest.raises(BundleError, match=message) as caught:
         Detector(bundle_copy)
     assert "\n" not in str(caught.value)
@@ -87,7 +87,7 @@ def test_graphs_of_another_model(bundle_copy: Path, field: str, value: float, me
 @by_provider
 def test_fewer_classes_than_the_head(bundle_copy: Path, provider: str) -> None:
     good = load_bundle(bundle_copy)
-    write_bundle_manifest(bundle_copy, replace(good, spec=replace(good.spec, classes=good.spec.classes[:1])))
+    sign(bundle_copy, replace(good, spec=replace(good.spec, classes=good.spec.classes[:1])))
     with pytest.raises(BundleError, match=r"output `scores` is .*\(1, 12, 28, 6\).*needs .*\(1, 12, 28, 2\)"):
         Detector(bundle_copy, provider=provider)
 

@@ -37,9 +37,9 @@ def maps_and_boxes(
     """Of the sample scan by a bundle that ships, in OpenVINO; None for the stock CPU."""
     where = {} if precision is None else {"provider": "openvino", "precision": precision}
     detector = Detector(bundle, **where)  # type: ignore[arg-type]
-    pillars = detector.pillarize(read_scan(sample_scan_path()).points)
-    maps = detector.neck_and_head(detector.scatter(detector.encode(pillars), pillars.cells))
-    return maps, detector.decode(maps), detector
+    pipeline = detector.pipeline
+    maps = pipeline.infer(pipeline.prepare(read_scan(sample_scan_path()).points, []), [])
+    return maps, pipeline.finish(maps, []), detector
 
 
 def test_float32_is_what_the_stock_cpu_computes() -> None:

@@ -31,24 +31,22 @@ def test_the_same_boxes_and_counters_as_one_by_one(tiny_bundle: Path) -> None:
     detector, alone = Detector(tiny_bundle), Detector(tiny_bundle)
     streamed = 0
     for points, detections in zip(scans, detector.stream(iter(scans)), strict=True):
-        assert same(detections, alone(points))
-        assert detector.last_frame is not None and alone.last_frame is not None
-        assert detector.last_frame.counts == alone.last_frame.counts
-        assert detector.last_frame.warnings == alone.last_frame.warnings
+        expected = alone(points)
+        assert same(detections, expected)
+        assert detections.report.counts == expected.report.counts
+        assert detections.report.warnings == expected.report.warnings
         streamed += len(detections)
     assert streamed > 10
 
 
 def test_latency_includes_the_waiting(tiny_bundle: Path, scans: list[Points]) -> None:
     detector = Detector(tiny_bundle)
-    for _ in detector.stream(scans):
-        frame = detector.last_frame
-        assert frame is not None
+    for detections in detector.stream(scans):
+        frame = detections.report
         assert all(time_ms > 0 for time_ms in frame.times_ms.values())
         assert frame.waiting_ms > 0
         assert frame.total_ms == pytest.approx(sum(frame.times_ms.values()) + frame.waiting_ms)
-    detector(scans[0])
-    assert detector.last_frame is not None and detector.last_frame.waiting_ms == 0
+    assert detector(scans[0]).report.waiting_ms == 0
 
 
 def test_no_scans_no_detections(tiny_bundle: Path) -> None:
@@ -108,21 +106,21 @@ def test_a_scan_of_the_wrong_shape_comes_in_its_place(tiny_bundle: Path, scan: P
     assert len(list(detector.stream([scan, scan]))) == 2
 
 
-@pytest.mark.parametrize("stage", ["neck_and_head", "decode"])
+@pytest.mark.parametrize("stage", ["infer", "finish"])
 def test_a_stage_that_fails_ends_the_stream_there(
     tiny_bundle: Path, scan: Points, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
     detector = Detector(tiny_bundle)
-    works: Callable[..., object] = getattr(detector, stage)
+    works: Callable[..., object] = getattr(detector.pipeline, stage)
     calls: list[int] = []
 
-    def fails_the_second_time(argument: object) -> object:
+    def fails_the_second_time(*arguments: object) -> object:
         calls.append(1)
         if len(calls) == 2:
             raise RuntimeError("broken")
-        return works(argument)
+        return works(*arguments)
 
-    monkeypatch.setattr(detector, stage, fails_the_second_time)
+    monkeypatch.setattr(detector.pipeline, stage, fails_the_second_time)
     results = detector.stream([scan] * 4)
     next(results)
     with pytest.raises(RuntimeError, match="broken"):
@@ -152,37 +150,21 @@ def test_a_call_between_two_scans_of_a_stream_disturbs_neither(tiny_bundle: Path
 
 def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     detector, scans = Detector(tiny_bundle), [make_scan(seed, 50 + 20 * seed) for seed in range(5)]
-    canvases: list[object] = []
     images = set()
-    new_canvas, neck_and_head = detector._new_canvas, detector.neck_and_head
-    monkeypatch.setattr(detector, "_new_canvas", lambda: canvases.append(None) or new_canvas())
-    monkeypatch.setattr(detector, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image))
+    neck_and_head = detector.pipeline.neck_and_head
+    monkeypatch.setattr(
+        detector.pipeline, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image)
+    )
     most_threads = 0
     for _ in detector.stream(scans[number % 5] for number in range(300)):
         most_threads = max(most_threads, threading.active_count())
-    assert len(canvases) == len(images) == 2
+    assert len(images) <= 2
     assert most_threads <= threading.active_count() + 2
 
 
 def test_stop_iteration_out_of_a_stage_is_an_error_and_no_end() -> None:
-    def prepare(scan: int, slot: int) -> int:
+    def prepare(scan: int) -> int:
         raise StopIteration
 
     with pytest.raises(RuntimeError):
         list(overlapped([1, 2], prepare, infer=abs, finish=abs))
-
-
-def test_slots_alternate_and_are_free_when_they_are_used_again() -> None:
-    busy: dict[int, int] = {}
-
-    def prepare(scan: int, slot: int) -> tuple[int, int]:
-        assert slot not in busy
-        busy[slot] = scan
-        return scan, slot
-
-    def infer(ready: tuple[int, int]) -> int:
-        scan, slot = ready
-        assert busy.pop(slot) == scan
-        return scan
-
-    assert list(overlapped(range(200), prepare, infer, finish=lambda scan: scan)) == list(range(200))

@@ -31,7 +31,7 @@ def test_bundle_is_the_same_detector(tmp_path: Path, cpa: str) -> None:
     checkpoint = tiny_checkpoint(cpa)
     bundle = export_bundle(checkpoint, tmp_path / "bundle", SCANS, trained_on="nothing", command="none")
     assert load_bundle(tmp_path / "bundle") == bundle
-    assert bundle.spec == SPEC and bundle.cpa == cpa and bundle.provenance.steps == 0
+    assert bundle.spec == SPEC and bundle.pillar.cpa == cpa and bundle.provenance.steps == 0
     parity = bundle.parity
     assert parity is not None and parity.scans == len(SCANS)
     assert 0 < parity.head_maps_max_abs_error <= MAP_TOLERANCE
@@ -68,13 +68,13 @@ def test_graphs_carry_the_contract(tmp_path: Path) -> None:
 def test_encoder_gives_the_same_features_every_time(tmp_path: Path) -> None:
     """onnxruntime's threads race for the repeated indices of ScatterND: the runtime has to keep them out."""
     export_bundle(tiny_checkpoint("none"), tmp_path, SCANS)
-    detector = Detector(tmp_path, threads=2)
+    pipeline = Detector(tmp_path, threads=2).pipeline
     rng = np.random.default_rng(0)
     points = rng.uniform((5, -6, -2, 0), (25, 7, 0, 1), (12000, 4)).astype(np.float32)
-    pillars = detector.pillarize(points)
+    pillars = pipeline.pillarize(points)
     assert pillars.point_counts.max() > 4  # indices repeat
-    first = detector.encode(pillars).copy()
-    assert all(np.array_equal(detector.encode(pillars), first) for _ in range(300))
+    first = pipeline.encode(pillars).copy()
+    assert all(np.array_equal(pipeline.encode(pillars), first) for _ in range(300))
 
 
 def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(

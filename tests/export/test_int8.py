@@ -37,9 +37,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_bundle_says_what_it_is(folder: Path) -> None:
     bundle = load_bundle(folder)
-    assert (bundle.name, bundle.precision, bundle.canvas.type) == ("tiny_int8", "int8", "uint8")
-    assert len(bundle.canvas.empty) == bundle.channels
-    assert any(bundle.canvas.empty), "attention makes features negative, so zero is not the lowest step"
+    assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny_int8", "int8", "uint8")
+    assert len(bundle.pillar.canvas.empty) == bundle.pillar.channels
+    assert any(bundle.pillar.canvas.empty), "attention makes features negative, so zero is not the lowest step"
     report = bundle.quantization
     assert report is not None and bundle.parity is not None
     assert (report.calibration_scans, report.compared_scans) == (8, 8)
@@ -47,7 +47,7 @@ def test_the_bundle_says_what_it_is(folder: Path) -> None:
     assert 0 < report.logit_rms_error <= int8.MAX_LOGIT_ERROR
     assert report.boxes > 20 and report.boxes_matched > 0.9 * report.boxes
     properties = [item.key for item in onnx.load(folder / "backbone.onnx").metadata_props]
-    assert {"spec", "layout", "license"} <= set(properties)
+    assert {"spec", "pillar", "license"} <= set(properties)
 
 
 def test_weights_are_7_bits_and_multiplications_8(folder: Path) -> None:
@@ -67,9 +67,8 @@ def test_onnxruntime_computes_what_the_graph_says(folder: Path) -> None:
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     plain = onnxruntime.InferenceSession(folder / "backbone.onnx", options, providers=["CPUExecutionProvider"])
     for points in SCANS[:3]:
-        pillars = detector.pillarize(points)
-        canvas = detector.scatter(detector.encode(pillars), pillars.cells)
-        fast = detector.neck_and_head(canvas)
+        canvas = detector.pipeline.prepare(points, []).canvas.image
+        fast = detector.pipeline.neck_and_head(canvas)
         for name, maps in zip(("scores", "boxes", "directions"), fast, strict=True):
             (expected,) = plain.run([name], {"canvas": canvas})
             error = np.abs(np.moveaxis(expected[0], -1, 0) - maps)

@@ -16,8 +16,9 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.targets import assign_targets
+from asca_pillars.models.pillar.pillar_preparation import PillarPreparation, PreparedPillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.training.dataset import Batch, KittiDataset, Sample
+from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
 
 CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(train_set="train", val_set="val", workers=0))
@@ -118,45 +119,45 @@ def test_a_frame_without_points_or_labels(tmp_path: Path) -> None:
     assert frame.boxes.shape == (0, 7) and frame.labels.shape == (0,) and len(frame.points) > 0
     one_frame(tmp_path, ("Car", "Pedestrian"))
     write_scan(split.scan_path("000000"), np.array([[-9, 0, 0, 0.5]], np.float32))  # behind the camera
-    sample = KittiDataset(tmp_path, with_data(train_set="val"), training=True)[0, 0]
-    assert len(sample.pillars.cells) == len(sample.targets.positives) == 0
+    sample = open_dataset(tmp_path, with_data(train_set="val"), training=True).sample(0, 0)
+    assert len(sample.prepared.pillars.cells) == len(sample.prepared.targets.positives) == 0
     frame = read(split, CONFIG)
     assert frame.points.shape == (0, 4) and frame.labels.tolist() == [IGNORED, IGNORED]
 
 
 def test_lists_and_modes(tmp_path: Path) -> None:
     root = write_dataset(tmp_path, 5, val_frames=2)
-    training, validation = (KittiDataset(root, CONFIG, training=training) for training in (True, False))
+    training, validation = (open_dataset(root, CONFIG, training=training) for training in (True, False))
     assert training.frame_ids == ("000000", "000001", "000002") and len(training) == 3
     assert validation.frame_ids == ("000003", "000004") and len(validation) == 2
     write_image_set(root, "few", ["000001"])
-    assert KittiDataset(root, with_data(train_set="few"), training=True).frame_ids == ("000001",)
+    assert open_dataset(root, with_data(train_set="few"), training=True).frame_ids == ("000001",)
 
 
 def test_validation_samples_are_not_augmented(tmp_path: Path) -> None:
-    frames = KittiDataset(write_dataset(tmp_path, 3, val_frames=2), CONFIG, training=False)
+    frames = open_dataset(write_dataset(tmp_path, 3, val_frames=2), CONFIG, training=False)
     plain = read(frames.split, CONFIG, "000002")
     for epoch in (0, 5):
-        sample = frames[epoch, 1]
+        sample = frames.sample(epoch, 1)
         assert np.array_equal(sample.frame.points, plain.points) and np.array_equal(sample.frame.boxes, plain.boxes)
-        assert np.array_equal(sample.pillars.features, SPEC.pillarize(plain.points).features)
+        assert np.array_equal(sample.prepared.pillars.features, SPEC.pillarize(plain.points).features)
 
 
 def test_training_samples_change_with_seed_and_epoch_together_with_their_targets(tmp_path: Path) -> None:
     root = write_dataset(tmp_path, 3)
-    frames = KittiDataset(root, CONFIG, training=True)
+    frames = open_dataset(root, CONFIG, training=True)
     reseeded = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, seed=1))
-    other_seed = KittiDataset(root, reseeded, training=True)
-    samples = [frames[0, 0], frames[1, 0], other_seed[0, 0]]
+    other_seed = open_dataset(root, reseeded, training=True)
+    samples = [frames.sample(0, 0), frames.sample(1, 0), other_seed.sample(0, 0)]
     boxes = [sample.frame.boxes for sample in samples]
     assert not any(np.array_equal(boxes[i], boxes[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
     for sample in samples:
         expected = assign_targets(SPEC.anchors, SPEC.classes, sample.frame.boxes, sample.frame.labels)
-        for found, wanted in zip(vars(sample.targets).values(), vars(expected).values(), strict=True):
+        for found, wanted in zip(vars(sample.prepared.targets).values(), vars(expected).values(), strict=True):
             assert np.array_equal(found, wanted)
         inside = SPEC.grid.cells(sample.frame.points) >= 0
-        assert sample.pillars.stats.points == len(sample.frame.points)
-        assert sample.pillars.stats.points_outside == (~inside).sum()
+        assert sample.prepared.pillars.stats.points == len(sample.frame.points)
+        assert sample.prepared.pillars.stats.points_outside == (~inside).sum()
 
 
 def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
@@ -166,35 +167,48 @@ def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
         flip_probability=0.0, rotation_rad=0.0, scale=(1.0, 1.0), object_rotation_rad=0.0, object_shift_m=0.0
     )
     config = dataclasses.replace(CONFIG, model=PillarModel(spec=tight), augment=still)
-    frames = KittiDataset(write_dataset(tmp_path, 2), config, training=True)
-    first, second = frames[0, 0], frames[1, 0]
+    frames = open_dataset(write_dataset(tmp_path, 2), config, training=True)
+    first, second = frames.sample(0, 0), frames.sample(1, 0)
     assert np.array_equal(first.frame.points, second.frame.points)
-    assert len(first.pillars.cells) == 50 and not np.array_equal(first.pillars.cells, second.pillars.cells)
+    assert len(first.prepared.pillars.cells) == 50 and not np.array_equal(
+        first.prepared.pillars.cells, second.prepared.pillars.cells
+    )
 
 
 def samples(root: Path) -> list[Sample]:
     """Three frames of different size; the one in the middle has no points and nothing to find."""
-    frames = KittiDataset(write_dataset(root, 3, val_frames=2), CONFIG, training=False)
+    frames = open_dataset(write_dataset(root, 3, val_frames=2), CONFIG, training=False)
     no_points, no_boxes = np.empty((0, 4), np.float32), np.empty((0, 7), np.float32)
     empty = LabeledFrame("none", no_points, no_boxes, np.empty(0, np.int64))
     nothing = assign_targets(SPEC.anchors, SPEC.classes, empty.boxes, empty.labels)
-    return [frames[0, 0], Sample(empty, SPEC.pillarize(empty.points), nothing), frames[0, 1]]
+    return [
+        frames.sample(0, 0),
+        Sample(empty, PreparedPillars(SPEC.pillarize(empty.points), nothing)),
+        frames.sample(0, 1),
+    ]
+
+
+def collated(chosen: list[Sample]) -> Batch:
+    batch = Collate(PillarPreparation(SPEC))(chosen)
+    assert isinstance(batch, Batch)
+    return batch
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (0, 2, 1), (1,), (2,)])
 def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> None:
     all_samples = samples(tmp_path)
     chosen = [all_samples[i] for i in order]
-    batch = Batch(chosen)
+    batch = collated(chosen)
+    pillar_batch, target_batch = batch.inputs
     assert batch.frame_ids == [sample.frame.frame_id for sample in chosen]
     assert all(boxes is sample.frame.boxes for boxes, sample in zip(batch.boxes, chosen, strict=True))
     assert all(labels is sample.frame.labels for labels, sample in zip(batch.labels, chosen, strict=True))
 
-    features, pillar_index, point_counts, cells, frame_pillars = batch.pillars
-    assert list(frame_pillars) == [len(sample.pillars.cells) for sample in chosen]
+    features, pillar_index, point_counts, cells, frame_pillars = pillar_batch
+    assert list(frame_pillars) == [len(sample.prepared.pillars.cells) for sample in chosen]
     first_pillar = first_point = first_positive = 0
     for i, sample in enumerate(chosen):
-        pillars, targets = sample.pillars, sample.targets
+        pillars, targets = sample.prepared.pillars, sample.prepared.targets
         own_pillars = slice(first_pillar, first_pillar + len(pillars.cells))
         own_points = slice(first_point, first_point + len(pillars.features))
         assert np.array_equal(features[own_points], pillars.features)
@@ -204,25 +218,25 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
         first_pillar, first_point = own_pillars.stop, own_points.stop
 
         own_positives = slice(first_positive, first_positive + len(targets.positives))
-        assert np.array_equal(batch.targets.state[i], targets.state)
-        assert np.array_equal(batch.targets.residuals[own_positives], targets.residuals)
-        assert np.array_equal(batch.targets.directions[own_positives], targets.directions)
+        assert np.array_equal(target_batch.state[i], targets.state)
+        assert np.array_equal(target_batch.residuals[own_positives], targets.residuals)
+        assert np.array_equal(target_batch.directions[own_positives], targets.directions)
         first_positive = own_positives.stop
-    assert (len(cells), len(features), len(batch.targets.positives)) == (first_pillar, first_point, first_positive)
+    assert (len(cells), len(features), len(target_batch.positives)) == (first_pillar, first_point, first_positive)
     # Counted through (B, H, W, A) they are exactly the positives of the stacked states.
-    assert np.array_equal(batch.targets.positives, np.flatnonzero(batch.targets.state.numpy() == 1))
+    assert np.array_equal(target_batch.positives, np.flatnonzero(target_batch.state.numpy() == 1))
     # Points and pillars agree: each pillar is pointed at as often as it says.
     assert np.array_equal(np.bincount(pillar_index, minlength=len(cells)), point_counts)
-    types = [tensor.dtype for tensor in (features, pillar_index, cells, batch.targets.state, batch.targets.positives)]
+    types = [tensor.dtype for tensor in (features, pillar_index, cells, target_batch.state, target_batch.positives)]
     assert types == [torch.float32, torch.int64, torch.int64, torch.int8, torch.int64]
 
 
 def test_a_batch_moves_as_a_whole(tmp_path: Path) -> None:
-    batch = Batch(samples(tmp_path))
-    frame_pillars = list(batch.pillars.frame_pillars)
+    batch = collated(samples(tmp_path))
+    frame_pillars = list(batch.inputs.pillars.frame_pillars)
     assert batch.to("meta") is batch
-    *tensors, found = batch.pillars
-    assert {tensor.device.type for tensor in (*tensors, *batch.targets)} == {"meta"}
+    *tensors, found = batch.inputs.pillars
+    assert {tensor.device.type for tensor in (*tensors, *batch.inputs.targets)} == {"meta"}
     assert list(found) == frame_pillars and isinstance(batch.boxes[0], np.ndarray)
 
 
@@ -246,5 +260,5 @@ def test_what_is_missing_or_damaged_is_named(
     root = write_dataset(tmp_path, 3)
     damage(KittiSplit(root))
     with pytest.raises(DatasetError, match=message) as caught:
-        _ = KittiDataset(root, CONFIG, training=True)[0, 0]
+        _ = open_dataset(root, CONFIG, training=True).sample(0, 0)
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)

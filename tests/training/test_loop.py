@@ -14,16 +14,18 @@ import torch
 import yaml
 
 from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, PillarModel, TrainConfig
-from asca_pillars.errors import TrainingError
+from asca_pillars.data.expected_input import ExpectedInput
+from asca_pillars.errors import ScanError, TrainingError
 from asca_pillars.evaluation.recall import RecallTally
-from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.pillar.loss import detection_loss
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.schema import to_dict
-from asca_pillars.training.dataset import Batch, KittiDataset
-from asca_pillars.training.loop import DetectionModule, train
-from tests.scenes import SPEC, write_dataset
+from asca_pillars.training.callbacks import TrainingInterruptedError
+from asca_pillars.training.dataset import Batch, Collate, open_dataset
+from asca_pillars.training.loop import train
+from asca_pillars.training.module import DetectionModule
+from asca_pillars.training.run_folder import claim
+from tests.scenes import GROUND_Z_M, SPEC, write_dataset
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
 CONFIG = Config(
@@ -39,22 +41,21 @@ def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: str) -> None:
     torch.manual_seed(0)
     model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa=cpa))
     config = dataclasses.replace(CONFIG, model=model, data=DataConfig(train_set="val", workers=0))
-    frames = KittiDataset(write_dataset(tmp_path, 2, val_frames=2), config, training=False)
-    batch = Batch([frames[0, 0], frames[0, 1]])
+    frames = open_dataset(write_dataset(tmp_path, 2, val_frames=2), config, training=False)
+    batch = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
     assert sum(len(boxes) for boxes in batch.boxes) == 8
-    detector = build_pillar_detector(config.model)
+    detector = build_model(config.model)
     optimizer = torch.optim.Adam(detector.parameters(), lr=3e-3)
     for _ in range(150):
         optimizer.zero_grad()
-        detection_loss(detector(batch.pillars), batch.targets, config.model.loss).total.backward()
+        sum(detector.loss(detector.predict(batch.inputs), batch.inputs).values()).backward()
         optimizer.step()
     tally = RecallTally(SPEC.class_names)
     # Running statistics of the normalization lag behind so few steps: judge with those of the batch.
     with torch.no_grad():
-        maps = detector(batch.pillars)
-    for frame in range(2):
-        detections = SPEC.decode(HeadMaps(*(part[frame].numpy() for part in maps)))
-        tally.add(detections, batch.boxes[frame], batch.labels[frame])
+        found = detector.detect(detector.predict(batch.inputs), SPEC)
+    for detections, boxes, labels in zip(found, batch.boxes, batch.labels, strict=True):
+        tally.add(detections, boxes, labels)
     for name, row in tally.rows().items():
         assert (row.recall, row.false) == (1.0, 0), f"{name}: {row}"
 
@@ -64,17 +65,29 @@ def test_run_folder_and_checkpoint(tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert yaml.safe_load((run / "config.yaml").read_text()) == to_dict(CONFIG)
     assert "torch" in (run / "environment.json").read_text()
-    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last.ckpt", "best.ckpt"}
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {
+        "last.ckpt",
+        "previous.ckpt",
+        "best.ckpt",
+        "weights.ckpt",
+    }
     assert list((run / "tensorboard").glob("events*"))
     checkpoint = load_checkpoint(last)
+    assert checkpoint.expected_input is not None and checkpoint.expected_input.camera_view
+    assert checkpoint.expected_input.ground_z_m == pytest.approx((GROUND_Z_M, GROUND_Z_M), abs=0.01)
+    assert load_checkpoint(last.with_name("weights.ckpt")).expected_input == checkpoint.expected_input
     assert checkpoint.config == CONFIG and checkpoint.steps == 4 and not checkpoint.detector.training
 
 
 def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 3)
-    train(dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1)), data, tmp_path / "run")
-    with pytest.raises(TrainingError, match=r"train\.epochs = 1, now train\.epochs = 2"):
-        train(CONFIG, data, tmp_path / "run")
+    claim(tmp_path / "run", CONFIG)
+    with pytest.raises(TrainingError, match=r"config\.yaml: .* train\.seed = 0, now train\.seed = 1; choose another"):
+        train(with_train(seed=1), data, tmp_path / "run")
+
+
+def with_train(**changes: object) -> Config:
+    return dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, **changes))  # type: ignore[arg-type]
 
 
 def test_a_run_of_an_older_version_goes_on(tmp_path: Path) -> None:
@@ -106,6 +119,61 @@ def test_a_run_can_start_from_other_weights(tmp_path: Path) -> None:
 def test_devices_that_do_not_exist_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="devices many x 1 nodes"):
         train(CONFIG, write_dataset(tmp_path / "data", 3), tmp_path / "run", devices="many")
+
+
+@pytest.mark.parametrize("ema", [0.0, 0.9])
+def test_a_longer_run_is_a_finished_run_made_longer(tmp_path: Path, ema: float) -> None:
+    """Also from before the last checkpoint, which was cut short, and with an average of the weights."""
+    data = write_dataset(tmp_path / "data", 5)
+    config = with_train(epochs=1, learning_rate=1e-2, decay_epochs=1, ema=ema)
+    longer = with_train(epochs=2, learning_rate=1e-2, decay_epochs=1, ema=ema)
+    unbroken = load_checkpoint(train(longer, data, tmp_path / "unbroken"))
+    last = train(config, data, tmp_path / "run")
+    last.write_bytes(last.read_bytes()[:1000])
+    resumed = load_checkpoint(train(longer, data, tmp_path / "run"))
+    assert resumed.steps == unbroken.steps == 4
+    for (name, expected), found in zip(
+        unbroken.detector.state_dict().items(), resumed.detector.state_dict().values(), strict=True
+    ):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, msg=name)
+    content = torch.load(last, weights_only=True)
+    assert ("current_model_state" in content) == (ema > 0)
+    if ema:
+        own = content["current_model_state"]["detector.head.scores.weight"]
+        assert not torch.equal(own, content["state_dict"]["detector.head.scores.weight"])
+
+
+def test_a_damaged_scan_is_one_line_from_a_loader_process(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 5)
+    scan = data / "training" / "velodyne" / "000001.bin"
+    scan.write_bytes(b"x" * 33)
+    frames = open_dataset(data, CONFIG, training=True)
+    assert str(scan) in str(Collate(frames.preparation)([frames[0, 0], frames[0, 1]]))
+    config = dataclasses.replace(CONFIG, data=DataConfig(workers=1))
+    claim(tmp_path / "run", config)
+    measured = ExpectedInput((1, 2), (0.1, 0.2), None, camera_view=True)
+    (tmp_path / "run" / "expected_input.yaml").write_text(yaml.safe_dump(to_dict(measured)))
+    with pytest.raises(ScanError, match=r"000001\.bin") as caught:
+        train(config, data, tmp_path / "run")
+    assert "\n" not in str(caught.value)
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = write_dataset(tmp_path / "data", 7)
+    config = with_train(epochs=1, checkpoint_steps=1000)
+    step = DetectionModule.training_step
+
+    def interrupted(self: DetectionModule, batch: Batch, number: int) -> torch.Tensor:
+        if self.global_step == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, batch, number)
+
+    monkeypatch.setattr(DetectionModule, "training_step", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(TrainingInterruptedError, match="saved at step 2; the same command goes on"):
+        train(config, data, tmp_path / "run")
+    assert signal.getsignal(signal.SIGINT) is before
+    assert load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").steps == 2
 
 
 def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
@@ -145,21 +213,21 @@ def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
 
 
 def test_the_first_loss_that_is_not_finite_stops_and_names_term_and_frames(tmp_path: Path) -> None:
-    frames = KittiDataset(write_dataset(tmp_path, 4), CONFIG, training=True)
+    frames = open_dataset(write_dataset(tmp_path, 4), CONFIG, training=True)
     module = DetectionModule(CONFIG)
     with torch.no_grad():
         module.detector.head.boxes.bias.fill_(float("nan"))
     with pytest.raises(TrainingError, match=r"loss term `box` became nan .* frames 000001, 000000"):
-        module.training_step(Batch([frames[0, 1], frames[0, 0]]), 0)
+        module.training_step(Collate(frames.preparation)([frames.sample(0, 1), frames.sample(0, 0)]), 0)
 
 
 def test_samples_do_not_depend_on_what_was_drawn_before(tmp_path: Path) -> None:
-    frames = KittiDataset(write_dataset(tmp_path, 4), CONFIG, training=True)
-    first = frames[3, 1]
-    _ = frames[3, 2], frames[4, 1]
-    again = frames[3, 1]
-    assert np.array_equal(first.pillars.features, again.pillars.features)
-    assert not np.array_equal(frames[4, 1].frame.points[:50], first.frame.points[:50])
+    frames = open_dataset(write_dataset(tmp_path, 4), CONFIG, training=True)
+    first = frames.sample(3, 1)
+    _ = frames.sample(3, 2), frames.sample(4, 1)
+    again = frames.sample(3, 1)
+    assert np.array_equal(first.prepared.pillars.features, again.prepared.pillars.features)
+    assert not np.array_equal(frames.sample(4, 1).frame.points[:50], first.frame.points[:50])
 
 
 def test_two_processes_train_together(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.config import Config, InsertConfig
+from asca_pillars.config import DataConfig, InsertConfig
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_maps import load_free_space
 from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
@@ -29,6 +29,7 @@ from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_data
 from asca_pillars.data.insertion.prepared import prepared_folder
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.geometry.ranges import Ranges
 
 OBJECT_TRIES = 10  # objects of a class that are tried before one is given up
@@ -69,13 +70,12 @@ class Inserter:
         return load_free_space(self.split, frame_id, self.prepared, camera_view=self.camera_view)
 
 
-def prepare_inserter(split: KittiSplit, config: Config) -> Inserter:
+def prepare_inserter(split: KittiSplit, spec: DetectorSpec, data: DataConfig, insert: InsertConfig) -> Inserter:
     """Build or find the object database, and work out how often each class is to be drawn.
 
     Raises:
         DatasetError: a class is wanted of which no object may be inserted, or the database cannot be built.
     """
-    data, spec, insert = config.data, config.model.spec, config.augment.insert
     prepared = prepared_folder(split.root, data)
     database = prepare_database(split, spec.class_names, prepared, camera_view=data.camera_view)
     counted = (database.point_counts >= data.min_points) & spec.ranges.hold_centers(database.boxes)

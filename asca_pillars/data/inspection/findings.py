@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from asca_pillars.config import Config
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
 from asca_pillars.geometry.sensor_height import TOLERANCE_M
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -31,8 +30,14 @@ class Finding(NamedTuple):
     text: str
 
 
-def findings(inspection: Inspection, config: Config) -> list[Finding]:
-    """Errors first: frames that cannot be read, classes without positives; then whatever else looks wrong."""
+def findings(inspection: Inspection, spec: PillarSpec, min_points: int) -> list[Finding]:
+    """Errors first: frames that cannot be read, classes without positives; then whatever else looks wrong.
+
+    Args:
+        inspection: of the dataset.
+        spec: what the dataset was measured against.
+        min_points: data.min_points of the same configuration.
+    """
     found: list[Finding] = []
     if inspection.damaged:
         text = f"frames that cannot be read: {len(inspection.damaged)}, the first: {inspection.damaged[0]}"
@@ -40,44 +45,48 @@ def findings(inspection: Inspection, config: Config) -> list[Finding]:
     for facts in inspection.classes:
         if facts.positives == 0:
             frames = f"{inspection.frames} of {inspection.frames_in_split} frames of '{inspection.split}'"
-            text = f"no anchor is positive for {facts.name} in {frames}: {_why_none(facts, inspection, config)}"
+            text = (
+                f"no anchor is positive for {facts.name} in {frames}: {_why_none(facts, inspection, spec, min_points)}"
+            )
             found.append(Finding("error", facts.name, text))
     for facts in inspection.classes:
         if facts.positives:
-            found += [Finding("warning", facts.name, f"{facts.name}: {text}") for text in _of_class(facts, config)]
+            found += [
+                Finding("warning", facts.name, f"{facts.name}: {text}") for text in _of_class(facts, spec, min_points)
+            ]
     scans = inspection.scans
     found += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
     found += [Finding("warning", "height", text) for text in _of_height(inspection)]
-    found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, config.model.spec)]
+    found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, spec)]
     return found
 
 
-def _why_none(facts: ClassFacts, inspection: Inspection, config: Config) -> str:
+def _why_none(facts: ClassFacts, inspection: Inspection, spec: PillarSpec, min_points: int) -> str:
     if facts.boxes == 0:
         return _why_no_boxes(facts.name, inspection)
     if facts.no_points == facts.boxes:
         return "none of its boxes holds a point; labels and calib must belong to the scans"
     if facts.few_points == facts.boxes:
-        return f"all of its boxes have fewer points than data.min_points = {config.data.min_points}; lower it"
+        return f"all of its boxes have fewer points than data.min_points = {min_points}; lower it"
     if facts.missed == 0:
-        return f"its boxes with enough points lie outside the grid; {_widen(facts, config.model.spec)}"
+        return f"its boxes with enough points lie outside the grid; {_widen(facts, spec)}"
     return "the anchors stand too far apart to overlap its boxes; make model.spec.grid.v_max_m and v_y_m smaller"
 
 
 def _why_no_boxes(name: str, inspection: Inspection) -> str:
     for other in inspection.types:
         if other.casefold() == name.casefold():
-            return f"the labels spell it '{other}'; rename it there or in detector.classes"
+            return f"the labels spell it '{other}'; rename it there or in model.spec.classes"
     there = ", ".join(f"{kind} {count}" for kind, count in inspection.types.items()) or "none at all"
     if inspection.sampled:
         advice = f"look at all frames with --frames {inspection.frames_in_split}, or list other frames in ImageSets/"
     else:
-        advice = "list frames that have some in ImageSets/, or take the class out of detector.classes"
+        advice = "list frames that have some in ImageSets/, or take the class out of model.spec.classes"
     return f"no label is of this type (there are: {there}); {advice}"
 
 
-def _of_class(facts: ClassFacts, config: Config) -> Iterator[str]:
-    spec, boxes = config.model.spec, facts.boxes
+def _of_class(facts: ClassFacts, spec: PillarSpec, min_points: int) -> Iterator[str]:
+    boxes = facts.boxes
     if boxes < FEWEST_BOXES:
         number = "1 box" if boxes == 1 else f"{boxes} boxes"
         yield f"only {number}, too few to learn from or to compare with the anchors; inspect or add more frames"
@@ -87,7 +96,7 @@ def _of_class(facts: ClassFacts, config: Config) -> Iterator[str]:
         share = _percent(facts.no_points, boxes)
         yield f"{share} of the boxes hold no point; check that labels and calib belong to the scans"
     elif facts.few_points > BOXES_WITH_FEW_POINTS * boxes:
-        share, limit = _percent(facts.few_points, boxes), config.data.min_points
+        share, limit = _percent(facts.few_points, boxes), min_points
         yield f"{share} of the boxes have fewer points than data.min_points = {limit} and are ignored; lower it"
     if max(facts.outside_xyz[:2]) > BOXES_OUTSIDE * boxes:
         x, y = (_percent(count, boxes) for count in facts.outside_xyz[:2])

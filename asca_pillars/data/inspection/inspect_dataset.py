@@ -1,19 +1,18 @@
 """What a detector is going to be trained on: a KITTI-layout dataset measured against a configuration.
 
-`data.measuring` measures a frame, this module a dataset, and `data.findings` says what is wrong with it.
+`measurements` measures a frame, this module a dataset, and `findings` says what is wrong with it.
 """
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.config import Config
+from asca_pillars.config import DataConfig
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError, ScanError
@@ -117,7 +116,6 @@ class Inspection:
 
     data: str
     split: str
-    config: str
     frames: int
     frames_in_split: int
     frames_without_objects: int
@@ -133,44 +131,43 @@ class Inspection:
 
 
 def inspect_dataset(
-    root: str | Path, config: Config, *, split: str | None = None, frames: int = 500, progress: bool = False
+    split: KittiSplit, spec: PillarSpec, data: DataConfig, *, frames: int = 500, progress: bool = False
 ) -> Inspection:
     """Measure `frames` evenly spaced frames of a split, or all of them if there are fewer.
 
     Args:
-        root: KITTI-layout folder.
-        config: what is to be trained.
-        split: default: the config's data.train_set.
+        split: a list of a KITTI-layout folder.
+        spec: grid, limits and classes that are to be trained on it.
+        data: how its frames are to be read.
+        frames: how many are looked at.
         progress: show a bar.
 
     Raises:
         DatasetError: a list, scan, calibration or label file is missing, anywhere in the split.
         DatasetError, ScanError: no frame can be read.
     """
-    dataset = KittiSplit(root, config.data.train_set if split is None else split)
-    _require_files(dataset)
-    in_split = len(dataset.frame_ids)
+    _require_files(split)
+    in_split = len(split.frame_ids)
     wanted = min(frames, in_split)
     measured: list[FrameMeasure] = []
     damaged: list[DatasetError | ScanError] = []
     for number in track(range(wanted), "Inspecting", disable=not progress, transient=True):
         try:
-            measured.append(measure_frame(dataset, dataset.frame_ids[number * in_split // wanted], config))
+            measured.append(measure_frame(split, split.frame_ids[number * in_split // wanted], spec, data))
         except (DatasetError, ScanError) as error:
             damaged.append(error)
     if not measured:
         raise damaged[0]
     types = sum((frame.types for frame in measured), Counter[str]())
     return Inspection(
-        data=str(root),
-        split=dataset.name,
-        config=config.name,
+        data=str(split.root),
+        split=split.name,
         frames=len(measured),
         frames_in_split=in_split,
         frames_without_objects=sum(not len(frame.boxes) for frame in measured),
         types=dict(types.most_common()),
-        classes=tuple(_class_facts(measured, index, config) for index in range(len(config.model.spec.classes))),
-        scans=_scan_facts([frame.scan for frame in measured], config.model.spec),
+        classes=tuple(_class_facts(measured, index, spec, data.min_points) for index in range(len(spec.classes))),
+        scans=_scan_facts([frame.scan for frame in measured], spec),
         damaged=tuple(map(str, damaged)),
     )
 
@@ -185,8 +182,8 @@ def _require_files(split: KittiSplit) -> None:
         )
 
 
-def _class_facts(frames: Sequence[FrameMeasure], index: int, config: Config) -> ClassFacts:
-    spec, grid = config.model.spec.classes[index], config.model.spec.grid
+def _class_facts(frames: Sequence[FrameMeasure], index: int, detector: PillarSpec, min_points: int) -> ClassFacts:
+    spec, grid = detector.classes[index], detector.grid
     own = np.concatenate([frame.labels for frame in frames]) == index
     boxes = np.concatenate([frame.boxes for frame in frames])[own].astype(np.float64)
     points = np.concatenate([frame.points for frame in frames])[own]
@@ -199,7 +196,7 @@ def _class_facts(frames: Sequence[FrameMeasure], index: int, config: Config) -> 
         boxes=len(boxes),
         points=_spread(points),
         no_points=int((points == 0).sum()),
-        few_points=int((points < config.data.min_points).sum()),
+        few_points=int((points < min_points).sum()),
         size_m=tuple(boxes[:, 3:6].mean(axis=0).tolist()) if len(boxes) else None,
         size_std_m=tuple(boxes[:, 3:6].std(axis=0).tolist()) if len(boxes) else None,
         anchor_size_m=(spec.length_m, spec.width_m, spec.height_m),

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.config import Config
+from asca_pillars.config import DataConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import stored_points
@@ -70,17 +70,16 @@ class FrameMeasure(NamedTuple):
     scan: ScanMeasure
 
 
-def measure_frame(split: KittiSplit, frame_id: str, config: Config) -> FrameMeasure:
+def measure_frame(split: KittiSplit, frame_id: str, spec: PillarSpec, data: DataConfig) -> FrameMeasure:
     """Read a frame without random changes, match it with the anchors, and count.
 
     Raises:
         DatasetError, ScanError: a damaged file, see `read_frame`.
     """
-    spec = config.model.spec
     # min_points=0: objects that training ignores for their few points are to be counted by class, too.
-    frame = read_frame(split, frame_id, spec.class_names, camera_view=config.data.camera_view, min_points=0)
+    frame = read_frame(split, frame_id, spec.class_names, camera_view=data.camera_view, min_points=0)
     points = points_in_boxes(frame.points, frame.boxes).sum(axis=0)
-    to_find = replace(frame, labels=np.where(points < config.data.min_points, IGNORED, frame.labels))
+    to_find = replace(frame, labels=np.where(points < data.min_points, IGNORED, frame.labels))
     outcomes, positives = match(to_find, spec)
     own = frame.labels != IGNORED
     return FrameMeasure(

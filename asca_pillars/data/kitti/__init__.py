@@ -11,6 +11,7 @@ from asca_pillars.data.kitti.calibration import (
 from asca_pillars.data.kitti.kitti_labels import (
     KittiObject,
     boxes_from_objects,
+    labels_text,
     objects_3d,
     objects_from_boxes,
     read_labels,
@@ -26,6 +27,7 @@ __all__ = [
     "boxes_from_objects",
     "image_boxes",
     "in_image",
+    "labels_text",
     "objects_3d",
     "objects_from_boxes",
     "read_calibration",

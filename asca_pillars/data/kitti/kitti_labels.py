@@ -75,7 +75,12 @@ def read_labels(path: str | Path) -> list[KittiObject]:
 def write_labels(path: str | Path, objects: Iterable[KittiObject]) -> None:
     """Write a label or detection file as KITTI prints it: two decimals, scores with six."""
     with atomic_path(path) as temporary:
-        temporary.write_text("".join(_format_object(item) + "\n" for item in objects), encoding="utf-8")
+        temporary.write_text(labels_text(objects), encoding="utf-8")
+
+
+def labels_text(objects: Iterable[KittiObject]) -> str:
+    """The text of a label or detection file, a line for each object; what `write_labels` writes."""
+    return "".join(_format_object(item) + "\n" for item in objects)
 
 
 def boxes_from_objects(objects: Sequence[KittiObject], calib: Calibration) -> NDArray[np.float32]:

@@ -1,45 +1,39 @@
-"""The whole network: pillarize and decode stand in `geometry`, the five stops between them here."""
+"""The whole network between pillars and head maps, and its side of training (`models.trainable.Trainable`)."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
-import numpy as np
-import torch
 from torch import Tensor, nn
 
-from asca_pillars.config import PillarModel
+from asca_pillars.config import LossConfig, PillarModel
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.models.pillar.encoder import PillarEncoder
 from asca_pillars.models.pillar.head import SSDHead
+from asca_pillars.models.pillar.loss import detection_loss
 from asca_pillars.models.pillar.neck import RPNNeck
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillarize import Pillars
-
-
-class PillarBatch(NamedTuple):
-    """Pillars of B frames, one frame's after the other's.
-
-    Attributes:
-        features: (M, 9) decorated points.
-        pillar_index: (M,) pillar of each point, counted through the batch, ascending.
-        point_counts: (P,) points of each pillar.
-        cells: (P,) flat index (row * nx + column) of each pillar in its own frame.
-        frame_pillars: pillars of each frame.
-    """
-
-    features: Tensor
-    pillar_index: Tensor
-    point_counts: Tensor
-    cells: Tensor
-    frame_pillars: Sequence[int]
+from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, PillarPreparation
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
 class PillarDetector(nn.Module):
-    """ASCA-PointPillars (figure 1 of the paper); PointPillars with K = 1, V_max = 0.16 m and no CPA."""
+    """ASCA-PointPillars (figure 1 of the paper); PointPillars with K = 1, V_max = 0.16 m and no CPA.
 
-    def __init__(self, grid: PillarGrid, encode: PillarEncoder, neck: RPNNeck, head: SSDHead) -> None:
+    Args:
+        spec: grid, limits and classes that its parts were made for.
+        loss_weights: what training weighs its terms with.
+        encode: points of pillars to pillar features (section 3.2 and 3.3).
+        neck: pseudo-image to features (section 3.4).
+        head: features to head maps.
+    """
+
+    def __init__(
+        self, spec: PillarSpec, loss_weights: LossConfig, encode: PillarEncoder, neck: RPNNeck, head: SSDHead
+    ) -> None:
         super().__init__()
-        self.grid = grid
+        self.grid = spec.grid
+        self.preparation = PillarPreparation(spec)
+        self.loss_weights = loss_weights
         self.encode = encode
         self.neck = neck
         self.head = head
@@ -53,6 +47,20 @@ class PillarDetector(nn.Module):
         maps: HeadMaps[Tensor] = self.head(self.neck(canvas))
         return maps
 
+    def predict(self, batch: LabeledPillars) -> HeadMaps[Tensor]:
+        """Head maps of B labelled frames."""
+        maps: HeadMaps[Tensor] = self(batch.pillars)
+        return maps
+
+    def loss(self, outputs: HeadMaps[Tensor], batch: LabeledPillars) -> Mapping[str, Tensor]:
+        """The terms of eq. (15) by name, see `detection_loss`."""
+        return detection_loss(outputs, batch.targets, self.loss_weights)._asdict()
+
+    def detect(self, outputs: HeadMaps[Tensor], spec: DetectorSpec) -> list[Detections]:
+        """Boxes in the head maps of each frame, with the thresholds of `spec`."""
+        arrays = [part.float().cpu().numpy() for part in outputs]
+        return [spec.decode(HeadMaps(*frame)) for frame in zip(*arrays, strict=True)]
+
     def scatter(self, pillar_features: Tensor, cells: Tensor, frame_pillars: Sequence[int]) -> Tensor:
         """Put each pillar's features at its cell of an empty pseudo-image: (P, C) -> (B, C, ny, nx)."""
         ny, nx = self.grid.ny, self.grid.nx
@@ -64,27 +72,13 @@ class PillarDetector(nn.Module):
         return canvas.view(frames, ny, nx, channels).permute(0, 3, 1, 2)
 
 
-def batch_pillars(frames: Sequence[Pillars]) -> PillarBatch:
-    """Pillars of several frames, one frame's after the other's."""
-    frame_pillars = [len(frame.cells) for frame in frames]
-    starts = np.concatenate([[0], np.cumsum(frame_pillars)[:-1]]).astype(np.int64)
-    return PillarBatch(
-        features=torch.from_numpy(np.concatenate([frame.features for frame in frames])),
-        pillar_index=torch.from_numpy(
-            np.concatenate([frame.pillar_index + start for frame, start in zip(frames, starts, strict=True)])
-        ),
-        point_counts=torch.from_numpy(np.concatenate([frame.point_counts for frame in frames])),
-        cells=torch.from_numpy(np.concatenate([frame.cells for frame in frames])),
-        frame_pillars=frame_pillars,
-    )
-
-
 def build_pillar_detector(model: PillarModel) -> PillarDetector:
     """The network that `model` describes, with fresh random weights."""
     network, spec = model.network, model.spec
     neck = RPNNeck(network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels)
     return PillarDetector(
-        grid=spec.grid,
+        spec=spec,
+        loss_weights=model.loss,
         encode=PillarEncoder(network.pillar_channels, network.cpa, spec.limits),
         neck=neck,
         head=SSDHead(neck.out_channels, anchors_per_cell=spec.anchors.shape[2]),

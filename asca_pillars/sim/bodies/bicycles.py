@@ -15,7 +15,7 @@ from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ell
 _SEGMENTS = 12  # of a wheel's circle
 _RIM = 0.70  # inner over outer radius of tire and rim together
 MUDGUARD_SHARE, RACK_SHARE, REFLECTOR_SHARE = 0.8, 0.7, 0.8
-STRIPED_TIRE_SHARE, VEST_SHARE = 0.45, 0.2  # with a ring of foil on the sidewalls; riders with foil on their jacket
+STRIPED_TIRE_SHARE, VEST_SHARE = 0.25, 0.1  # with a ring of foil on the sidewalls; riders with foil on their jacket
 REFLECTOR = Surface(2.5, 0.5)  # sends the light back where it came from
 
 
@@ -35,10 +35,11 @@ def _frame(length: float) -> _Frame:
     return _Frame(radius, hub_x, (hub_x - 0.22, 0.0, 0.80), (-0.08, 0.0, 0.30), (-0.26, 0.0, 0.80))
 
 
-def bicycle(rng: np.random.Generator, length: float) -> Primitives:
-    """A bicycle: wheels, frame, handlebar, saddle; mostly mudguards, a rack, lamps and reflectors."""
+def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -> Primitives:
+    """A bicycle: wheels, frame, handlebar, saddle; mostly mudguards, a rack, lamps and reflectors, which grow by
+    `footprint_m`, the width of a laser's beam there."""
     frame = _frame(length)
-    paint = float(np.exp(rng.uniform(np.log(0.1), np.log(0.6))))
+    paint = float(np.exp(rng.uniform(np.log(0.03), np.log(0.5))))
     parts = [_wheels(rng, frame), _tubes(rng, frame, paint)]
     rows: list[tuple[float, ...]] = []
     if rng.random() < RACK_SHARE:
@@ -48,15 +49,16 @@ def bicycle(rng: np.random.Generator, length: float) -> Primitives:
         parts.append(_mudguards(frame, Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.6)))), 0.4)))
     if rng.random() < REFLECTOR_SHARE:
         lamps = ((frame.hub_x - 0.1, 0.78), (-frame.hub_x - frame.wheel_radius + 0.04, 0.62))
-        rows += [(x, 0, z, 0.06, 0.10, 0.10, 0, *REFLECTOR.row) for x, z in lamps]
+        more = footprint_m
+        rows += [(x, 0, z - more / 2, 0.04 + more, 0.05 + more, 0.05 + more, 0, *REFLECTOR.row) for x, z in lamps]
         rows += [
             (
                 hub + 0.6 * frame.wheel_radius * np.cos(turn),
                 0,
                 frame.wheel_radius * (1 + 0.6 * np.sin(turn)) - 0.03,
-                0.07,
+                0.03 + more,
                 0.03,
-                0.06,
+                0.03 + more,
                 0,
                 *REFLECTOR.row,
             )
@@ -71,9 +73,9 @@ def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
     """Tires with their rims, and spokes as disks that let many rays through."""
     angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
     ring = frame.wheel_radius * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
-    rubber = Surface(float(np.exp(rng.uniform(np.log(0.12), np.log(0.5)))), 0.3)
-    sidewall = Surface(float(rng.uniform(0.6, 2.0)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
-    spokes = Surface(float(rng.uniform(0.1, 0.4)), 0.2, float(rng.uniform(0.5, 0.75)))
+    rubber = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.3)))), 0.3)
+    sidewall = Surface(float(rng.uniform(0.45, 0.95)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
+    spokes = Surface(float(rng.uniform(0.05, 0.3)), 0.2, float(rng.uniform(0.5, 0.75)))
     a, b, side = ring[:-1], ring[1:], np.array([0.0, 0.035, 0.0])
     faces = np.stack(
         [
@@ -122,8 +124,11 @@ def _tubes(rng: np.random.Generator, frame: _Frame, paint: float) -> Primitives:
     return limbs([t[0] for t in tubes], [t[1] for t in tubes], radii, surface, (0.0, 1.0, 0.0))
 
 
-def cyclist_body(rng: np.random.Generator, height: float, width: float, length: float) -> Primitives:
-    """A bicycle and its rider, upright to bent over; `height` is that of the head above the ground."""
+def cyclist_body(
+    rng: np.random.Generator, height: float, width: float, length: float, footprint_m: float = 0.0
+) -> Primitives:
+    """A bicycle and its rider, upright to bent over; `height` is that of the head above the ground. `footprint_m` as
+    for `bicycle`."""
     neck = np.array([-0.28 + rng.uniform(0.05, 0.42), 0.0, height - 0.27])
     crown = draw_cloth(rng, 1)[0]  # hair or a helmet
     head = ellipsoids(
@@ -132,13 +137,18 @@ def cyclist_body(rng: np.random.Generator, height: float, width: float, length: 
         np.stack([draw_skin(rng), crown]),
     )
     return Primitives.join(
-        [bicycle(rng, length), _rider(rng, neck, width, _frame(length).hub_x - 0.28), head, _luggage(rng, neck, length)]
+        [
+            bicycle(rng, length, footprint_m),
+            _rider(rng, neck, width, _frame(length).hub_x - 0.28),
+            head,
+            _luggage(rng, neck, length),
+        ]
     )
 
 
 def _rider(rng: np.random.Generator, neck: Floats, width: float, bar_x: float) -> Primitives:
     """Trunk, arms and legs between saddle, pedals and handlebar."""
-    upper, lower, shoe = draw_cloth(rng, 3, dark_share=0.15)
+    upper, lower, shoe = draw_cloth(rng, 3, dark_share=0.25)
     bulk = float(rng.uniform(1.2, 1.55))
     shoulder = float(np.clip(0.36 * width, 0.17, 0.26))
     hips = np.array([-0.28, 0.0, 0.99])
@@ -149,7 +159,7 @@ def _rider(rng: np.random.Generator, neck: Floats, width: float, bar_x: float) -
         (_offset(hips, -0.02, 0, -0.06), _offset(hips, 0.06, 0, 0.08), 0.16 * bulk, 0.13 * bulk, lower),
     ]
     if rng.random() < VEST_SHARE:
-        foil = np.array([rng.uniform(0.8, 2.0), 0.3, 0.0])
+        foil = np.array([rng.uniform(0.5, 1.1), 0.3, 0.0])
         middle = 0.5 * (hips + neck)
         rows.append((_offset(middle, 0, 0, -0.06), _offset(middle, 0.02, 0, 0.08), 1.04 * shoulder, 0.14 * bulk, foil))
     if rng.random() < 0.4:  # a jacket that hangs over the hips

@@ -79,7 +79,7 @@ def draw_paint(rng: np.random.Generator, dark_share: float = 0.5) -> Paint:
     if rng.random() < dark_share:
         value, gloss = float(np.exp(rng.uniform(np.log(0.012), np.log(0.035)))), float(rng.uniform(0.5, 1.8))
     else:
-        value, gloss = float(np.exp(rng.uniform(np.log(0.22), np.log(0.62)))), float(rng.uniform(0.1, 0.6))
+        value, gloss = float(np.exp(rng.uniform(np.log(0.22), np.log(0.55)))), float(rng.uniform(0.1, 0.6))
         if rng.random() < PALE_SHARE:
-            return Paint(Surface(float(rng.uniform(0.5, 0.95)), 0.1), Surface(float(rng.uniform(0.3, 0.6)), 0.2))
+            return Paint(Surface(float(rng.uniform(0.35, 0.65)), 0.1), Surface(float(rng.uniform(0.2, 0.45)), 0.2))
     return Paint(Surface(value, gloss), Surface(max(0.1 * value, 0.012), float(rng.uniform(0.25, 0.6))))

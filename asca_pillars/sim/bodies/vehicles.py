@@ -54,9 +54,18 @@ class _Hull(NamedTuple):
 
 
 def car_body(
-    rng: np.random.Generator, length: float, width: float, height: float, profile: Profile, dark_share: float = 0.5
+    rng: np.random.Generator,
+    length: float,
+    width: float,
+    height: float,
+    profile: Profile,
+    dark_share: float = 0.5,
+    footprint_m: float = 0.0,
 ) -> Primitives:
-    """A lofted car or van with wheels, mirrors, plates and seats behind its glass."""
+    """A lofted car or van with wheels, mirrors, plates and seats behind its glass.
+
+    Plates and lamps grow by `footprint_m`, the width of a laser's beam there: one that touches them returns brightly.
+    """
     hull = _Hull(
         length,
         width,
@@ -77,7 +86,7 @@ def car_body(
     underside = np.column_stack([floor, np.full(4, hull.clearance + 0.08)])
     parts = [quads(corners, np.concatenate([table, table])), quads(underside, trim)]
     parts.append(wheels((0.5 - hull.wheel_x) * length, width / 2 - 0.05, hull.wheel_radius, rng))
-    parts += [_fittings(rng, hull, paint.upright), _seats(rng, hull)]
+    parts += [_fittings(rng, hull, paint.upright, footprint_m), _seats(rng, hull)]
     return Primitives.join(parts)
 
 
@@ -181,26 +190,30 @@ def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.ran
     return quads(both, np.broadcast_to(table, (*both.shape[:3], 3)))
 
 
-def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface) -> Primitives:
+def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface, footprint_m: float) -> Primitives:
     """Plates, lamps and their reflectors (they shine), mirrors, and the dashboard."""
     length, width, height, profile = hull.length, hull.width, hull.height, hull.profile
     plate_z = min(0.45 * height, 0.75)
     plate = Surface(float(rng.uniform(1.5, 4.0)), 0.3).row
-    rear_lamp, front_lamp = (Surface(float(rng.uniform(0.8, 2.2)), 0.4).row for _ in range(2))
+    rear_lamp, front_lamp = (
+        Surface(float(rng.uniform(0.5, 1.8)), 0.4).row,
+        Surface(float(rng.uniform(0.3, 1.2)), 0.6).row,
+    )
+    more = footprint_m
     rows: list[tuple[float, ...]] = [
-        (length / 2, 0, 0.25 * height, 0.05, 0.54, 0.14, 0, *plate),
-        (-length / 2, 0, plate_z - 0.1, 0.05, 0.54, 0.14, 0, *plate),
+        (length / 2, 0, 0.25 * height, 0.05, 0.52 + more, 0.11 + more, 0, *plate),
+        (-length / 2, 0, plate_z - 0.1, 0.05, 0.52 + more, 0.11 + more, 0, *plate),
         (length * (0.46 - profile.cabin[0]), 0, 0.45 * height, 0.4, 0.8 * width, 0.14 * height, 0, 0.05, 0.5, 0),
     ]
     nose, tail = length / 2 - 0.55 * hull.nose_bow, -length / 2 + 0.6 * hull.tail_bow
     mirror = (0.5 - profile.cabin[0] - 0.05) * length
     stands_out = float(rng.uniform(0.03, 0.08))
-    lamp_m = float(rng.uniform(0.14, 0.32))  # height of the rear ones
+    lamp_m = float(rng.uniform(0.08, 0.2))  # height of the rear ones
     for sign in (1, -1):
         rows += [
-            (tail, sign * width * 0.40, 0.5 * height, 0.08, 0.17, lamp_m, 0, *rear_lamp),
-            (tail - 0.03, sign * width * 0.38, 0.24 * height, 0.06, 0.14, 0.06, 0, 2.5, 0.4, 0),
-            (nose - 0.02 * length, sign * width * 0.38, 0.38 * height, 0.08, 0.28, 0.15, 0, *front_lamp),
+            (tail, sign * width * 0.40, 0.5 * height, 0.08, 0.10 + more, lamp_m + more, 0, *rear_lamp),
+            (tail - 0.03, sign * width * 0.38, 0.24 * height, 0.06, 0.06 + more, 0.03 + more, 0, 2.5, 0.4, 0),
+            (nose - 0.02 * length, sign * width * 0.38, 0.38 * height, 0.08, 0.24 + more, 0.11 + more, 0, *front_lamp),
             (mirror, sign * (width / 2 + stands_out), profile.belt * height, 0.10, 0.17, 0.13, 0, *paint.row),
         ]
     return cuboids(rows)

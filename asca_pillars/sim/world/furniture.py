@@ -38,8 +38,21 @@ def pole(builder: Builder, along: float, across: float) -> None:
             builder.box(along, across, z, (0.25, 0.3, 0.8), (0.12, 0.4, 0.0), yaw=float(rng.normal(0, 0.5)))
     elif what < 0.65:  # a base with the fuses
         builder.post(along, across, -0.2, float(rng.uniform(0.8, 1.4)), 1.8 * radius, 0.3)
-    elif what < 0.75:  # a litter bin on it
+    elif what < 0.90:  # sacks, plants or a sheet tied to it
+        wrapped(builder, along, across, float(rng.uniform(0.14, 0.3)), float(rng.uniform(0.9, 1.8)))
+    else:  # a litter bin on it
         builder.box(along + 0.25, across, 0.6, (0.35, 0.4, 0.6), material(builder))
+
+
+def wrapped(builder: Builder, along: float, across: float, wide_m: float, tall_m: float) -> None:
+    """Something uneven and upright under a sheet or wound with plants, `wide_m` in radius."""
+    rng = builder.rng
+    pieces, reflectance = int(rng.integers(3, 7)), float(rng.uniform(0.12, 0.6))
+    for i in range(pieces):
+        radii = (wide_m * float(rng.uniform(0.6, 1.2)), wide_m * float(rng.uniform(0.6, 1.2)), 0.7 * tall_m / pieces)
+        shift = rng.normal(0.0, 0.2 * wide_m, 2)
+        z = (i + 0.5) * tall_m / pieces
+        builder.ball(along + float(shift[0]), across + float(shift[1]), z, radii, reflectance)
 
 
 def pole_group(builder: Builder, along: float, across: float) -> None:

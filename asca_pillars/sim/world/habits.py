@@ -77,7 +77,7 @@ class Habits:
         rng, config, ground = self.rng, self.config, self.ground
         half, pavement = ground.half_width_m, ground.pavement_m
         if self.people and rng.random() < config.in_company:
-            u, v, heading = self._companion(self.people[int(rng.integers(len(self.people)))])
+            u, v, heading = self.companion()
         else:
             u = way * self._distance(2.0, 6.6)
             habit = rng.random()
@@ -98,17 +98,17 @@ class Habits:
     def _turned(self, heading: float, u: float, v: float) -> float:
         """A walker's heading against the street: as given, anyhow, or across the line of sight."""
         rng, config = self.rng, self.config
-        draw = rng.random()
-        if draw < config.pedestrian_uniform_heading:
+        if rng.random() < config.pedestrian_uniform_heading:
             return float(rng.uniform(-np.pi, np.pi))
-        if draw < config.pedestrian_uniform_heading + config.pedestrian_across_sight:
+        if rng.random() < config.pedestrian_across_sight:
             x, y, along = self.ground.to_lidar(u, v)
             return float(np.arctan2(y, x) - along + rng.choice([-1.0, 1.0]) * np.pi / 2 + rng.normal(0.0, 0.35))
         return heading
 
-    def _companion(self, of: Neighbor) -> tuple[float, float, float]:
-        """Beside somebody with the same heading, behind, or face to face."""
+    def companion(self) -> tuple[float, float, float]:
+        """u, v and heading of somebody beside another one with the same heading, behind, or face to face."""
         rng, config = self.rng, self.config
+        of = self.people[int(rng.integers(len(self.people)))]
         habit = rng.random()
         if habit < config.side_by_side:
             along, turn = rng.normal(0, 0.15), rng.normal(0, 0.12)
@@ -166,6 +166,9 @@ class Habits:
         return Candidate(place, company, Neighbor(float(u), float(v), float(heading), float(length)))
 
     def _distance(self, shape: float, scale: float) -> float:
+        """Along the street, metres: by KITTI's labels where its camera looks, and as many beside the car."""
+        if self.rng.random() < self.config.alongside:
+            return float(self.rng.uniform(0.0, 7.0))
         distance = float(self.rng.gamma(shape, scale))
         return distance if 2.0 < distance < self.config.reach_m else float(self.rng.uniform(2.0, self.config.reach_m))
 

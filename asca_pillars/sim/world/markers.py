@@ -4,7 +4,7 @@ what KITTI's detectors take for people is one of them."""
 import numpy as np
 
 from asca_pillars.sim.world.builder import Builder, Material
-from asca_pillars.sim.world.furniture import material
+from asca_pillars.sim.world.furniture import material, wrapped
 
 
 def retroreflective(builder: Builder) -> Material:
@@ -103,12 +103,7 @@ def covered_thing(builder: Builder, along: float, across: float) -> None:
     wide, tall = float(rng.uniform(0.14, 0.34)), float(rng.uniform(0.9, 1.9))
     if not builder.claim(along, across, 2.2 * wide, 2.2 * wide):
         return
-    pieces, reflectance = int(rng.integers(3, 7)), float(rng.uniform(0.12, 0.6))
-    for i in range(pieces):
-        half = 0.7 * tall / pieces
-        radii = (wide * float(rng.uniform(0.6, 1.2)), wide * float(rng.uniform(0.6, 1.2)), half)
-        shift = rng.normal(0.0, 0.2 * wide, 2)
-        builder.ball(along + float(shift[0]), across + float(shift[1]), (i + 0.5) * tall / pieces, radii, reflectance)
+    wrapped(builder, along, across, wide, tall)
     if rng.random() < 0.4:
         aside = float(rng.normal(0.0, wide))
         builder.post(along + aside, across, -0.2, float(rng.uniform(2.2, 5.0)), float(rng.uniform(0.03, 0.09)), 0.35)

@@ -11,15 +11,18 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass
 class Occupied:
-    """Footprints that are taken: rows x, y, length, width, yaw. Grows as things are placed."""
+    """Footprints that are taken: rows x, y, length, width, yaw, and by how much it may overlap others that may overlap.
+    Grows as things are placed."""
 
-    rows: Floats = field(default_factory=lambda: np.zeros((2048, 5)))
+    rows: Floats = field(default_factory=lambda: np.zeros((2048, 6)))
     count: int = 0
 
-    def take(self, x: float, y: float, length: float, width: float, yaw: float, margin_m: float = 0.0) -> bool:
-        """Take a footprint if it is free with a margin around it; whether it was. A negative margin lets the edges of
-        two footprints overlap."""
-        row = np.array([x, y, max(length + 2 * margin_m, 0.05), max(width + 2 * margin_m, 0.05), yaw])
+    def take(
+        self, x: float, y: float, length: float, width: float, yaw: float, margin_m: float = 0.0, overlap_m: float = 0.0
+    ) -> bool:
+        """Take a footprint if it is free with a margin around it; whether it was. Two footprints may overlap by the
+        lesser `overlap_m` of theirs."""
+        row = np.array([x, y, length + 2 * margin_m, width + 2 * margin_m, yaw, overlap_m])
         if not _is_free(row, self.rows, self.count) or self.count == len(self.rows):
             return False
         row[2:4] = length, width
@@ -36,13 +39,14 @@ def _is_free(row: Floats, rows: Floats, count: int) -> bool:
         if max(abs(dx), abs(dy)) > (row[2] + row[3] + rows[i, 2] + rows[i, 3]) / 2:
             continue  # farther than half the diagonals reach
         apart = False
+        overlap = min(row[5], rows[i, 5])
         for one, other in ((row, rows[i]), (rows[i], row)):
             cos, sin = np.cos(one[4]), np.sin(one[4])
             c, s = abs(np.cos(other[4] - one[4])), abs(np.sin(other[4] - one[4]))
             along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
             if (
-                along > (one[2] + other[2] * c + other[3] * s) / 2
-                or across > (one[3] + other[2] * s + other[3] * c) / 2
+                along > (one[2] + other[2] * c + other[3] * s) / 2 - overlap
+                or across > (one[3] + other[2] * s + other[3] * c) / 2 - overlap
             ):
                 apart = True
         if not apart:

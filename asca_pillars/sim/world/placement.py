@@ -13,8 +13,9 @@ from asca_pillars.sim.world.sizes import draw_size
 
 ON_FOOT = ("Pedestrian", "Person_sitting")
 TRIES = 14
-BODY_MARGIN_M = {"Pedestrian": -0.12, "Person_sitting": -0.05, "Cyclist": 0.10}  # people's boxes overlap in company
+MARGIN_M = {"Pedestrian": 0.02, "Person_sitting": 0.04, "Cyclist": 0.10}
 VEHICLE_MARGIN_M = 0.25
+PEDESTRIANS_OVERLAP_M = 0.15  # boxes of people who walk side by side share that much
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,11 @@ class Placer:
     half_hidden: list[Target] = field(default_factory=list)  # those of `targets` before which something shall stand
 
     def __post_init__(self) -> None:
-        self._habits = Habits(self.rng, self.config, self.ground, self.kind)
+        self.habits = Habits(self.rng, self.config, self.ground, self.kind)
 
     def place(self, name: str, ahead: bool) -> None:
         """Place one object of a class, or give up after some tries."""
-        habits = self._habits
+        habits = self.habits
         draw: Callable[[Floats, float], Candidate] = {
             "Pedestrian": habits.pedestrian,
             "Person_sitting": habits.sitting,
@@ -75,7 +76,8 @@ class Placer:
         rise = self.config.slope_x[0] * x + self.config.slope_y[0] * y
         if abs(level - self.ground.z_m - rise) > near + per_m * np.hypot(x, y):
             return False
-        if not self.occupied.take(x, y, size[0], size[1], yaw, BODY_MARGIN_M.get(name, VEHICLE_MARGIN_M)):
+        overlap = PEDESTRIANS_OVERLAP_M if name == "Pedestrian" else 0.0
+        if not self.occupied.take(x, y, size[0], size[1], yaw, MARGIN_M.get(name, VEHICLE_MARGIN_M), overlap):
             return False
         mean, deviation = self.config.box_lift_m[0 if name in (*ON_FOOT, "Cyclist") else 1]
         lift = float(np.clip(self.rng.normal(mean, deviation), -0.12, 0.15))

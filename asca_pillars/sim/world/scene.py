@@ -21,6 +21,7 @@ from asca_pillars.sim.world.streets import draw_ground, draw_kind
 
 # Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
 EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 4.0
+BEAM_M_PER_M = 0.004  # width of a laser's beam per metre of distance
 # Of cars, of people on foot and of cyclists.
 RATE_FACTORS = {
     "residential": (1.15, 0.75, 0.9),
@@ -49,8 +50,20 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
     occupied = Occupied()
     occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
     placer = Placer(rng, config, ground, occupied, habits)
+    place_objects(placer)
+    builder = Builder(rng, config, ground, occupied, kind)
+    hide_partly(builder, placer.half_hidden)
+    fill_gaps(builder, placer.targets)
+    line_streets(builder)
+    scatter(builder)
+    return Scene(ground, tuple(placer.targets), builder.primitives(), draw_calibration(rng))
+
+
+def place_objects(placer: Placer) -> None:
+    """Put as many objects of every class on a street as the configuration's rates suggest, or none at all."""
+    rng, config = placer.rng, placer.config
     if rng.random() >= config.empty_share:
-        for name, rate in _rates(config, habits):
+        for name, rate in _rates(config, placer.kind):
             crowds = name in ("Pedestrian", "Person_sitting")
             dispersion = config.people_dispersion if crowds else config.dispersion
             for ahead in (True, False):
@@ -59,12 +72,6 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
                     placer.place(name, ahead)
         for _ in range(rng.poisson(config.beyond)):
             placer.place_beyond()
-    builder = Builder(rng, config, ground, occupied, kind)
-    hide_partly(builder, placer.half_hidden)
-    fill_gaps(builder, placer.targets)
-    line_streets(builder)
-    scatter(builder)
-    return Scene(ground, tuple(placer.targets), builder.primitives(), draw_calibration(rng))
 
 
 def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
@@ -110,13 +117,13 @@ def _rotation(turns: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Primitives:
     """The body of an object, placed: a little smaller than its label box, as KITTI's labels are loose."""
     x, y, z, length, width, height, yaw = target.box
-    name = target.type
+    name, footprint = target.type, BEAM_M_PER_M * float(np.hypot(x, y))
     if name in ("Car", "Van"):
         # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
         slack = rng.uniform((0.0, 0.0, -0.03), (0.24, 0.14, 0.09))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.1
-        body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark)
+        body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark, footprint)
     elif name == "Truck":
         bus = rng.random() < 0.15
         body = (heavy.bus_body if bus else heavy.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
@@ -131,7 +138,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     elif name == "Person_sitting":
         body = people.sitting_body(rng, height - 0.05)
     else:
-        body = bicycles.cyclist_body(rng, height - 0.08, width, length - 0.04)
+        body = bicycles.cyclist_body(rng, height - 0.08, width, length - 0.04, footprint)
     dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
     return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 

@@ -12,7 +12,7 @@ from asca_pillars.sim.world.markers import board, fragments, mast, wall_end
 from asca_pillars.sim.world.placement import Target
 from asca_pillars.sim.world.vegetation import bush, shrub, tree
 
-PIECE_M, LANE_OF_SIGHT_M = 3.0, 2.0
+STEP_M, LANE_OF_SIGHT_M = 1.5, 2.0
 Thing = Callable[[Builder, float, float], None]
 
 
@@ -34,8 +34,10 @@ def hide_partly(builder: Builder, targets: Sequence[Target]) -> None:
         for _ in range(int(rng.integers(1, 4))):
             share, aside = rng.uniform(0.6, 0.9), rng.uniform(-0.5, 0.5) * seen
             _put(builder, BEFORE, share * x - aside * math.sin(bearing), share * y + aside * math.cos(bearing))
-        for way in np.arange(8.0, distance - 0.5 * length - 0.5 * PIECE_M, PIECE_M):
-            builder.occupied.take(way * math.cos(bearing), way * math.sin(bearing), PIECE_M, LANE_OF_SIGHT_M, bearing)
+        for way in np.arange(8.0, distance - 0.5 * length - 0.5 * STEP_M, STEP_M):
+            # A little shorter than the step, as pieces may not touch.
+            x, y = way * math.cos(bearing), way * math.sin(bearing)
+            builder.occupied.take(x, y, STEP_M - 0.1, LANE_OF_SIGHT_M, bearing)
 
 
 def fill_gaps(builder: Builder, targets: Sequence[Target]) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.benchmark.resident_memory import peak_memory_mib
-from asca_deploy.benchmark.timing import Percentiles, Track, run_frame, silently
+from asca_deploy.benchmark.timing import Percentiles, Track, pillars_of, run_frame, silently
 from asca_deploy.detector import Detector
-from asca_deploy.frame import GRAPHS, FrameReport
+from asca_pillars.geometry.frame_report import FrameReport
 from asca_pillars.system import cpu_model, package_versions
 
 
@@ -27,8 +27,8 @@ class BenchmarkReport:
     """What is not spent in the two graphs: input check, pillars, scatter, decoding and suppression."""
     outside_share: float
     """Median over frames of outside / total."""
-    cold_ms: float | None
-    """The detector's very first scan; None if it had run before."""
+    cold_ms: float
+    """The first scan, a fresh detector's very first one."""
     load_s: float
     """Opening the bundle: checksums, sessions, canvas."""
     frames: int
@@ -42,6 +42,8 @@ class BenchmarkReport:
     provider: str
     precision: str
     """float32 or reduced, see `asca_deploy.providers`."""
+    runs_on: str
+    """Provider and arithmetic in words, `Detector.runs_on`."""
     threads: int
     cpu: str
     peak_memory_mib: float | None
@@ -74,15 +76,14 @@ def benchmark(
     """
     if not scans or rounds < 1:
         raise ValueError(f"{len(scans)} scans, {rounds} rounds: at least one of each is needed")
-    cold_ms = run_frame(detector, scans[0]).total_ms if detector.last_frame is None else None
+    cold_ms = run_frame(detector, scans[0]).total_ms
     for _ in range(warmup):
         for scan in scans:
             detector(scan)
     passes = [[run_frame(detector, scan) for scan in scans] for _ in track(rounds, "stages")]
     frames = [frame for one_pass in passes for frame in one_pass]
     total_ms = Percentiles.of([frame.total_ms for frame in frames])
-    outside_ms = [_outside_ms(frame) for frame in frames]
-    graphs = detector.bundle.graphs
+    outside_ms = [_outside_ms(frame, detector.pipeline.network_stages) for frame in frames]
     return BenchmarkReport(
         fps=1e3 / total_ms.p50,
         total_ms=total_ms,
@@ -94,22 +95,23 @@ def benchmark(
         frames=len(frames),
         scans=len(scans),
         points=tuple(len(scan) for scan in scans),
-        pillars=tuple(frame.counts.pillars for frame in passes[0]),
+        pillars=tuple(pillars_of(frame) for frame in passes[0]),
         detections=tuple(len(detector(scan)) for scan in scans),
         provider=detector.provider,
         precision=detector.precision,
+        runs_on=detector.runs_on,
         threads=detector.threads,
         cpu=cpu_model(),
         peak_memory_mib=peak_memory_mib(),
         versions=package_versions(),
         bundle=detector.bundle.name,
-        graphs_sha256={"encoder": graphs.encoder.sha256, "backbone": graphs.backbone.sha256},
+        graphs_sha256={name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         input_sha256=_sha256(scans),
     )
 
 
-def _outside_ms(frame: FrameReport) -> float:
-    return frame.total_ms - sum(frame.times_ms[stage] for stage in GRAPHS)
+def _outside_ms(frame: FrameReport, network_stages: Sequence[str]) -> float:
+    return frame.total_ms - sum(frame.times_ms[stage] for stage in network_stages)
 
 
 def _sha256(scans: Sequence[NDArray[np.float32]]) -> str:

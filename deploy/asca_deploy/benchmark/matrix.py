@@ -12,7 +12,7 @@ from asca_deploy.benchmark.box_comparison import Contestant, compare
 from asca_deploy.benchmark.box_differences import BoxDifference, box_difference
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
-from asca_deploy.providers import PRECISIONS, PROVIDERS
+from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider
 from asca_pillars.errors import AscaError
 from asca_pillars.system import default_threads
 
@@ -23,8 +23,8 @@ class Way(NamedTuple):
     """One way of running a bundle."""
 
     bundle: str
-    provider: str
-    precision: str
+    provider: Provider
+    precision: Precision
     threads: int
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.benchmark.timing import Track, run_frame, silently
+from asca_deploy.benchmark.timing import Track, pillars_of, run_frame, silently
 from asca_deploy.detector import Detector
 
 COUNTS = (1_000, 10_000, 100_000, 1_000_000)
@@ -41,7 +41,7 @@ def measure_scaling(
     return tuple(
         ScalingRow(
             points=len(points),
-            pillars=column[0].counts.pillars,
+            pillars=pillars_of(column[0]),
             stages_ms={stage: float(np.median([f.times_ms[stage] for f in column])) for stage in column[0].times_ms},
             total_ms=float(np.median([f.total_ms for f in column])),
         )

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
-from asca_deploy.frame import FrameReport
+from asca_pillars.geometry.frame_report import FrameReport
+from asca_pillars.pillars.pillarize import PillarCounts
 
 Track: TypeAlias = Callable[[int, str], Iterable[int]]
 """Numbers 0..count-1 of what is being done, in words; a command line puts a progress bar behind it."""
@@ -49,6 +50,9 @@ class Spread:
 
 def run_frame(detector: Detector, scan: NDArray[Any]) -> FrameReport:
     """Run one scan and return its report."""
-    detector(scan)
-    assert detector.last_frame is not None
-    return detector.last_frame
+    return detector(scan).report
+
+
+def pillars_of(frame: FrameReport) -> int:
+    """Pillars of a scan after the limits; 0 where the family has none."""
+    return frame.counts.pillars if isinstance(frame.counts, PillarCounts) else 0

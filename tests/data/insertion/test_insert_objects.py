@@ -19,7 +19,7 @@ from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, 
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
-from asca_pillars.training.dataset import Batch, KittiDataset
+from asca_pillars.training.dataset import Collate, open_dataset
 from tests.data.insertion.simple_streets import TYPES, write_streets
 from tests.scenes import SPEC
 
@@ -39,7 +39,11 @@ def config(method: str, **insert: object) -> Config:
 
 
 def inserter_of(root: Path, method: str, **insert: object) -> Inserter:
-    return prepare_inserter(KittiSplit(root, "train"), config(method, **insert))
+    return open_inserter(KittiSplit(root, "train"), config(method, **insert))
+
+
+def open_inserter(split: KittiSplit, settings: Config) -> Inserter:
+    return prepare_inserter(split, settings.model.spec, settings.data, settings.augment.insert)
 
 
 def frame_of(root: Path, number: int) -> LabeledFrame:
@@ -130,7 +134,7 @@ def test_objects_of_gt_aug_stand_where_they_stood(root: Path) -> None:
 def test_other_types_are_in_the_way_too(root: Path, tmp_path: Path, method: str) -> None:
     """A lorry, which is no class, stands over the whole street: there is no room for anything."""
     split = KittiSplit(write_streets(tmp_path, 2), "train")
-    inserter = prepare_inserter(split, config(method))
+    inserter = open_inserter(split, config(method))
     car = objects_3d(read_labels(split.label_path("000000")))[0]
     lorry = dataclasses.replace(car, type="Truck", length_m=100.0, width_m=100.0)
     write_labels(split.label_path("000000"), [lorry])
@@ -162,25 +166,29 @@ def test_counts_approach_the_proportions(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_samples_depend_on_seed_epoch_and_frame_alone(root: Path, method: str) -> None:
-    frames = KittiDataset(root, config(method), training=True)
-    again = KittiDataset(root, config(method), training=True)
-    late = [again[epoch, number].frame for epoch, number in ((1, 3), (0, 3), (0, 2))][1:]
+    frames = open_dataset(root, config(method), training=True)
+    again = open_dataset(root, config(method), training=True)
+    late = [again.sample(epoch, number).frame for epoch, number in ((1, 3), (0, 3), (0, 2))][1:]
     for sample, number in zip(late, (3, 2), strict=True):
-        expected = frames[0, number].frame
+        expected = frames.sample(0, number).frame
         assert np.array_equal(sample.points, expected.points) and np.array_equal(sample.boxes, expected.boxes)
-    first, second = frames[0, 3].frame, frames[1, 3].frame
+    first, second = frames.sample(0, 3).frame, frames.sample(1, 3).frame
     assert len(first.points) != len(second.points) or not np.array_equal(first.points, second.points)
 
 
 def test_any_number_of_workers_gives_the_same(root: Path) -> None:
-    frames = KittiDataset(root, config("rs_aug"), training=True)
+    frames = open_dataset(root, config("rs_aug"), training=True)
     batches = [[(0, number), (1, number)] for number in range(FRAMES)]
     loader = DataLoader(
-        frames, batch_sampler=batches, num_workers=2, collate_fn=Batch, multiprocessing_context="forkserver"
+        frames,
+        batch_sampler=batches,
+        num_workers=2,
+        collate_fn=Collate(frames.preparation),
+        multiprocessing_context="forkserver",
     )
     for batch, indices in zip(loader, batches, strict=True):
         for boxes, labels, index in zip(batch.boxes, batch.labels, indices, strict=True):
-            expected = frames[index].frame
+            expected = frames.sample(*index).frame
             assert np.array_equal(boxes, expected.boxes) and np.array_equal(labels, expected.labels)
 
 
@@ -193,21 +201,21 @@ def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -
     frame = within_ranges(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid.ranges)
     pillars = SPEC.pillarize(frame.points, rng)
     for settings_ in (plain, config("rs_aug", objects=0), config("gt_aug", objects=0)):
-        sample = KittiDataset(root, settings_, training=True)[2, 4]
+        sample = open_dataset(root, settings_, training=True).sample(2, 4)
         assert np.array_equal(sample.frame.points, frame.points) and np.array_equal(sample.frame.boxes, frame.boxes)
-        assert np.array_equal(sample.pillars.features, pillars.features)
+        assert np.array_equal(sample.prepared.pillars.features, pillars.features)
     assert not folder.exists()
 
 
 def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("asca_pillars.training.dataset.prepare_inserter", lambda *_: pytest.fail("built"))
-    sample = KittiDataset(root, config("rs_aug"), training=False)[0, 0]
+    sample = open_dataset(root, config("rs_aug"), training=False).sample(0, 0)
     assert np.array_equal(sample.frame.points, frame_of(root, 0).points)
 
 
 def test_a_frame_without_ground_or_points_stays_as_it_is(tmp_path: Path) -> None:
     split = KittiSplit(write_streets(tmp_path, 3), "train")
-    inserter = prepare_inserter(split, config("rs_aug"))
+    inserter = open_inserter(split, config("rs_aug"))
     write_scan(split.scan_path("000000"), np.array([[9, 0, 0, 0.5]], np.float32))
     write_scan(split.scan_path("000001"), np.array([[-9, 0, 0, 0.5]], np.float32))
     for number in (0, 1):
@@ -221,7 +229,7 @@ def test_a_class_without_objects_is_named(tmp_path: Path) -> None:
         text = split.label_path(frame_id).read_text()
         split.label_path(frame_id).write_text(text.replace("Cyclist", "Misc"))
     with pytest.raises(DatasetError, match=r"list `train` has no Cyclist with 5 .*proportions") as caught:
-        KittiDataset(tmp_path, config("rs_aug"), training=True)
+        open_dataset(tmp_path, config("rs_aug"), training=True)
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
     without = inserter_of(tmp_path, "rs_aug", proportions={"Car": 1, "Pedestrian": 1})
     assert without.shares[2] == 0
@@ -255,6 +263,6 @@ def test_prepare_leaves_nothing_for_training_to_compute(
     settings_ = dataclasses.replace(
         settings_, data=dataclasses.replace(settings_.data, prepared=str(tmp_path / "prepared"))
     )
-    frames = KittiDataset(root, settings_, training=True)
-    assert all(len(frames[0, number].frame.boxes) for number in range(FRAMES))
+    frames = open_dataset(root, settings_, training=True)
+    assert all(len(frames.sample(0, number).frame.boxes) for number in range(FRAMES))
     assert {file: file.stat().st_mtime_ns for file in made} == made

@@ -21,7 +21,7 @@ from asca_pillars.commands.inspect import run
 from asca_pillars.config import Config, DataConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
-from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
+from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dataset
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan, stored_points
@@ -30,7 +30,7 @@ from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.pillars.pillarize import PillarLimits
 from asca_pillars.schema import to_dict
-from asca_pillars.training.dataset import KittiDataset
+from asca_pillars.training.dataset import open_dataset
 from tests.scenes import GRID, SIZES, SPEC, make_scene, write_dataset
 
 Points = NDArray[np.float32]
@@ -61,8 +61,13 @@ def with_grid(**changes: object) -> Config:
     return with_detector(grid=dataclasses.replace(GRID, **changes))
 
 
+def inspected(root: Path, config: Config, *, split: str | None = None, frames: int = 500) -> Inspection:
+    wanted = KittiSplit(root, config.data.train_set if split is None else split)
+    return inspect_dataset(wanted, config.model.spec, config.data, frames=frames)
+
+
 def found(root: Path, config: Config = CONFIG) -> list[Finding]:
-    return findings(inspect_dataset(root, config), config)
+    return findings(inspected(root, config), config.model.spec, config.data.min_points)
 
 
 def change_scans(root: Path, change: Callable[[Points], None], every: int = 1) -> None:
@@ -89,7 +94,7 @@ def test_clean_data_gives_nothing_to_warn_of(clean: Path) -> None:
 
 
 def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
-    inspection = inspect_dataset(clean, CONFIG)
+    inspection = inspected(clean, CONFIG)
     assert inspection.types == {"Car": 2 * FRAMES, "Pedestrian": FRAMES, "Cyclist": FRAMES}
     cars = [box for seed in range(FRAMES) for box, name in zip(*make_scene(seed)[1:], strict=True) if name == "Car"]
     facts = inspection.classes[0]
@@ -105,7 +110,7 @@ def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
 
 def test_points_of_a_box_by_a_plain_loop(clean: Path) -> None:
     split = KittiSplit(clean)
-    measure = measure_frame(split, "000000", CONFIG)
+    measure = measure_frame(split, "000000", CONFIG.model.spec, CONFIG.data)
     counts = [0] * len(measure.boxes)
     for x, y, z, _ in read_scan(split.scan_path("000000")).points.tolist():  # the camera sees all of the boxes
         for row, (bx, by, bz, length, width, height, yaw) in enumerate(measure.boxes.tolist()):
@@ -120,15 +125,15 @@ def test_positives_are_those_of_the_training_loader(clean: Path) -> None:
     config = with_data(min_points=110)  # some objects are to be ignored
     one_zone = dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1))
     config = dataclasses.replace(config, model=PillarModel(spec=one_zone))
-    samples = [KittiDataset(clean, config, training=False)[0, number] for number in range(FRAMES)]
-    inspection = inspect_dataset(clean, config)
+    samples = [open_dataset(clean, config, training=False).sample(0, number) for number in range(FRAMES)]
+    inspection = inspected(clean, config)
     for index, facts in enumerate(inspection.classes):
-        states = [sample.targets.state[..., 2 * index : 2 * index + 2] for sample in samples]
+        states = [sample.prepared.targets.state[..., 2 * index : 2 * index + 2] for sample in samples]
         assert facts.positives == sum((state == 1).sum() for state in states) > 0
         to_find = sum((sample.frame.labels == index).sum() for sample in samples)
         assert facts.overlapped + facts.forced + facts.missed == to_find < facts.boxes
         assert facts.few_points == facts.boxes - to_find
-    points = [sample.pillars.stats.points for sample in samples]
+    points = [sample.prepared.pillars.stats.points for sample in samples]
     assert inspection.scans.points.largest == max(points)
 
 
@@ -184,14 +189,15 @@ def test_pillars_before_the_limits_agree_with_what_pillarize_drops(clean: Path) 
 
 
 def test_evenly_spaced_frames(clean: Path) -> None:
-    inspection = inspect_dataset(clean, CONFIG, frames=4)
+    inspection = inspected(clean, CONFIG, frames=4)
     assert (inspection.frames, inspection.frames_in_split, inspection.sampled) == (4, FRAMES, True)
     chosen = [
-        measure_frame(KittiSplit(clean), frame_id, CONFIG) for frame_id in ("000000", "000003", "000006", "000009")
+        measure_frame(KittiSplit(clean), frame_id, CONFIG.model.spec, CONFIG.data)
+        for frame_id in ("000000", "000003", "000006", "000009")
     ]
     assert inspection.scans.points.largest == max(frame.scan.points for frame in chosen)
     assert inspection.classes[1].positives == sum(frame.positives[1] for frame in chosen)
-    assert inspect_dataset(clean, CONFIG, frames=99, split="val").frames == 1
+    assert inspected(clean, CONFIG, frames=99, split="val").frames == 1
 
 
 @pytest.mark.parametrize(
@@ -266,7 +272,7 @@ def test_anchors_of_another_size(clean: Path) -> None:
     assert warning.text.startswith("Car: 100 % of the boxes differ too much in size from the anchor for positive_iou")
     advised = float(warning.text.split("length_m ")[1].split(",")[0])
     assert advised == pytest.approx(3.9, abs=0.2)
-    assert inspect_dataset(clean, config).classes[0].misfits == 2 * FRAMES
+    assert inspected(clean, config).classes[0].misfits == 2 * FRAMES
 
 
 def test_anchors_too_far_apart(clean: Path) -> None:
@@ -320,11 +326,11 @@ def test_damaged_frames_are_counted_and_refused(data: Path, tmp_path: Path) -> N
         KittiSplit(data).label_path(frame_id).write_text("Car 0 0\n")
     message = refusal(data, CONFIG, tmp_path)
     assert re.search(r"cannot be read: 2, the first: .*label_2.000003.txt:1: 3 fields", message)
-    inspection = inspect_dataset(data, CONFIG)
+    inspection = inspected(data, CONFIG)
     assert inspection.frames == FRAMES - 2 and not inspection.sampled
     change_files(data, "label_2", lambda text: "Car 0 0\n")
     with pytest.raises(DatasetError, match=r"000000.txt:1: 3 fields"):
-        inspect_dataset(data, CONFIG)
+        inspected(data, CONFIG)
 
 
 def test_the_tables_come_before_the_refusal(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -343,8 +349,10 @@ def test_a_class_missing_in_a_sample_may_be_in_the_rest(data: Path) -> None:
     for frame_id in ("000000", "000006"):
         path = KittiSplit(data).label_path(frame_id)
         path.write_text(re.sub("Cyclist.*\n", "", path.read_text()))
-    inspection = inspect_dataset(data, CONFIG, frames=2)
-    assert "look at all frames with --frames 12" in findings(inspection, CONFIG)[0].text
+    inspection = inspected(data, CONFIG, frames=2)
+    assert (
+        "look at all frames with --frames 12" in findings(inspection, CONFIG.model.spec, CONFIG.data.min_points)[0].text
+    )
 
 
 def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path) -> None:
@@ -352,12 +360,12 @@ def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path)
     split.calib_path("000001").unlink()
     split.label_path("000002").unlink()
     with pytest.raises(DatasetError, match=r"calib.000001.txt: not there \(2 of 24 calibration and label files"):
-        inspect_dataset(data, CONFIG, frames=1)
+        inspected(data, CONFIG, frames=1)
 
 
 def test_neighbors_are_ignored_and_other_types_left_out(data: Path) -> None:
     change_files(data, "label_2", lambda text: text.replace("Car", "Van", 1).replace("Cyclist", "Tram"))
-    inspection = inspect_dataset(data, CONFIG)
+    inspection = inspected(data, CONFIG)
     assert inspection.types == {"Van": FRAMES, "Car": FRAMES, "Pedestrian": FRAMES, "Tram": FRAMES}
     assert [facts.boxes for facts in inspection.classes] == [FRAMES, FRAMES, 0]
     assert read_labels(KittiSplit(data).label_path("000000"))[0].type == "Van"

@@ -6,7 +6,8 @@ import torch
 
 from asca_pillars.config import NetworkConfig, PillarModel
 from asca_pillars.models.pillar.neck import RPNNeck
-from asca_pillars.models.pillar.pillar_detector import PillarBatch, PillarDetector, batch_pillars, build_pillar_detector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
+from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
 

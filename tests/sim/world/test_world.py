@@ -218,3 +218,16 @@ def test_scans_of_the_world_have_the_shape_of_real_ones() -> None:
     assert 0.47 < np.mean(on_ground) < 0.67  # a little more than in scans, where weak returns are lost
     assert 0.74 < np.mean(high) < 0.95
     assert np.std(on_ground) > 0.05
+
+
+def test_road_coordinates_and_back() -> None:
+    ground = flat(yaw_rad=0.3, bend_per_m=0.004, offset_m=1.4)
+    rng = np.random.default_rng(0)
+    for u, v in rng.uniform(-60.0, 60.0, (20, 2)):
+        x, y, _ = ground.to_lidar(float(u), float(v))
+        np.testing.assert_allclose(ground.to_road(x, y), (u, v), atol=1e-9)
+
+
+def test_a_street_has_no_misspelt_number() -> None:
+    with pytest.raises(TypeError, match="curb_m"):
+        make_street(curb_m=0.1)

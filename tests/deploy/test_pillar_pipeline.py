@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_deploy.canvas import Canvas, CanvasFormat
+from asca_deploy.bundle import CanvasFormat
+from asca_deploy.pillar_pipeline import Canvas
 from asca_pillars.pillars.grid import PillarGrid
 
 # 8 + 16 + 32 columns by 16 rows, off center.

@@ -1,4 +1,4 @@
-"""Does a scan look like those the model was trained on?
+"""What the scans of a training looked like, and how far another scan is from them.
 
 A wrong reflectance scale or sensor height ruins detection without any error; here it becomes a sentence.
 """
@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.geometry.sensor_height import TOLERANCE_M, ground_z_m
-from asca_pillars.pillars.pillarize import PillarCounts
 from asca_pillars.schema import Strict
 
 OUTSIDE_SHARE = 0.95
@@ -20,18 +20,17 @@ SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at 
 
 @dataclass(frozen=True)
 class ExpectedInput(Strict):
-    """What the training scans looked like: (lowest, highest) over scans.
-
-    Attributes:
-        points_per_scan: finite points of a scan.
-        reflectance_mean: mean reflectance of a scan, 0..1.
-        ground_z_m: height of the ground near the sensor, LiDAR frame, metres (minus the sensor's height);
-            None where no training scan showed it.
-    """
+    """What the training scans looked like: (lowest, highest) over scans."""
 
     points_per_scan: tuple[int, int]
+    """Finite points of a scan, cropped to the camera's view if `camera_view`."""
     reflectance_mean: tuple[float, float]
+    """Mean reflectance of a scan, 0..1."""
     ground_z_m: tuple[float, float] | None
+    """Height of the ground near the sensor, LiDAR frame, metres (minus the sensor's height); None where no scan
+    showed it."""
+    camera_view: bool
+    """Whether the scans were cropped to the points in the camera's image."""
 
 
 class InputWarning(NamedTuple):
@@ -41,23 +40,35 @@ class InputWarning(NamedTuple):
     text: str
 
 
-def expected_input(scans: Iterable[NDArray[np.float32]]) -> ExpectedInput:
-    """Measure training scans, each (N, 4) x, y, z in metres and reflectance 0..1, with at least one point.
+def measure_expected_input(scans: Iterable[NDArray[np.float32]], camera_view: bool) -> ExpectedInput:
+    """Measure training scans.
+
+    Args:
+        scans: each (N, 4) x, y, z in metres, LiDAR frame, and reflectance 0..1, empty ones are left out; as the
+            network gets them before augmentation, hence cropped if `camera_view`. Read once, one after the other.
+        camera_view: whether they are cropped to the camera's image.
 
     Raises:
-        ValueError: there is no scan.
+        ValueError: there is no scan with a point.
     """
-    measured = [(len(points), float(points[:, 3].mean()), ground_z_m(points)) for points in scans]
+    measured = [(len(points), float(points[:, 3].mean()), ground_z_m(points)) for points in scans if len(points)]
     grounds = [ground for _, _, ground in measured if ground is not None]
     return ExpectedInput(
         points_per_scan=(min(m[0] for m in measured), max(m[0] for m in measured)),
         reflectance_mean=(min(m[1] for m in measured), max(m[1] for m in measured)),
         ground_z_m=(min(grounds), max(grounds)) if grounds else None,
+        camera_view=camera_view,
     )
 
 
-def check_input(points: NDArray[np.float32], counts: PillarCounts, expected: ExpectedInput) -> list[InputWarning]:
-    """Compare a scan (N, 4) of finite points, and what pillarize counted in it, with the training scans."""
+def check_input(points: NDArray[np.float32], counts: ScanCounts, expected: ExpectedInput) -> list[InputWarning]:
+    """Compare a scan with the training scans.
+
+    Args:
+        points: (N, 4) finite x, y, z in metres, LiDAR frame, and reflectance.
+        counts: what became of them on the detector's grid.
+        expected: of the training scans.
+    """
     fewest, most = expected.points_per_scan
     if len(points) < fewest / 10:
         text = f"{len(points)} points, the training scans had {fewest} to {most}"
@@ -74,7 +85,7 @@ def check_input(points: NDArray[np.float32], counts: PillarCounts, expected: Exp
 
 def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:
     low, high = expected.reflectance_mean
-    largest, mean = float(reflectance.max()), float(reflectance.mean())
+    largest, mean = float(reflectance.max()), float(reflectance.mean(dtype=np.float64))
     if largest > 1.5:
         scale = 255 if largest <= 255 else 65535
         text = f"reflectance reaches {largest:.4g}, the model was trained on 0..1: divide it by {scale}"

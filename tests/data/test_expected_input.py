@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import load_bundle
-from asca_deploy.input_check import ExpectedInput, InputWarning, check_input, expected_input
+from asca_pillars.data.expected_input import ExpectedInput, InputWarning, check_input, measure_expected_input
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillarize import PillarLimits, pillarize
 
@@ -19,7 +18,7 @@ def street(seed: int = 0, ground: float = -1.7, count: int = 4000) -> Points:
     return points.astype(np.float32)
 
 
-EXPECTED = expected_input([street(1), street(2, ground=-1.8, count=5000)])
+EXPECTED = measure_expected_input([street(1), street(2, ground=-1.8, count=5000)], camera_view=False)
 
 
 def check(points: Points, expected: ExpectedInput = EXPECTED) -> list[InputWarning]:
@@ -39,8 +38,8 @@ def test_a_scan_like_the_training_scans() -> None:
 def test_too_few_points_near_the_sensor_to_see_the_ground() -> None:
     far = street()
     far[:, 0] += 100
-    assert expected_input([far]).ground_z_m is None
-    assert check(street(), expected_input([far, far])) == []
+    assert measure_expected_input([far], False).ground_z_m is None
+    assert check(street(), measure_expected_input([far, far], False)) == []
 
 
 @pytest.mark.parametrize(("scale", "advice"), [(255, "divide it by 255"), (65535, "divide it by 65535")])
@@ -88,7 +87,3 @@ def test_too_few_points(count: int) -> None:
 
 def test_a_camera_view_crop_is_no_surprise_after_full_scans() -> None:
     assert check(street()[::6]) == []
-
-
-def test_real_bundles_carry_it(tiny_bundle: object) -> None:
-    assert load_bundle(tiny_bundle).expected_input.ground_z_m == (-1.9, -1.6)  # type: ignore[arg-type]

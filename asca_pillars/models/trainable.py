@@ -1,0 +1,74 @@
+"""What training, evaluation in PyTorch and checkpoints need of a family of detectors, whatever is inside it."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol, Self
+
+import numpy as np
+from torch import Tensor, nn
+
+from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.detector_spec import DetectorSpec
+
+
+class Movable(Protocol):
+    """A batch of tensors that can move to a device."""
+
+    def to(self, device: Any) -> Self:
+        """The same batch with its tensors on `device`."""
+        ...
+
+
+class Preparation(Protocol):
+    """Frames to input and targets of a network. Loader processes do it, so it is pickled and holds no weights."""
+
+    def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> Any:
+        """One frame, NumPy arrays only.
+
+        Args:
+            frame: points and boxes in the LiDAR frame; every box lies within the detector's ranges.
+            rng: draws what the detector's limits leave to chance; None chooses the same every time.
+        """
+        ...
+
+    def collate(self, frames: Sequence[Any]) -> Movable:
+        """What `prepare` gave for B frames as one batch of tensors."""
+        ...
+
+
+class Trainable(Protocol):
+    """A detector that can be trained; a `torch.nn.Module` that has the methods below.
+
+    Outputs are the family's own: what `predict` gives goes to `loss` and to `detect`, and nobody else looks inside.
+    """
+
+    @property
+    def preparation(self) -> Preparation:
+        """How its batches are made."""
+        ...
+
+    def predict(self, batch: Any) -> Any:
+        """Outputs of the network for a batch that `preparation.collate` made."""
+        ...
+
+    def loss(self, outputs: Any, batch: Any) -> Mapping[str, Tensor]:
+        """Weighted terms of the loss by name, scalars; training minimizes their sum."""
+        ...
+
+    def detect(self, outputs: Any, spec: DetectorSpec) -> list[Detections]:
+        """Detections of each of the B frames, best first, with the thresholds of `spec`."""
+        ...
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """See `torch.nn.Module`, as for all that follow."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
+
+    def to(self, device: Any) -> Self: ...
+
+    def train(self, mode: bool = True) -> Self: ...
+
+    def eval(self) -> Self: ...

@@ -1,0 +1,158 @@
+"""What happens around the steps of a run: progress, Ctrl-C, the average of the weights."""
+
+import signal
+import threading
+from typing import Any
+
+import lightning as L  # noqa: N812  (Lightning's own convention)
+from lightning.pytorch.callbacks import Checkpoint, ProgressBar, WeightAveraging
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
+
+from asca_pillars.errors import TrainingError
+from asca_pillars.training.checkpoints import LastCheckpoint
+
+
+class TrainingInterruptedError(TrainingError):
+    """Ctrl-C: the run is saved and can go on."""
+
+
+class SaveOnInterrupt(Checkpoint):
+    """The first Ctrl-C waits for the step to end, saves, and stops; the second one stops at once.
+
+    A `Checkpoint`, because those act after everything else that a step changes.
+
+    Args:
+        last: what saves.
+    """
+
+    def __init__(self, last: LastCheckpoint) -> None:
+        self.last = last
+        self.asked = False
+        self._before: Any = None
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take over SIGINT, which only the main thread may."""
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._ask)
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Save and stop, on all ranks together."""
+        if self._any_rank_asked(trainer):
+            self.last.save(trainer)
+            self._stop(trainer)
+
+    def on_validation_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Stop: the epoch was saved before its validation."""
+        if not trainer.sanity_checking and self._any_rank_asked(trainer):
+            self._stop(trainer)
+
+    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Give SIGINT back."""
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+            self._before = None
+
+    def _ask(self, *_: Any) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, self._before)
+
+    def _any_rank_asked(self, trainer: L.Trainer) -> bool:
+        return trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+
+    def _stop(self, trainer: L.Trainer) -> None:
+        raise TrainingInterruptedError(f"interrupted and saved at step {trainer.global_step}; the same command goes on")
+
+
+class RunProgress(ProgressBar):
+    """One bar over all steps of the run, so that the time that is left is that of the run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._enabled = True
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=True, compact=True),
+            TextColumn("{task.fields[loss]}"),
+            speed_estimate_period=600,
+        )
+        self._task = self._bar.add_task("Starting", total=None, loss="")
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether this rank prints."""
+        return self._enabled
+
+    def disable(self) -> None:
+        """Of the ranks that do not print."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Of the rank that prints."""
+        self._enabled = True
+
+    def on_sanity_check_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Show that something happens from the first loader process on."""
+        self._start("Checking validation")
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Know the length of the run."""
+        total = (trainer.max_epochs or 0) * pl_module.steps_per_epoch()  # type: ignore[operator]
+        self._start("Starting")
+        self._bar.update(self._task, total=total, completed=trainer.global_step)
+
+    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Say which epoch it is, counted from one."""
+        self._bar.update(self._task, description=f"Epoch {trainer.current_epoch + 1}/{trainer.max_epochs}")
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """One step more."""
+        loss = trainer.progress_bar_metrics.get("loss")
+        self._bar.update(
+            self._task, completed=trainer.global_step, loss="" if loss is None else f"loss {float(loss):.3f}"
+        )
+
+    def on_validation_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *arguments: Any) -> None:
+        """How far a validation is stands beside the epoch."""
+        if not trainer.sanity_checking:
+            batches = sum(int(count) for count in trainer.num_val_batches)
+            done = f"validation {arguments[2] + 1}/{batches}"
+            self._bar.update(self._task, description=f"Epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, {done}")
+
+    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Leave the bar as it is."""
+        self._bar.stop()
+
+    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+        """Leave the bar as it is, or it would be drawn over the error."""
+        self._bar.stop()
+
+    def print(self, *args: Any, **_: Any) -> None:
+        """A line above the bar."""
+        if self._enabled:
+            self._bar.console.print(" ".join(map(str, args)), markup=False, highlight=False, soft_wrap=True)
+
+    def _start(self, what: str) -> None:
+        if self._enabled:
+            self._bar.update(self._task, description=what)
+            self._bar.start()
+
+
+def weight_average(decay: float) -> WeightAveraging:
+    """Exponential moving average of weights and normalization statistics, for validation and checkpoints.
+
+    It forgets faster at first: after n steps the decay is at most (1 + n) / (10 + n), so that random weights are gone
+    from it in short runs, too.
+    """
+
+    def average(averaged: Tensor, current: Tensor, steps: Tensor | int) -> Tensor:
+        kept = min(decay, float((1 + steps) / (10 + steps)))
+        if not averaged.is_floating_point():  # batches that a normalization has counted
+            return current
+        return averaged * kept + current * (1 - kept)
+
+    return WeightAveraging(avg_fn=average)

@@ -1,0 +1,114 @@
+"""A run's checkpoints: written whole, two generations of the last one, and the one to go on from."""
+
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import lightning as L  # noqa: N812  (Lightning's own convention)
+import torch
+from lightning.fabric.plugins import TorchCheckpointIO
+from lightning.pytorch.callbacks import Checkpoint
+
+from asca_pillars.errors import TrainingError
+from asca_pillars.files import atomic_path
+
+LAST, PREVIOUS, BEST, WEIGHTS = "last.ckpt", "previous.ckpt", "best.ckpt", "weights.ckpt"
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Checkpoints that a kill cannot leave half written; the last one before stays as previous.ckpt.
+
+    Args:
+        keep_last: whether the last.ckpt that is there is worth keeping; a damaged one is not.
+    """
+
+    def __init__(self, keep_last: bool) -> None:
+        super().__init__()
+        self.keep_last = keep_last
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
+        """Write `checkpoint` to `path`."""
+        path = Path(path)
+        with atomic_path(path) as temporary:
+            torch.save(checkpoint, temporary)
+            if path.name == LAST:
+                if self.keep_last and path.exists():
+                    path.replace(path.with_name(PREVIOUS))  # a kill now leaves that one to go on from
+                self.keep_last = True
+
+
+class LastCheckpoint(Checkpoint):
+    """Saves last.ckpt every so many steps and with the last step of each epoch, before validation.
+
+    It acts after everything else that a step changes: weights, their average, the schedule.
+
+    Args:
+        folder: of the checkpoints.
+        every_steps: optimizer steps between two.
+    """
+
+    def __init__(self, folder: Path, every_steps: int) -> None:
+        self.folder, self.every_steps = folder, every_steps
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Save if it is time."""
+        if trainer.global_step % self.every_steps == 0 or trainer.is_last_batch:
+            self.save(trainer)
+
+    def save(self, trainer: L.Trainer) -> None:
+        """Save now; between two steps of training only."""
+        trainer.save_checkpoint(self.folder / LAST)
+
+
+def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
+    """The newest checkpoint of a run that can be read, or None in a new run; and what is wrong with a newer one.
+
+    Raises:
+        TrainingError: there are checkpoints, but none to go on from.
+    """
+    damage: list[str] = []
+    for path in (folder / LAST, folder / PREVIOUS):
+        if not path.exists():
+            continue
+        try:
+            torch.load(path, map_location="cpu", weights_only=True, mmap=False)
+        except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as e:
+            damage.append(f"{path} is damaged ({(str(e).splitlines() or [type(e).__name__])[0]})")
+        else:
+            return path, damage[0] if damage else None
+    if damage:
+        raise TrainingError(
+            f"{damage[0]} and there is no {PREVIOUS} to go on from; start a new run in another --out, "
+            f"with the weights of this one if {folder / BEST} is there: --init {folder / BEST}"
+        )
+    return None, None
+
+
+def save_weights(checkpoint: Path) -> Path:
+    """Write weights.ckpt beside a checkpoint: what detecting, exporting and --init need, in half the digits.
+
+    Matrices and kernels are float16; what is added or divided by (biases, statistics of the normalization) stays
+    float32. Optimizer and averaging are left out: a run cannot be resumed from it.
+    """
+    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    content = {
+        "hyper_parameters": content["hyper_parameters"],
+        "global_step": content["global_step"],
+        "state_dict": {
+            name: value.half() if value.is_floating_point() and value.ndim > 1 else value
+            for name, value in content["state_dict"].items()
+        },
+    }
+    path = checkpoint.with_name(WEIGHTS)
+    with atomic_path(path) as temporary:
+        torch.save(content, temporary)
+    return path
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files of a run that was killed while it saved; another process may be doing the same."""
+    if int(os.environ.get("LOCAL_RANK", 0)) == 0:
+        for leftover in folder.glob(".*"):
+            leftover.unlink(missing_ok=True)

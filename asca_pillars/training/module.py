@@ -1,0 +1,126 @@
+"""What one step of training and of validation does, whatever the family of detectors."""
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import lightning as L  # noqa: N812  (Lightning's own convention)
+import torch
+from torch import Tensor
+
+from asca_pillars.config import Config
+from asca_pillars.data.expected_input import ExpectedInput
+from asca_pillars.errors import AscaError, TrainingError
+from asca_pillars.evaluation.recall import RecallTally
+from asca_pillars.models.build import build_model
+from asca_pillars.schema import to_dict
+from asca_pillars.training.dataset import Batch
+
+
+class DetectionModule(L.LightningModule):
+    """One training step and one validation step of a detector.
+
+    Args:
+        config: of the run.
+        expected_input: of its training scans; it goes into every checkpoint.
+    """
+
+    def __init__(self, config: Config, expected_input: ExpectedInput | None = None) -> None:
+        super().__init__()
+        measured = None if expected_input is None else to_dict(expected_input)
+        self.save_hyperparameters({"config": to_dict(config), "expected_input": measured})
+        self.config = config
+        self.detector = build_model(config.model)
+        self.recall = RecallTally(config.model.spec.class_names)
+
+    def training_step(self, batch: Batch | AscaError, _: int) -> Tensor:
+        """The loss of one batch.
+
+        Raises:
+            AscaError: a frame of the batch could not be read, or a term of its loss is not finite.
+        """
+        batch = _read(batch)
+        terms = self.detector.loss(self.detector.predict(batch.inputs), batch.inputs)
+        total = _total(terms)
+        self._require_finite(terms, batch)
+        self.log_dict(_named(terms, "train"), batch_size=len(batch.frame_ids))
+        self.log("loss", total.detach(), prog_bar=True, logger=False)
+        return total
+
+    def validation_step(self, batch: Batch | AscaError, _: int) -> None:
+        """Loss, recall and false detections of one batch."""
+        batch = _read(batch)
+        outputs = self.detector.predict(batch.inputs)
+        terms = self.detector.loss(outputs, batch.inputs)
+        self.log_dict(_named(terms, "val"), sync_dist=True, batch_size=len(batch.frame_ids))
+        found = self.detector.detect(outputs, self.config.model.spec)
+        for detections, boxes, labels in zip(found, batch.boxes, batch.labels, strict=True):
+            self.recall.add(detections, boxes, labels)
+
+    def on_validation_epoch_end(self) -> None:
+        """Recall over the frames of all ranks: counts are summed, because a mean of shares is not the share."""
+        counts = self.trainer.strategy.reduce(torch.from_numpy(self.recall.counts).to(self.device), reduce_op="sum")
+        self.recall = RecallTally(self.config.model.spec.class_names, counts.cpu().numpy())
+        rows = self.recall.rows()
+        for name, row in rows.items():
+            self.log(f"val/recall/{name}", row.recall)
+            self.log(f"val/false_per_frame/{name}", row.false_per_frame)
+        if not self.trainer.sanity_checking:
+            found = ", ".join(f"{name} {row.recall:.2f} ({row.false_per_frame:.2f})" for name, row in rows.items())
+            self.print(f"epoch {self.current_epoch + 1}: recall (false per frame): {found}")
+        self.recall = RecallTally(self.config.model.spec.class_names)
+
+    def configure_optimizers(self) -> Any:
+        """Adam, and the schedule of the configuration; both count optimizer steps."""
+        recipe = self.config.train
+        optimizer = torch.optim.Adam(
+            self.parameters(),
+            lr=recipe.learning_rate,
+            weight_decay=recipe.weight_decay,
+            decoupled_weight_decay=True,
+        )
+        steps = self.steps_per_epoch()
+        if recipe.schedule == "step":
+            # Counted in steps, so that a checkpoint taken just before the end of an epoch holds all of its state.
+            schedule: Any = torch.optim.lr_scheduler.StepLR(optimizer, recipe.decay_epochs * steps, recipe.decay)
+        else:
+            schedule = torch.optim.lr_scheduler.OneCycleLR(
+                optimizer,
+                max_lr=recipe.learning_rate,
+                total_steps=recipe.epochs * steps,
+                pct_start=0.3,
+                div_factor=10,
+            )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def steps_per_epoch(self) -> int:
+        """Optimizer steps of one epoch.
+
+        Not Lightning's `estimated_stepping_batches`: that opens the loader before a checkpoint has told the step at
+        which the sampler is to go on.
+        """
+        frames = len(self.trainer.datamodule.training_set)  # type: ignore[attr-defined]
+        return int(frames // (self.config.train.batch_size * self.trainer.world_size))
+
+    def _require_finite(self, terms: Mapping[str, Tensor], batch: Batch) -> None:
+        for name, value in terms.items():
+            if not torch.isfinite(value):
+                raise TrainingError(
+                    f"loss term `{name}` became {value.item()} at step {self.global_step} on frames "
+                    f"{', '.join(batch.frame_ids)}; look at these frames, or lower train.learning_rate"
+                )
+
+
+def _read(batch: Batch | AscaError) -> Batch:
+    if isinstance(batch, AscaError):
+        raise batch
+    return batch
+
+
+def _total(terms: Mapping[str, Tensor]) -> Tensor:
+    return functools.reduce(torch.add, terms.values())
+
+
+def _named(terms: Mapping[str, Tensor], stage: str) -> dict[str, Tensor]:
+    named = {f"{stage}/{name}": value.detach() for name, value in terms.items()}
+    return {f"{stage}/loss": _total(terms).detach()} | named

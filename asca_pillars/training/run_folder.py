@@ -1,0 +1,86 @@
+"""The folder of a run: what it is, so that only the same run goes on in it."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.progress import track
+
+from asca_pillars.config import Config, load_config
+from asca_pillars.data.expected_input import ExpectedInput, measure_expected_input
+from asca_pillars.data.frames import read_frame
+from asca_pillars.errors import TrainingError
+from asca_pillars.files import atomic_path
+from asca_pillars.schema import parse, to_dict
+from asca_pillars.system import describe_environment
+from asca_pillars.training.dataset import KittiDataset
+
+EXPECTED_INPUT_FRAMES = 200
+# Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.
+NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
+
+
+def claim(out: Path, config: Config) -> None:
+    """Write what this run is into `out`, or make sure that the run found there is the same one.
+
+    A run of the `step` schedule may be made longer: its steps so far are those of the longer run.
+
+    Raises:
+        TrainingError: the run there is another one.
+    """
+    resolved = to_dict(config)
+    path = out / "config.yaml"
+    if path.exists():
+        found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
+        found = to_dict(found_config)
+        longer = config.train.epochs > found_config.train.epochs
+        if longer and config.train.schedule == "step":
+            found["train"]["epochs"] = config.train.epochs
+        if difference := _first_difference(found, resolved):
+            if longer and difference.startswith("train.epochs"):
+                raise TrainingError(
+                    f"{path}: the run there was started with {difference}; a one_cycle schedule is planned for its "
+                    f"whole length: start a new run in another --out with --init {out / 'checkpoints' / 'last.ckpt'}"
+                )
+            raise TrainingError(
+                f"{path}: the run there was started with {difference}; choose another --out, or delete it"
+            )
+    else:
+        with atomic_path(out / "environment.json") as temporary:
+            temporary.write_text(describe_environment(), encoding="utf-8")
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml.safe_dump(resolved, sort_keys=False), encoding="utf-8")
+
+
+def measure_input(out: Path, frames: KittiDataset) -> ExpectedInput:
+    """What up to EXPECTED_INPUT_FRAMES evenly spaced training scans look like; kept in `out` for a resumed run.
+
+    Raises:
+        DatasetError, ScanError: a frame cannot be read.
+        TrainingError: no frame has a point.
+    """
+    path = out / "expected_input.yaml"
+    if path.exists():
+        return parse(ExpectedInput, yaml.safe_load(path.read_text(encoding="utf-8")), str(path))
+    ids = frames.frame_ids
+    count = min(len(ids), EXPECTED_INPUT_FRAMES)
+    chosen = track([ids[i * len(ids) // count] for i in range(count)], "Measuring training scans", transient=True)
+    scans = (read_frame(frames.split, one, (), camera_view=frames.camera_view).points for one in chosen)
+    try:
+        measured = measure_expected_input(scans, frames.camera_view)
+    except ValueError:
+        raise TrainingError(f"{frames.split.root}: no scan of list `{frames.split.name}` has a point to see") from None
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml.safe_dump(to_dict(measured)), encoding="utf-8")
+    return measured
+
+
+def _first_difference(found: Any, wanted: Any, key: str = "") -> str | None:
+    if key in NOT_OF_THE_RUN:
+        return None
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for name in wanted | found:
+            if difference := _first_difference(found.get(name), wanted.get(name), f"{key}.{name}".lstrip(".")):
+                return difference
+        return None
+    return None if found == wanted else f"{key} = {found}, now {key} = {wanted}"

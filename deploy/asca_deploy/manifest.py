@@ -1,0 +1,229 @@
+"""bundle.json: read, compared with the graphs beside it, and written.
+
+A manifest that does not belong to its graphs would move boxes without any error. So everything that boxes depend on
+is also in the metadata of each graph, under the graph's SHA-256, and the two have to agree.
+"""
+
+import hashlib
+import json
+import reprlib
+from pathlib import Path
+from typing import Any
+
+from asca_deploy.bundle import MANIFEST, PILLAR_GRAPHS, SCHEMA_VERSION, Bundle, GraphFile
+from asca_deploy.layout import difference, layout_of
+from asca_deploy.onnx_file import has_external_data, read_metadata
+from asca_pillars.errors import AscaError, BundleError
+from asca_pillars.files import atomic_path
+from asca_pillars.schema import parse, to_dict
+
+ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
+"""Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
+
+_ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
+_LARGEST_BYTES = 1 << 20
+_LONGEST_REASON = 300
+_EXPORT_AGAIN = "export the bundle again with `asca export`"
+
+
+def load_bundle(folder: str | Path) -> Bundle:
+    """Read and verify a bundle: every key, the graphs' SHA-256, their stamped metadata, the derived layout.
+
+    Raises:
+        BundleError: the bundle is missing, damaged, mixed up with another or made for another version;
+            one line that names the file, the value and the remedy.
+    """
+    folder = Path(folder)
+    manifest = folder / MANIFEST
+    data = _read_manifest(manifest)
+    old = data["schema_version"] == 2
+    stamped = {key: data.get(key) for key in (_ESSENTIALS_2 if old else ESSENTIALS)}
+    if old:
+        data = upgrade_schema_2(data)
+    layout = None
+    if isinstance(section := data.get("pillar"), dict):
+        data["pillar"] = dict(section)
+        layout = data["pillar"].pop("layout", None)
+    try:
+        bundle = parse(Bundle, data, str(manifest))
+        if ignored := _first_difference(data, to_dict(bundle)):
+            raise BundleError(f"`{ignored}` is missing or of the wrong type")
+    except AscaError as error:
+        # The grid and the classes check themselves and do not know the file they were read from.
+        raise BundleError(f"{_blamed(manifest, error)}; {_EXPORT_AGAIN}") from None
+    except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
+        raise BundleError(f"{manifest}: a value makes no sense ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
+    if set(bundle.graphs) != set(PILLAR_GRAPHS):
+        raise BundleError(
+            f"{manifest}: a pillar detector has the graphs {' and '.join(PILLAR_GRAPHS)}, not "
+            f"{_cut(', '.join(bundle.graphs)) or 'none'}; {_EXPORT_AGAIN}"
+        )
+    for graph in bundle.graphs.values():
+        _verify_graph(folder, graph, stamped)
+    if differs := difference(layout, layout_of(bundle.spec)):
+        raise BundleError(
+            f"{manifest}: `pillar.layout.{differs}` is not what this version derives from `spec`; {_EXPORT_AGAIN}"
+        )
+    return bundle
+
+
+def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
+    """The manifest of a bundle of schema 2 as schema 3 would have written it; what makes no sense stays so.
+
+    Schema 2 knew pillar detectors alone, measured the expected input on the scans given to the export, and did not
+    say whether the model was trained on the camera's view; `asca eval` took it for granted.
+    """
+    data = dict(data)
+    pillar = {key: data.pop(key) for key in ("cpa", "channels", "canvas", "layout") if key in data}
+    if isinstance(expected := data.get("expected_input"), dict):
+        data["expected_input"] = {**expected, "camera_view": True}
+    if isinstance(quantization := data.get("quantization"), dict):
+        data["quantization"] = {**quantization, "dropped_scans": None}
+    return {
+        **data,
+        "schema_version": SCHEMA_VERSION,
+        "kind": "pillar",
+        "pillar": pillar,
+        "expected_input_from": "export",
+    }
+
+
+def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
+    """Write bundle.json beside the graphs in `folder`, which must lie there already, stamped with `essentials`."""
+    data = bundle_to_json(bundle)
+    for graph in bundle.graphs.values():
+        _verify_graph(Path(folder), graph, {key: data[key] for key in ESSENTIALS})
+    with atomic_path(Path(folder) / MANIFEST) as path:
+        path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
+    """What bundle.json holds: the bundle's fields, and the layout that readers in other languages need."""
+    data = {"schema_version": bundle.schema_version, **to_dict(bundle)}
+    data["pillar"]["layout"] = layout_of(bundle.spec)
+    return data
+
+
+def essentials(bundle: Bundle) -> dict[str, Any]:
+    """What the export stamps into the metadata of each graph, see ESSENTIALS."""
+    data = bundle_to_json(bundle)
+    return {key: data[key] for key in ESSENTIALS}
+
+
+def graph_files(folder: str | Path) -> dict[str, GraphFile]:
+    """The graphs of a pillar detector as they lie in `folder`, encoder.onnx and backbone.onnx."""
+    files = {name: f"{name}.onnx" for name in PILLAR_GRAPHS}
+    return {name: GraphFile(file, _sha256((Path(folder) / file).read_bytes())) for name, file in files.items()}
+
+
+def _read_manifest(manifest: Path) -> dict[str, Any]:
+    try:
+        if manifest.stat().st_size > _LARGEST_BYTES:
+            raise BundleError(f"{manifest} is larger than a manifest ever is (1 MiB); {_EXPORT_AGAIN}")
+        text = manifest.read_text(encoding="utf-8")
+        data = json.loads(text, object_pairs_hook=_without_duplicates, parse_constant=_no_number)
+    except (FileNotFoundError, NotADirectoryError):
+        raise BundleError(
+            f"{manifest.parent} is no model bundle, it holds no {MANIFEST}; make one with `asca export`"
+        ) from None
+    except OSError as error:
+        raise BundleError(f"{manifest}: {error.strerror}") from None
+    except RecursionError:
+        raise BundleError(f"{manifest} is damaged (nested too deeply); {_EXPORT_AGAIN}") from None
+    except ValueError as error:  # of the JSON, or of its UTF-8
+        raise BundleError(f"{manifest} is damaged ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
+    version = data.get("schema_version") if isinstance(data, dict) else None
+    if type(version) is not int:
+        shown = reprlib.repr(version)
+        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {shown}; {_EXPORT_AGAIN}")
+    if version > SCHEMA_VERSION:
+        raise BundleError(
+            f"{manifest}: schema_version {reprlib.repr(version)} is newer than {SCHEMA_VERSION}, which this version "
+            "reads; upgrade with `pip install --upgrade asca-pillars`"
+        )
+    if version < 2:
+        raise BundleError(f"{manifest}: schema_version {reprlib.repr(version)} is no longer read; {_EXPORT_AGAIN}")
+    return dict(data)
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for number, (key, _) in enumerate(pairs) if key in dict(pairs[:number]))
+        raise ValueError(f"key `{_cut(twice)}` is there twice")
+    return found
+
+
+def _no_number(word: str) -> Any:
+    raise ValueError(f"{word} is no number")
+
+
+def _blamed(manifest: Path, error: AscaError) -> str:
+    reason = str(error).removeprefix(f"{manifest}: ")
+    return f"{manifest}: {_cut(reason)}"
+
+
+def _cut(reason: str) -> str:
+    """Text that holds a file's content, on one line of bounded length."""
+    line = "".join(mark if mark.isprintable() else ascii(mark)[1:-1] for mark in reason[:_LONGEST_REASON])
+    return line if len(reason) <= _LONGEST_REASON else f"{line}..."
+
+
+def _first_difference(written: Any, understood: Any) -> str | None:
+    """Path of the first value that was not taken as it is written, such as true for 1 or a default; or None."""
+    if isinstance(understood, dict):
+        if not isinstance(written, dict):
+            return "*"
+        for key, value in understood.items():
+            if key not in written:
+                return str(key)
+            if inner := _first_difference(written[key], value):
+                return key if inner == "*" else f"{key}.{inner}"
+        return None
+    if isinstance(understood, list):
+        if not isinstance(written, list) or len(written) != len(understood):
+            return "*"
+        for index, (ours, theirs) in enumerate(zip(written, understood, strict=True)):
+            if inner := _first_difference(ours, theirs):
+                return str(index) if inner == "*" else f"{index}.{inner}"
+        return None
+    if isinstance(understood, float) and type(written) is int:
+        return None if written == understood else "*"
+    return None if type(written) is type(understood) and written == understood else "*"
+
+
+def _verify_graph(folder: Path, graph: GraphFile, stamped: dict[str, Any]) -> None:
+    """Raise BundleError unless the file is there, whole, complete in itself, and stamped with these values."""
+    path = folder / graph.file
+    if not path.is_file():
+        raise BundleError(f"{path} is missing; copy the whole folder, or {_EXPORT_AGAIN}")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise BundleError(f"{path}: {error.strerror}") from None
+    found = _sha256(content)
+    if found != graph.sha256:
+        raise BundleError(
+            f"{path} is damaged or belongs to another bundle: its SHA-256 is {found[:12]}..., {MANIFEST} says"
+            f" {graph.sha256[:12]}...; copy the whole folder again, or {_EXPORT_AGAIN}"
+        )
+    try:
+        metadata = read_metadata(content)
+        if has_external_data(content):
+            raise BundleError(f"{path} keeps weights in another file, which no SHA-256 covers; {_EXPORT_AGAIN}")
+        for key, value in stamped.items():
+            if key not in metadata or _canonical(json.loads(metadata[key])) != _canonical(value):
+                raise BundleError(
+                    f"{folder / MANIFEST}: `{key}` is not the one that {graph.file} was exported with; "
+                    f"copy the whole folder again, or {_EXPORT_AGAIN}"
+                )
+    except (ValueError, RecursionError) as error:
+        raise BundleError(f"{path} is damaged ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
+
+
+def _canonical(value: Any) -> str:
+    return json.dumps(value, sort_keys=True)
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

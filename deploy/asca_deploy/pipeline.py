@@ -1,0 +1,54 @@
+"""What a family of detectors has to bring along to be run by `Detector`."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.frame_report import ScanCounts
+
+Laps: TypeAlias = list[tuple[str, float]]
+"""A scan's stages in the order in which they ended: name, and `time.perf_counter()` at the end. A stage lasts from the
+end before it; a name may come twice."""
+
+
+class Prepared(Protocol):
+    """A scan on its way into the network."""
+
+    @property
+    def counts(self) -> ScanCounts:
+        """What became of its points."""
+
+
+P = TypeVar("P", bound=Prepared)
+R = TypeVar("R")
+
+
+class Pipeline(Protocol[P, R]):
+    """The way from points to boxes, in three parts that `Detector.stream` runs at once for different scans.
+
+    What belongs to one scan travels in the arguments and results, so that several threads may be in one pipeline.
+    Each part appends the stages that it is through with to `laps`.
+    """
+
+    spec: Any
+    """The bundle's numbers; the same with other score thresholds may be put in their place."""
+
+    @property
+    def stages(self) -> Sequence[str]:
+        """Names of the stages, in order."""
+
+    @property
+    def network_stages(self) -> Sequence[str]:
+        """Those of them that are spent in graphs."""
+
+    def prepare(self, points: NDArray[np.float32], laps: Laps) -> P:
+        """(N, 4) finite x, y, z in metres, LiDAR frame, and reflectance 0..1 -> the input of the slowest network."""
+
+    def infer(self, prepared: P, laps: Laps) -> R:
+        """Run the slowest network; each prepared scan may be given once."""
+
+    def finish(self, raw: R, laps: Laps) -> Detections:
+        """What the network answered -> boxes."""

@@ -1,0 +1,49 @@
+"""A bundle written again for this version, its networks as they are.
+
+    python -m asca_export.reissue asca_small_sim --scans data/sim/training/velodyne -o bundles/asca_small_sim
+
+Bundles of an older schema are read as they are; this is for those that are handed on: their graphs get today's stamp,
+and `expected_input` is measured on scans that are like those trained on.
+"""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from asca_deploy.bundle import MANIFEST, find_bundle
+from asca_deploy.manifest import load_bundle, write_bundle_manifest
+from asca_export import graphs
+from asca_pillars.data.expected_input import measure_expected_input
+from asca_pillars.data.scans.scan_reader import find_scans, read_scan
+from asca_pillars.files import atomic_directory
+
+
+def main(
+    bundle: Annotated[Path, typer.Argument(help="A bundle's folder, or the name of one that ships.")],
+    scans: Annotated[Path, typer.Option(help="Scans like those that the model was trained on.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the new bundle; must not exist.")],
+    camera_view: Annotated[bool, typer.Option(help="Whether they are cropped to the camera's image.")] = True,
+    training: Annotated[
+        bool,
+        typer.Option(help="They are of the training set; otherwise they stand in for it, and the manifest says so."),
+    ] = False,
+) -> None:
+    """Write the bundle again with the expected input measured on the scans."""
+    if out.exists():
+        raise typer.BadParameter(f"{out} exists; name another folder")
+    source = find_bundle(bundle)
+    loaded = load_bundle(source)
+    expected = measure_expected_input((read_scan(path).points for path in find_scans(scans)), camera_view)
+    with atomic_directory(out, "asca export", MANIFEST) as folder:
+        for name, graph in loaded.graphs.items():
+            shutil.copyfile(source / graph.file, graphs.graph_path(folder, name))
+        known = replace(loaded, expected_input=expected, expected_input_from="training" if training else "export")
+        signed = graphs.sign(folder, known)
+        write_bundle_manifest(folder, signed)
+
+
+if __name__ == "__main__":
+    typer.run(main)

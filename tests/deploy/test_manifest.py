@@ -1,0 +1,319 @@
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from numpy.typing import NDArray
+
+from asca_deploy import Detector
+from asca_deploy.bundle import MANIFEST, SCHEMA_VERSION, GraphFile, Parity, shipped_bundles
+from asca_deploy.layout import difference, layout_of
+from asca_deploy.manifest import bundle_to_json, graph_files, load_bundle, write_bundle_manifest
+from asca_pillars.errors import BundleError
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.pillars.pillarize import FEATURES
+from tests.deploy.conftest import sign
+
+
+def edit(bundle: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """Change bundle.json by hand."""
+    data = json.loads((bundle / MANIFEST).read_text())
+    change(data)
+    (bundle / MANIFEST).write_text(json.dumps(data))
+    return bundle
+
+
+def assert_refused(bundle: Path, message: str) -> None:
+    with pytest.raises(BundleError, match=message) as caught:
+        load_bundle(bundle)
+    text = str(caught.value)
+    assert text.isprintable() and len(text) < 1500
+    assert str(bundle) in text  # whose fault it is
+
+
+def test_round_trip(bundle_copy: Path) -> None:
+    bundle = load_bundle(bundle_copy)
+    proven = replace(bundle, parity=Parity(2e-6, 1e-5, 1e-6, scans=8, tolerance=1e-3))
+    write_bundle_manifest(bundle_copy, proven)
+    assert load_bundle(str(bundle_copy)) == proven
+    assert json.loads((bundle_copy / MANIFEST).read_text()) == bundle_to_json(proven)
+
+
+def test_layout_of_the_papers_grid(tiny_bundle: Path) -> None:
+    bundle = replace(load_bundle(tiny_bundle), spec=PillarSpec())
+    layout = bundle_to_json(bundle)["pillar"]["layout"]
+    # 69.12 m in three zones of 23.04 m: 72 x 0.32, 144 x 0.16 and 288 x 0.08 (DESIGN 4.1).
+    assert layout["x_zones"] == [
+        {"start_m": 0.0, "pillar_m": 0.32, "pillars": 72},
+        {"start_m": 23.04, "pillar_m": 0.16, "pillars": 144},
+        {"start_m": 46.08, "pillar_m": 0.08, "pillars": 288},
+    ]
+    assert layout["y_zones"] == [{"start_m": -39.68, "pillar_m": 0.16, "pillars": 496}]
+    assert layout["canvas_shape"] == [497, 505]
+    assert layout["head_shape"] == [248, 252]
+    assert layout["features"] == list(FEATURES)
+
+
+def test_layout_of_a_uniform_grid_is_one_zone(tiny_bundle: Path) -> None:
+    grid = PillarGrid(x_range_m=(3.0, 15.8), y_range_m=(-2.56, 1.28), v_max_m=0.16, zones=1)
+    layout = bundle_to_json(replace(load_bundle(tiny_bundle), spec=PillarSpec(grid=grid)))["pillar"]["layout"]
+    assert layout["x_zones"] == [{"start_m": 3.0, "pillar_m": 0.16, "pillars": 80}]
+
+
+NOT_THE_GRAPHS = r"`{}` is not the one that \w+\.onnx was exported with; .*export"
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (lambda layout: layout["features"].reverse(), "features.0"),
+        (lambda layout: layout["x_zones"][1].update(pillar_m=0.17), "x_zones.1.pillar_m"),
+        (lambda layout: layout["x_zones"].pop(), "x_zones"),
+        (lambda layout: layout.update(canvas_shape=[56, 24]), "canvas_shape.0"),
+        (lambda layout: layout.pop("anchor_yaws_rad"), r"\*"),
+        (lambda layout: layout.update(head_shape="12x28"), "head_shape"),
+    ],
+)
+def test_a_layout_that_does_not_follow_from_the_spec(
+    tiny_bundle: Path, change: Callable[[dict[str, Any]], object], key: str
+) -> None:
+    layout = layout_of(load_bundle(tiny_bundle).spec)
+    written = json.loads(json.dumps(layout))
+    assert difference(written, layout) is None
+    change(written)
+    found = difference(written, layout)
+    assert found is not None and re.fullmatch(key, found)
+
+
+def test_a_layout_within_rounding_is_accepted(tiny_bundle: Path) -> None:
+    layout = layout_of(load_bundle(tiny_bundle).spec)
+    written = json.loads(json.dumps(layout))
+    written["x_zones"][0].update(start_m=2.0000000004)
+    assert difference(written, layout) is None
+
+
+def test_a_signed_layout_that_does_not_follow_from_the_spec(bundle_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a version whose features meant something else would have written it."""
+    bundle = load_bundle(bundle_copy)
+    other = layout_of(bundle.spec) | {"features": ["z", "y", "x"]}
+    with monkeypatch.context() as patched:
+        patched.setattr("asca_deploy.manifest.layout_of", lambda spec: other)
+        sign(bundle_copy, bundle)
+    assert_refused(bundle_copy, r"`pillar\.layout\.features` is not what .* derives from `spec`; export")
+
+
+@pytest.mark.parametrize("change", [lambda data: data["pillar"].pop("layout"), lambda data: data.update(pillar=[])])
+def test_no_layout(bundle_copy: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    edit(bundle_copy, change)
+    assert_refused(bundle_copy, "pillar")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data["pillar"].update(chanels=8), r"unknown key `pillar\.chanels`; did you mean `channels`"),
+        (
+            lambda data: data["spec"]["grid"].update(v_maxm=0.3),
+            r"unknown key `spec\.grid\.v_maxm`; did you mean `v_max_m`",
+        ),
+        (lambda data: data["provenance"].update(sead=3), r"unknown key `provenance\.sead`"),
+        (lambda data: data.pop("license"), "missing key `license`"),
+        (lambda data: data["spec"]["grid"].update(zones=9), "zones 9 must lie between 1 and 5"),
+        (lambda data: data["pillar"].update(channels="many"), r"`pillar\.channels` = 'many'"),
+        (lambda data: data["pillar"].update(channels=True), r"`pillar\.channels` is missing or of the wrong type"),
+        (lambda data: data["spec"].pop("post"), r"`spec\.post` is missing"),
+        (lambda data: data["graphs"].pop("encoder"), "graphs encoder and backbone, not backbone"),
+        (lambda data: data["graphs"]["encoder"].update(sha256="0\x1b[31m"), r"sha256 .* is no SHA-256"),
+        (lambda data: data["expected_input"].update(ground_z_m=[1.0]), r"expected_input\.ground_z_m"),
+    ],
+)
+def test_wrong_keys_and_values(bundle_copy: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
+    edit(bundle_copy, change)
+    assert_refused(bundle_copy, f"{message}.*export the bundle again")
+
+
+@pytest.mark.parametrize("version", [None, "1", 1.0, True, [1]])
+def test_no_usable_schema_version(bundle_copy: Path, version: object) -> None:
+    edit(bundle_copy, lambda data: data.update(schema_version=version))
+    assert_refused(bundle_copy, "`schema_version` is .*export the bundle again")
+
+
+def test_newer_schema_version_is_said_before_anything_else(bundle_copy: Path) -> None:
+    edit(bundle_copy, lambda data: data.update(schema_version=SCHEMA_VERSION + 1, graphs="packed"))
+    assert_refused(bundle_copy, r"schema_version 4 is newer .*pip install --upgrade asca-pillars")
+
+
+def test_older_schema_version(bundle_copy: Path) -> None:
+    edit(bundle_copy, lambda data: data.update(schema_version=1))
+    assert_refused(bundle_copy, "schema_version 1 is no longer read; export the bundle again")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"bundle"', "null", "\xff"])
+def test_a_manifest_that_is_no_manifest(bundle_copy: Path, text: str) -> None:
+    (bundle_copy / MANIFEST).write_bytes(text.encode("latin-1"))
+    assert_refused(bundle_copy, "is damaged|is not a bundle's manifest")
+
+
+@pytest.mark.parametrize("graph", ["encoder.onnx", "backbone.onnx"])
+def test_a_damaged_graph(bundle_copy: Path, graph: str) -> None:
+    content = bytearray((bundle_copy / graph).read_bytes())
+    content[len(content) // 2] ^= 1
+    (bundle_copy / graph).write_bytes(content)
+    assert_refused(bundle_copy, rf"{graph} is damaged or belongs to another bundle: its SHA-256")
+
+
+def test_a_missing_graph(bundle_copy: Path) -> None:
+    (bundle_copy / "backbone.onnx").unlink()
+    assert_refused(bundle_copy, r"backbone\.onnx is missing")
+
+
+@pytest.mark.parametrize(
+    "name", ["../encoder.onnx", "/etc/passwd", "a/b.onnx", "..", "", "c:x.onnx", "..\\x", "x" * 100_000, "a\0"]
+)
+def test_graph_names_stay_inside_the_folder(bundle_copy: Path, name: str) -> None:
+    edit(bundle_copy, lambda data: data["graphs"]["encoder"].update(file=name))
+    assert_refused(bundle_copy, "is not a file name")
+
+
+def test_no_bundle_there(tmp_path: Path) -> None:
+    assert_refused(tmp_path / "nowhere", "is no model bundle.*asca export")
+    assert_refused(tmp_path, "is no model bundle")
+    checkpoint = tmp_path / "last.ckpt"
+    checkpoint.write_bytes(b"weights")
+    assert_refused(checkpoint, "is no model bundle")
+
+
+def test_a_manifest_is_not_written_for_graphs_that_are_not_there(bundle_copy: Path, tmp_path: Path) -> None:
+    bundle = load_bundle(bundle_copy)
+    swapped = replace(bundle, graphs={**bundle.graphs, "backbone": GraphFile("other.onnx", "0" * 64)})
+    with pytest.raises(BundleError, match=r"other\.onnx is missing"):
+        write_bundle_manifest(bundle_copy, swapped)
+    assert load_bundle(bundle_copy) == bundle
+
+
+def test_an_edit_of_what_boxes_depend_on_is_noticed(bundle_copy: Path) -> None:
+    edit(bundle_copy, lambda data: data["spec"]["classes"][0].update(length_m=13.9))
+    assert_refused(bundle_copy, NOT_THE_GRAPHS.format("spec"))
+
+
+def test_graphs_without_a_stamp(bundle_copy: Path) -> None:
+    bundle = load_bundle(bundle_copy)
+    model = onnx.load(bundle_copy / "encoder.onnx")
+    del model.metadata_props[:]
+    onnx.save(model, bundle_copy / "encoder.onnx")
+    with pytest.raises(BundleError, match=r"not the one that encoder\.onnx was exported with"):
+        write_bundle_manifest(bundle_copy, replace(bundle, graphs=graph_files(bundle_copy)))
+
+
+def test_graphs_with_external_data(bundle_copy: Path) -> None:
+    bundle = load_bundle(bundle_copy)
+    model = onnx.load(bundle_copy / "backbone.onnx")
+    onnx.save(model, bundle_copy / "backbone.onnx", save_as_external_data=True, location="w.bin", size_threshold=0)
+    data = json.loads((bundle_copy / MANIFEST).read_text())
+    data["graphs"]["backbone"]["sha256"] = graph_files(bundle_copy)["backbone"].sha256
+    (bundle_copy / MANIFEST).write_text(json.dumps(data))
+    assert_refused(bundle_copy, r"backbone\.onnx keeps weights in another file")
+    assert bundle.graphs  # it was a good one
+
+
+def test_duplicate_keys_and_deep_nesting(bundle_copy: Path) -> None:
+    text = (bundle_copy / MANIFEST).read_text()
+    (bundle_copy / MANIFEST).write_text(text.replace('"name": "tiny"', '"name": "tiny", "name": "tiny"', 1))
+    assert_refused(bundle_copy, "key `name` is there twice")
+    for damaged in ("[" * 200_000, '{"a":' * 50_000, text.replace("0.1", "NaN", 1), text + " " * 2_000_000):
+        (bundle_copy / MANIFEST).write_text(damaged)
+        assert_refused(bundle_copy, "is damaged|is larger than a manifest")
+
+
+def as_schema_2(folder: Path) -> Path:
+    """The bundle as the version before schema 3 wrote it."""
+    data = json.loads((folder / MANIFEST).read_text())
+    pillar = data.pop("pillar")
+    for key in ("kind", "expected_input_from"):
+        del data[key]
+    del data["expected_input"]["camera_view"]
+    if data["quantization"]:
+        del data["quantization"]["dropped_scans"]
+    data |= {"schema_version": 2, **pillar}
+    for name in ("encoder", "backbone"):
+        model = onnx.load(folder / f"{name}.onnx")
+        stamped = {key: data[key] for key in ("schema_version", "name", "cpa", "license", "spec", "layout")}
+        onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in stamped.items()})
+        onnx.save(model, folder / f"{name}.onnx")
+        data["graphs"][name]["sha256"] = graph_files(folder)[name].sha256
+    (folder / MANIFEST).write_text(json.dumps(data))
+    return folder
+
+
+def test_schema_2_is_read_as_kind_pillar(tiny_bundle: Path, bundle_copy: Path, scan: NDArray[np.float32]) -> None:
+    now, then = load_bundle(tiny_bundle), load_bundle(as_schema_2(bundle_copy))
+    expected = replace(now.expected_input, camera_view=True)
+    assert then == replace(now, graphs=then.graphs, expected_input=expected, expected_input_from="export")
+    assert np.array_equal(Detector(bundle_copy)(scan).boxes, Detector(tiny_bundle)(scan).boxes)
+    edit(bundle_copy, lambda data: data["spec"]["classes"][0].update(length_m=13.9))
+    assert_refused(bundle_copy, NOT_THE_GRAPHS.format("spec"))
+
+
+WITHOUT_EFFECT_ON_BOXES = (
+    "parity",
+    "quantization",
+    "expected_input",
+    "expected_input_from",
+    "provenance",
+    "backbone_gmac",
+)
+HOSTILE = (
+    None, True, False, -1, 0, 1, 3, 0.5, -1e308, 1e308, 2**63, 10**400, "", "0", "x" * 100_000, "\x1b[31m\n", "int8",
+    [], [None], {}, {"a": {}}, [[[]]],
+)  # fmt: skip
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Paths of all values in a manifest, the containers too."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        yield from leaves(inner, (*path, key))
+
+
+@pytest.mark.parametrize("old", [False, True], ids=["schema 3", "schema 2"])
+def test_every_field_is_refused_or_harmless(tmp_path: Path, old: bool) -> None:
+    """Each value of an int8 manifest replaced or taken out: one line, or the same boxes."""
+    folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
+    if old:
+        as_schema_2(folder)
+    good, text = load_bundle(folder), (folder / MANIFEST).read_text()
+    paths = [path for path in leaves(json.loads(text)) if path]
+    assert len(paths) > 150
+    rng = np.random.default_rng(0)
+    refused = 0
+    for path in paths:
+        for mutation in rng.choice(len(HOSTILE) + 1, 3, replace=False):
+            data = json.loads(text)
+            parent = data
+            for key in path[:-1]:
+                parent = parent[key]
+            if mutation == len(HOSTILE):
+                del parent[path[-1]]
+            else:
+                parent[path[-1]] = HOSTILE[mutation]
+            (folder / MANIFEST).write_text(json.dumps(data))
+            try:
+                found = load_bundle(folder)
+            except BundleError as error:
+                assert str(error).isprintable() and len(str(error)) < 1500 and str(folder) in str(error)
+                refused += 1
+                continue
+            assert found.spec == good.spec and found.graphs == good.graphs, path
+            if not old:  # schema 2 did not stamp the canvas, the precision and the name
+                assert (found.pillar, found.precision) == (good.pillar, good.precision), path
+                same = data == json.loads(text) or path[0] in WITHOUT_EFFECT_ON_BOXES
+                assert same, f"{path} = {parent[path[-1]]} was taken"
+    assert refused > 300

@@ -1,0 +1,105 @@
+"""Checkpoints of a run: two generations, the one to go on from, the small one; and whose run a folder holds."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from asca_pillars.config import Config, DataConfig, PillarModel, TrainConfig
+from asca_pillars.errors import TrainingError
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.schema import to_dict
+from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume, remove_leftovers, save_weights
+from asca_pillars.training.run_folder import claim
+from tests.training.test_loop import CONFIG
+
+
+def save(folder: Path, step: int, files: AtomicCheckpointIO) -> None:
+    files.save_checkpoint({"global_step": step}, folder / "last.ckpt")
+
+
+def step_of(path: Path | None) -> int:
+    assert path is not None
+    return int(torch.load(path, weights_only=True)["global_step"])
+
+
+def test_the_last_two_are_kept(tmp_path: Path) -> None:
+    files = AtomicCheckpointIO(keep_last=True)
+    assert checkpoint_to_resume(tmp_path) == (None, None)
+    for step in (1, 2, 3):
+        save(tmp_path, step, files)
+    assert step_of(tmp_path / "last.ckpt") == 3 and step_of(tmp_path / "previous.ckpt") == 2
+    assert checkpoint_to_resume(tmp_path) == (tmp_path / "last.ckpt", None)
+    (tmp_path / "last.ckpt").unlink()  # killed between the two renames
+    assert checkpoint_to_resume(tmp_path) == (tmp_path / "previous.ckpt", None)
+
+
+@pytest.mark.parametrize("size", [0, 1, 100, -1])
+def test_a_truncated_checkpoint_is_passed_over_and_not_kept(tmp_path: Path, size: int) -> None:
+    files = AtomicCheckpointIO(keep_last=True)
+    for step in (1, 2):
+        save(tmp_path, step, files)
+    whole = (tmp_path / "last.ckpt").read_bytes()
+    (tmp_path / "last.ckpt").write_bytes(whole[:size])
+    resumed, damage = checkpoint_to_resume(tmp_path)
+    assert step_of(resumed) == 1
+    assert damage is not None and str(tmp_path / "last.ckpt") in damage and "\n" not in damage
+    save(tmp_path, 3, AtomicCheckpointIO(keep_last=False))
+    assert step_of(tmp_path / "last.ckpt") == 3 and step_of(tmp_path / "previous.ckpt") == 1
+
+
+def test_only_damaged_checkpoints_are_one_line_with_a_remedy(tmp_path: Path) -> None:
+    (tmp_path / "last.ckpt").write_bytes(b"PK junk")
+    with pytest.raises(TrainingError, match=r"last\.ckpt is damaged .*--init .*best\.ckpt") as caught:
+        checkpoint_to_resume(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_leftovers_may_be_gone_already(tmp_path: Path) -> None:
+    (tmp_path / ".last-x.ckpt").touch()
+    remove_leftovers(tmp_path)
+    remove_leftovers(tmp_path)
+    remove_leftovers(tmp_path / "nowhere")
+    assert not list(tmp_path.iterdir())
+
+
+def test_weights_at_the_paper_s_width_are_small_and_are_the_same_to_three_digits(tmp_path: Path) -> None:
+    config = Config(model=PillarModel())
+    torch.manual_seed(0)
+    network = build_model(config.model)
+    state = {f"detector.{name}": value for name, value in network.state_dict().items()}
+    content = {"hyper_parameters": {"config": to_dict(config)}, "global_step": 7, "state_dict": state, "optimizer": 1}
+    torch.save(content, tmp_path / "last.ckpt")
+    path = save_weights(tmp_path / "last.ckpt")
+    assert path.name == "weights.ckpt" and path.stat().st_size < 8 * 2**20
+    loaded = load_checkpoint(path)
+    assert loaded.steps == 7 and loaded.config == config and loaded.expected_input is None
+    for name, value in loaded.detector.state_dict().items():
+        assert value.dtype == state[f"detector.{name}"].dtype
+        torch.testing.assert_close(value, state[f"detector.{name}"], rtol=1e-3, atol=1e-7, msg=name)
+
+
+def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
+    claim(tmp_path, CONFIG)
+    data = DataConfig(workers=7, prepared=str(tmp_path))
+    train = dataclasses.replace(CONFIG.train, checkpoint_steps=9)
+    claim(tmp_path, dataclasses.replace(CONFIG, data=data, train=train))
+    with pytest.raises(TrainingError, match=r"data\.min_points = 1, now data\.min_points = 2"):
+        claim(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)))
+
+
+def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> None:
+    def of(**recipe: object) -> Config:
+        return dataclasses.replace(CONFIG, train=TrainConfig(**recipe))  # type: ignore[arg-type]
+
+    claim(tmp_path / "step", of(epochs=2, schedule="step"))
+    claim(tmp_path / "step", of(epochs=5, schedule="step"))
+    with pytest.raises(TrainingError, match=r"train\.epochs = 5, now train\.epochs = 4; choose another"):
+        claim(tmp_path / "step", of(epochs=4, schedule="step"))
+    with pytest.raises(TrainingError, match=r"train\.seed = 0, now train\.seed = 1"):
+        claim(tmp_path / "step", of(epochs=9, schedule="step", seed=1))
+    claim(tmp_path / "cycle", of(epochs=2, schedule="one_cycle"))
+    with pytest.raises(TrainingError, match=r"one_cycle schedule is planned .*--init .*last\.ckpt"):
+        claim(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"))
