@@ -10,6 +10,7 @@ from asca_pillars.commands.options import (
     JsonOption,
     PrecisionOption,
     ProviderOption,
+    RuntimeOptions,
     ScansArgument,
     ThreadsOption,
 )
@@ -65,8 +66,9 @@ def bench(
 
     from rich.console import Console
 
-    from asca_deploy import Detector, load_bundle, sample_scan_path
+    from asca_deploy import load_bundle, sample_scan_path
     from asca_pillars.commands.bench_parts import Parts, measure_parts, named_bundles
+    from asca_pillars.commands.models import open_detector
     from asca_pillars.data.scans.find_scans import name_scans
     from asca_pillars.data.scans.scan_reader import read_scan
     from asca_pillars.errors import ScanError
@@ -82,7 +84,8 @@ def bench(
     bundles = named_bundles([bundle, *(compare or ())])
     for folder in bundles.values():
         load_bundle(folder)  # a damaged one is named now and not after minutes
-    detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
+    options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    detector = open_detector(options)
     parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold)
     result = measure_parts(detector, points, rounds, parts, bundles, console)
     if json is not None:

@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.commands.options import BundleOption, PrecisionOption, ProviderOption, ScansArgument, ThreadsOption
+from asca_pillars.commands.options import (
+    BundleOption,
+    PrecisionOption,
+    ProviderOption,
+    RuntimeOptions,
+    ScansArgument,
+    ThreadsOption,
+)
 from asca_pillars.errors import ScanError
 
 TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
@@ -42,19 +49,21 @@ def detect(
     from rich.console import Console
     from rich.progress import track
 
-    from asca_deploy import Detector, sample_scan_path
+    from asca_deploy import sample_scan_path
     from asca_deploy.auto import summary
     from asca_pillars.commands import detect_tables as show
     from asca_pillars.commands.detect_files import ResultWriter
+    from asca_pillars.commands.models import open_detector
     from asca_pillars.data.scans.find_scans import name_scans
     from asca_pillars.data.scans.scan_reader import read_scan
 
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     named = name_scans(scans or [sample_scan_path()])
-    detector = Detector(bundle, provider=provider, precision=precision, threads=threads, score_threshold=score)
+    options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    detector = open_detector(options, score)
     if detector.candidates:
-        console.print(summary(detector.provider, detector.precision, detector.candidates), soft_wrap=True)
+        console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     results: list[show.Result] = []
     unreadable = 0
     with ResultWriter(out, detector.spec.ranges, pictures=pictures) as write:
@@ -68,7 +77,7 @@ def detect(
                 unreadable += 1
                 print(f"asca: {error}", file=sys.stderr)
                 continue
-            results.append(show.Result(path, detections.labels, detections.report))
+            results.append(show.Result(path, scan.notes, detections.labels, detections.report))
             write(path, name, scan, detections)
     if not results:
         raise ScanError(f"none of the {len(named)} scans can be read")

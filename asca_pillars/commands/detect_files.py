@@ -2,6 +2,7 @@
 
 import json
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -9,9 +10,9 @@ from typing import IO, Any
 import cv2
 
 from asca_deploy import Detections
-from asca_pillars.data.kitti import Calibration, objects_from_boxes, read_calibration, write_labels
+from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.scans.scan_reader import Scan
-from asca_pillars.files import atomic_path
+from asca_pillars.files import atomic_path, write_json
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
 
@@ -45,8 +46,7 @@ class ResultWriter:
     def __call__(self, path: Path, name: Path, scan: Scan, detections: Detections) -> None:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
         content = _content(path, scan, detections)
-        with atomic_path(self._named(name, ".json")) as temporary:
-            temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        write_json(self._named(name, ".json"), content)
         self._lines.write(json.dumps(content) + "\n")
         if self._pictures:
             write_png(self._named(name, "_bev.png"), draw_bev(scan.points, detections, self._ranges))
@@ -68,25 +68,21 @@ class ResultWriter:
 
 def _write_kitti(path: Path, detections: Detections, calibration: Calibration, image: Any) -> None:
     """What the camera sees, as KITTI's tools want it: they know no boxes outside the image."""
-    size = {} if image is None else {"image_size_wh": (image.shape[1], image.shape[0])}
-    objects = objects_from_boxes(detections.boxes, detections.names, calibration, scores=detections.scores, **size)
-    write_labels(path, [item for item in objects if item.bbox[2] > item.bbox[0]])
+    size_wh = None if image is None else (image.shape[1], image.shape[0])
+    with atomic_path(path) as temporary:
+        temporary.write_text(detections.to_kitti(calibration, size_wh), encoding="utf-8")
 
 
 def _content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
     report, notes = detections.report, scan.notes
-    counts = report.counts
     return {
         "scan": str(path),
         "frame": "lidar: x forward, y left, z up; box centers; yaw counter-clockwise from x",
         "boxes": detections.to_dicts(),
-        "points": counts.points,
+        **asdict(report.counts),
         "points_not_finite": report.non_finite_points + notes.dropped_points,
-        "points_outside_range": counts.points_outside,
-        "points_over_limit": counts.points_over_limit,
         "reflectance_scale": notes.reflectance_scale,
-        "reflectances_clipped": notes.clipped_reflectances,
-        "pillars": counts.pillars,
-        "pillars_over_limit": counts.pillars_over_limit,
+        "reflectances_clipped": report.clipped_reflectances + notes.clipped_reflectances,
+        "outputs_not_finite": report.non_finite_outputs,
         "warnings": [*notes.remarks, *report.warnings],
     }

@@ -1,5 +1,6 @@
 """What `asca detect` prints: one scan's boxes or a line per scan, notes, and the time of every stage."""
 
+import re
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,6 +13,8 @@ from rich.table import Table
 
 from asca_deploy import Detections, Detector, FrameReport
 from asca_pillars.data.scans.scan_reader import ScanNotes
+
+_NUMBER = re.compile(r"\d[\d.,]*")
 
 
 class Result(NamedTuple):
@@ -55,13 +58,13 @@ def notes(results: Iterable[Result]) -> Iterator[str]:
     """What was repaired, dropped or odd, each kind once, with the first scan that it concerns and how many others."""
     names: dict[str, list[str]] = defaultdict(list)
     for path, notes, _, report in results:
-        found = [(remark, remark) for remark in notes.remarks] + [(kind, text) for kind, text in report.warnings_by_kind()]
+        found = [*notes.remarks, *report.warnings]
         if dropped := notes.dropped_points + report.non_finite_points:
-            found.append(("not finite", f"{dropped} points are not finite and were dropped"))
+            found.append(f"{dropped} points are not finite and were dropped")
         if notes.clipped_reflectances:
-            found.append(("clipped", f"{notes.clipped_reflectances} reflectances lie outside 0..1 and were clipped"))
-        for kind, text in found:
-            names[kind].append(f"{path.name}: {text}")
+            found.append(f"{notes.clipped_reflectances} reflectances lie outside 0..1 and were set to the nearer end")
+        for text in found:
+            names[_NUMBER.sub("#", text)].append(f"{path.name}: {text}")  # of one kind: alike but for the numbers
     for lines in names.values():
         yield lines[0] + (f" (and {len(lines) - 1} more scans alike)" if lines[1:] else "")
 

@@ -1,241 +1,105 @@
-"""`asca eval`: a model or finished predictions against labels, as KITTI or Waymo scores them."""
+"""`asca eval`: a model or finished predictions against labels, as KITTI or Waymo score them."""
 
-import json
-import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Literal
 
-from rich.console import Console
+import typer
 
-from asca_pillars.commands.extras import missing_modules
-from asca_pillars.commands.models import Model, open_model
-from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import ConfigError, DatasetError
-from asca_pillars.evaluation import gallery
-from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
-from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
-from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
-from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
-from asca_pillars.evaluation.report import (
-    BANDS_M,
-    EvalReport,
-    markdown_page,
-    print_report,
-    print_tables,
-    to_json,
-    to_markdown,
-)
-from asca_pillars.evaluation.waymo import waymo_detection
-from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
-from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
-from asca_pillars.files import atomic_directory, atomic_path, require_own, require_replaceable
-from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.system import describe_environment
-
-Protocol = Literal["kitti", "waymo"]
-
-TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
-GALLERY = 8
-COMMAND, MADE_BY = "asca eval", "made_by.json"  # the file marks a folder of predictions as ours to replace
+from asca_pillars.commands.options import PrecisionOption, ProviderOption, RuntimeOptions, ThreadsOption
 
 
-@dataclass(frozen=True)
-class Task:
-    """Predictions and labels to compare, from where they are, and where their scans are if anywhere."""
-
-    subject: str
-    predictions: Path
-    labels: Path
-    split: KittiSplit | None
-    ranges: Ranges
-    scores: dict[str, float]
-    about: dict[str, Any]
-
-
-def run(
-    model: Path | None,
-    data: Path | None,
-    split_name: str,
-    predictions: Path | None,
-    labels: Path | None,
-    out: Path,
-    json_path: Path | None,
-    gallery_frames: int | None,
-    score: float | None,
-    min_score: float,
-    provider: str,
-    precision: str | None,
-    threads: int | None,
-    protocol: Protocol = "kitti",
+def evaluate(
+    model: Annotated[
+        Path | None,
+        typer.Argument(help="Bundle (folder) or checkpoint (.ckpt). Default: the bundle that comes with asca."),
+    ] = None,
+    *,
+    data: Annotated[
+        Path | None, typer.Option("--data", "-d", help="KITTI-layout folder whose labels count; a model is run on it.")
+    ] = None,
+    split: Annotated[
+        str, typer.Option("--split", help="A list of ImageSets/, or training for every frame; with --data.")
+    ] = "val",
+    predictions: Annotated[
+        Path | None,
+        typer.Option(
+            "--predictions",
+            help="Folder of KITTI text with scores, instead of a model; one file per frame, empty if nothing was found.",
+        ),
+    ] = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option("--labels", help="Folder of KITTI labels for --predictions. Default: those of --data."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for report, curves, gallery and the model's predictions.")
+    ] = Path("evaluation"),
+    json: Annotated[Path | None, typer.Option("--json", help="Also write the report's JSON to this file.")] = None,
+    gallery: Annotated[
+        int | None,
+        typer.Option("--gallery", min=0, help="Worst frames to draw. Default: 8 if there are scans (--data)."),
+    ] = None,
+    score: Annotated[
+        float | None,
+        typer.Option(
+            "--score",
+            help="Score from which on detections count for recall, precision and gallery. "
+            "Default: the model's, per class; 0.3 for --predictions.",
+        ),
+    ] = None,
+    min_score: Annotated[
+        float,
+        typer.Option(
+            "--min-score", min=0, max=1, help="Lowest score that a model is run with: AP needs the weak detections too."
+        ),
+    ] = 0.05,
+    protocol: Annotated[
+        Literal["kitti", "waymo"],
+        typer.Option(
+            "--protocol",
+            help="kitti: AP and AOS of Car, Pedestrian and Cyclist. waymo: AP and APH of any class, by level and range.",
+        ),
+    ] = "kitti",
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
 ) -> None:
-    """See `asca eval --help`."""
+    """Score a model, or finished predictions, by KITTI's protocol: AP and AOS, by distance, recall and precision.
+
+    With --protocol waymo by Waymo's metric: AP and APH at LEVEL_1 and LEVEL_2, everywhere and by range.
+    Frames without a prediction file are left out, as by KITTI's own tool, and named in every form of the report.
+
+    Example: asca eval runs/small/checkpoints/last.ckpt --data data/sim
+    """
+    from rich.console import Console
+
+    from asca_pillars.commands import eval_steps as steps
+    from asca_pillars.commands.models import open_model
+    from asca_pillars.data.kitti import KittiSplit
+    from asca_pillars.evaluation.predictions import read_predictions, read_truth
+
     console = Console(markup=False)
-    _check_arguments(model, data, predictions, labels, gallery_frames, score)
-    require_own(out, COMMAND, "report.json", "waymo.json", f"predictions/{MADE_BY}", text='"')
-    for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
-        require_replaceable(out / folder, COMMAND, marker)
-    _check_protocol(protocol, gallery_frames, score)
-    split = None if data is None else KittiSplit(data, split_name)
+    steps.check_arguments(model, data, predictions, labels, gallery, score)
+    steps.check_protocol(protocol, gallery, score)
+    steps.claim(out)
+    frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:
-        assert split is not None, "checked with the arguments"
-        labels = split.folder / "label_2"
-    truth = read_truth(labels, None if split is None else split.frame_ids)
+        assert frames_of is not None, "checked with the arguments"
+        labels = frames_of.folder / "label_2"
+    truth = read_truth(labels, None if frames_of is None else frames_of.frame_ids)
     if predictions is not None:
-        scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE if score is None else score)
-        about = {"predictions": str(predictions), "labels": str(labels)}
-        task = Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid().ranges, scores, about)
+        task = steps.text_task(predictions, labels, frames_of, score)
     else:
-        assert split is not None, "checked with the arguments"
-        opened = open_model(model, min_score, provider, precision, threads)
-        scores = _fixed_scores(opened, score, min_score) if protocol == "kitti" else {}
-        task = _run_model(opened, split, labels, scores, out, console)
+        assert frames_of is not None, "checked with the arguments"
+        options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
+        opened = open_model(options, min_score)
+        scores = steps.fixed_scores(opened, score, min_score) if protocol == "kitti" else {}
+        task = steps.run_model(opened, frames_of, labels, scores, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)
     if protocol == "waymo":
-        _report_waymo(task, frames, out, json_path, console)
+        steps.report_waymo(task, frames, out, json, console)
     else:
-        _check_classes(task, frames)
-        _report(task, frames, out, json_path, console)
-        _draw_gallery(task, frames, out, gallery_frames, console)
+        steps.check_classes(task, frames)
+        steps.report_kitti(task, frames, out, json, console)
+        steps.draw_gallery(task, frames, out, gallery, console)
     console.print(f"Written to {out}/", highlight=False)
-
-
-def _check_arguments(
-    model: Path | None,
-    data: Path | None,
-    predictions: Path | None,
-    labels: Path | None,
-    gallery_frames: int | None,
-    score: float | None,
-) -> None:
-    if predictions is not None and model is not None:
-        raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
-    if predictions is None and labels is not None:
-        raise ConfigError(f"--labels {labels} goes with --predictions DIR; a model is run on --data ROOT")
-    if predictions is None and data is None:
-        raise ConfigError("nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR")
-    if predictions is not None and labels is None and data is None:
-        raise ConfigError(f"--predictions {predictions} needs --labels DIR, or --data ROOT that has the labels")
-    if gallery_frames and data is None:
-        raise ConfigError(f"--gallery {gallery_frames} draws scans: give --data ROOT that has them")
-    if score is not None and not math.isfinite(score):
-        raise ConfigError(f"--score {score} must be a number")
-
-
-def _check_protocol(protocol: str, gallery_frames: int | None, score: float | None) -> None:
-    if protocol not in get_args(Protocol):
-        raise ConfigError(f"--protocol {protocol}: choose {' or '.join(get_args(Protocol))}")
-    if protocol == "waymo" and (gallery_frames or score is not None):
-        option = f"--gallery {gallery_frames}" if gallery_frames else f"--score {score:g}"
-        raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
-
-
-def _check_classes(task: Task, frames: ScoredFrames) -> None:
-    """Refuse what KITTI's protocol has nothing to say about; the report names single classes that are left out."""
-    known = {name.casefold() for name in CLASS_NAMES}
-    if frames.foreign_types and not any(
-        known & set(frame.folded_types.tolist()) for frame in (*frames.truth, *frames.detections)
-    ):
-        raise DatasetError(
-            f"{task.labels}: neither labels nor predictions are of a class that KITTI's protocol scores "
-            f"({', '.join(CLASS_NAMES)}); they have {', '.join(frames.foreign_types)}: give --protocol waymo, "
-            "which scores any class"
-        )
-
-
-def _fixed_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
-    """For each class the score from which on detections count for precision and recall."""
-    known = {name.lower(): name for name in CLASS_NAMES}
-    scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
-    if not any(item.name.lower() in known for item in model.spec.classes):
-        raise ConfigError(
-            f"{model.name} detects {', '.join(item.name for item in model.spec.classes)}; KITTI's protocol scores "
-            f"{', '.join(CLASS_NAMES)}: give --protocol waymo, which scores any class"
-        )
-    for item in model.spec.classes:
-        if item.name.lower() not in known:
-            continue  # the report names it
-        fixed = item.score_threshold if score is None else score
-        if fixed < min_score:
-            raise ConfigError(
-                f"score {fixed:g} of {item.name} is below --min-score {min_score:g}, the lowest that {model.name} is "
-                "run with; lower --min-score"
-            )
-        scores[known[item.name.lower()]] = fixed
-    return scores
-
-
-def _run_model(
-    model: Model, split: KittiSplit, labels: Path, scores: dict[str, float], out: Path, console: Console
-) -> Task:
-    """Write the model's predictions to `out`: what is scored is read from there, so that it can be scored again."""
-    about = {"model": model.about, "data": str(split.root), "split": split.name}
-    with atomic_directory(out / "predictions", COMMAND, MADE_BY) as folder:
-        write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
-        _write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
-    if model.unlike:
-        console.print(
-            f"{len(model.unlike)} of {len(split.frame_ids)} scans are unlike those that {model.name} was trained on; "
-            f"the first: {model.unlike[0]}",
-            style="yellow",
-            soft_wrap=True,
-        )
-    subject = f"{model.name} on {split.root}, {split.name}"
-    return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
-
-
-def _report_waymo(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
-    """Evaluate by Waymo's metric; print and write the table, and the JSON (to `json_path` too)."""
-    class_names = evaluated_classes(frames)
-    if not class_names:
-        raise DatasetError(f"{task.labels}: no label and no prediction is of a class to be evaluated")
-    prepared = waymo_frames(frames, class_names, task.split, console=console)
-    scores = waymo_detection(prepared.truth, prepared.detections, no_label=prepared.no_label, console=console)
-    about = task.about | {"environment": json.loads(describe_environment())}
-    report = WaymoReport(task.subject, frames, scores, task.split is not None, about)
-    tables, notes = [waymo_table(report)], waymo_notes(report)
-    print_tables(report.title, tables, notes, console)
-    content = waymo_json(report)
-    for path in (json_path, out / "waymo.json"):
-        if path is not None:
-            _write_json(path, content)
-    with atomic_path(out / "waymo.md") as temporary:
-        temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
-
-
-def _report(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
-    """Evaluate; print and write the tables, the JSON (to `json_path` too) and the curves."""
-    truth, found = frames.truth, frames.detections
-    ap = evaluate(truth, found, CLASS_NAMES, bands_m=tuple(BANDS_M), progress=True)
-    points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES)
-    about = task.about | {"environment": json.loads(describe_environment())}
-    report = EvalReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
-    print_report(report, console)
-    content = to_json(report)
-    for path in (json_path, out / "report.json"):
-        if path is not None:
-            _write_json(path, content)
-    with atomic_path(out / "report.md") as temporary:
-        temporary.write_text(to_markdown(report), encoding="utf-8")
-    if missing_modules("eval"):
-        console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
-    else:
-        write_curves(out / "curves.png", ap.overall, report.title)
-
-
-def _draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:
-    count = GALLERY if count is None else count
-    if task.split is None or count == 0:
-        return
-    judged = matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
-    worst = gallery.worst_frames(judged, count)
-    folders = task.split, task.labels, task.predictions
-    with atomic_directory(out / "gallery", COMMAND, gallery.INDEX) as folder:
-        gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)
-
-
-def _write_json(path: Path, content: Any) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,47 +1,59 @@
 """`asca inspect`: what a dataset holds and whether a configuration fits it, before hours of training."""
 
-import dataclasses
-import json
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from rich.console import Console
-from rich.table import Table
+import typer
 
-from asca_pillars.config import load_config
-from asca_pillars.data.frames import NEIGHBOR_TYPES
-from asca_pillars.data.inspection.findings import findings
-from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread, inspect_dataset
-from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path
-from asca_pillars.pillars.pillarize import PillarLimits
+from asca_pillars.commands.options import JsonOption
 
 
-def run(data: Path, config: Path, split: str | None, frames: int, report_path: Path | None) -> None:
-    """See `asca inspect --help`.
+def inspect(
+    data: Annotated[Path, typer.Argument(help="KITTI-layout folder with training/ and ImageSets/.")],
+    *,
+    config: Annotated[Path, typer.Option("--config", "-c", help="YAML to train with, or the name of one that ships.")],
+    split: Annotated[
+        str | None,
+        typer.Option("--split", help="A list in ImageSets/, or training for every scan. Default: data.train_set."),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", "-n", min=1, help="Look at so many frames, evenly spaced.")] = 500,
+    json: JsonOption = None,
+) -> None:
+    """Look at a dataset before training: objects, points, sizes and positives per class, ranges, scans.
 
-    Raises:
-        DatasetError: after the tables, if a frame cannot be read or a class has no positive anchor.
+    Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 2.
+
+    Example: asca inspect data/kitti -c asca_pointpillars_kitti
     """
+    import dataclasses
+
+    from rich.console import Console
+
+    from asca_pillars.commands import inspect_tables as show
+    from asca_pillars.config import load_config
+    from asca_pillars.data.inspection.findings import findings
+    from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
+    from asca_pillars.data.kitti import KittiSplit
+    from asca_pillars.errors import DatasetError
+    from asca_pillars.files import write_json
+
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
     spec, min_points, view = settings.model.spec, settings.data.min_points, settings.data.camera_view
     frames_of = KittiSplit(data, settings.data.train_set if split is None else split)
     inspection = inspect_dataset(frames_of, spec, settings.data, frames=frames, progress=True)
     found = findings(inspection, spec, min_points)
-    if report_path is not None:
+    if json is not None:
         report = {"config": settings.name} | dataclasses.asdict(inspection)
         report |= {"findings": [finding._asdict() for finding in found]}
-        with atomic_path(report_path) as temporary:
-            temporary.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_json(json, report)
     console.print(
         f"{data}, split {inspection.split}, against {settings.name}: {inspection.frames} of "
         f"{inspection.frames_in_split} frames{', evenly spaced' if inspection.sampled else ''}; "
         f"{inspection.frames_without_objects} without an object"
     )
-    console.print(_types(inspection, spec.class_names), _objects(inspection, min_points), _sizes(inspection), sep="\n")
-    console.print(_matching(inspection), _scans(inspection, spec.limits, view), sep="\n")
+    console.print(show.types(inspection, spec.class_names), show.objects(inspection, min_points), show.sizes(inspection), sep="\n")
+    console.print(show.matching(inspection), show.scans(inspection, spec.limits, view), sep="\n")
     errors = [finding for finding in found if finding.level == "error"]
     for finding in found:
         if finding not in errors[:1]:  # the first one is what the command fails with, below all of them
@@ -52,93 +64,3 @@ def run(data: Path, config: Path, split: str | None, frames: int, report_path: P
         raise DatasetError(f"{data}: {errors[0].text}{others}")
     if not found:
         console.print("Nothing to warn of.")
-
-
-def _types(inspection: Inspection, names: Sequence[str]) -> Table:
-    neighbors = {NEIGHBOR_TYPES[name]: name for name in names if name in NEIGHBOR_TYPES}
-    table = _table("Labels", "type", "count", "per frame", "in training")
-    for kind, count in inspection.types.items():
-        role = f"ignored: neither {neighbors[kind]} nor background" if kind in neighbors else "background"
-        table.add_row(kind, str(count), f"{count / inspection.frames:.2f}", "a class" if kind in names else role)
-    return table
-
-
-def _objects(inspection: Inspection, min_points: int) -> Table:
-    few = f"< {min_points}"
-    title = (
-        "Objects: points inside a box (10 % / median / 90 %); boxes with 0 or few, out of the grid, cut by z_range_m"
-    )
-    table = _table(title, "class", "boxes", "points", "= 0", few, "x out", "y out", "z out", "z cut")
-    for facts in inspection.classes:
-        counts = (facts.no_points, facts.few_points, *facts.outside_xyz, facts.cut_in_z)
-        table.add_row(
-            facts.name, str(facts.boxes), _spread(facts.points), *(_share(count, facts.boxes) for count in counts)
-        )
-    return table
-
-
-def _sizes(inspection: Inspection) -> Table:
-    title = "Sizes, m: mean ± standard deviation (difference to the anchor); misfits cannot reach positive_iou"
-    table = _table(title, "class", "length", "width", "height", "center z", "misfits")
-    for facts in inspection.classes:
-        table.add_row(facts.name, *_size_cells(facts), _share(facts.misfits, facts.boxes))
-    return table
-
-
-def _size_cells(facts: ClassFacts) -> list[str]:
-    if facts.size_m is None or facts.size_std_m is None or facts.z_m is None:
-        return ["-"] * 4
-    sizes = zip(facts.size_m, facts.size_std_m, facts.anchor_size_m, strict=True)
-    cells = [f"{mean:.2f} ± {std:.2f} ({mean - anchor:+.2f})" for mean, std, anchor in sizes]
-    return [*cells, f"{facts.z_m:.2f} ({facts.z_m - facts.anchor_z_m:+.2f})"]
-
-
-def _matching(inspection: Inspection) -> Table:
-    title = "Matching: objects to find, by the best anchor that is to find them: positive_iou, only the nearest, none"
-    table = _table(title, "class", "objects", "by IoU", "nearest", "none", "anchors per frame", "per object")
-    for facts in inspection.classes:
-        to_find = facts.overlapped + facts.forced + facts.missed
-        shares = (_share(count, to_find) for count in (facts.overlapped, facts.forced, facts.missed))
-        per_object = f"{facts.positives / to_find:.1f}" if to_find else "-"
-        table.add_row(facts.name, str(to_find), *shares, f"{facts.positives / inspection.frames:.2f}", per_object)
-    return table
-
-
-def _scans(inspection: Inspection, limits: PillarLimits, camera_view: bool) -> Table:
-    scans = inspection.scans
-    low, high = scans.reflectance_stored
-    ground = "not seen" if scans.ground_z_m is None else _spread(scans.ground_z_m, 2)
-    bottoms = " to ".join(f"{bottom:.2f}" for bottom in scans.anchor_bottoms_m)
-    over = _share(scans.scans_over_max_pillars, inspection.frames)
-    view = "in the camera's view" if camera_view else "per scan"
-    table = _table("Scans: 10 % / median / 90 %", "", "found", "expected")
-    table.add_row(f"points {view}", _spread(scans.points), "")
-    table.add_row("points outside the grid", f"{100 * scans.outside_share:.1f} %", "")
-    table.add_row("points not finite", f"{scans.dropped_points} in {scans.scans_with_dropped} scans", "0")
-    table.add_row("reflectance in the files", f"{low:.3g} to {high:.5g}", "0 to 1")
-    table.add_row("mean reflectance as read", _spread(scans.reflectance, 3), "")
-    table.add_row("ground near the sensor, z in m", ground, f"{bottoms}, where the anchors stand")
-    table.add_row("pillars", _spread(scans.pillars), f"at most {limits.max_pillars}")
-    table.add_row("scans with more pillars", f"{over}, largest {scans.pillars.largest:.0f}", "0 %")
-    table.add_row("points of the fullest pillar", str(scans.fullest_pillar), f"at most {limits.max_points}")
-    table.add_row("pillars with more points", f"{100 * scans.crowded_share:.1f} %", "")
-    table.add_row("points lost that way", f"{100 * scans.cut_share:.1f} %", "")
-    return table
-
-
-def _table(title: str, first: str, *others: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    table.add_column(first, no_wrap=True)
-    for name in others:
-        table.add_column(name, justify="left" if name in ("in training", "expected") else "right")
-    return table
-
-
-def _spread(spread: Spread | None, digits: int = 0) -> str:
-    if spread is None:
-        return "-"
-    return " / ".join(f"{value:.{digits}f}" for value in (spread.p10, spread.median, spread.p90))
-
-
-def _share(part: int, whole: int) -> str:
-    return f"{100 * part / whole:.1f} %" if whole else "-"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from asca_deploy import Detections, Detector
 from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.commands.extras import require
+from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.system import check_threads
@@ -38,28 +39,35 @@ class Model:
     unlike: list[str] = field(default_factory=list)
 
 
-def open_model(path: Path | None, min_score: float, provider: str, precision: str | None, threads: int | None) -> Model:
+def open_detector(options: RuntimeOptions, score: float | None = None) -> Detector:
+    """The detector of a bundle that is run as `options` say, from `score` on; None for the bundle's own thresholds.
+
+    Raises:
+        AscaError: as `asca_deploy.Detector`.
+    """
+    return Detector(
+        options.bundle,
+        provider=cast("Provider", options.provider),  # checked by Detector, as the precision is
+        precision=cast("Precision | None", options.precision),
+        threads=options.threads,
+        score_threshold=score,
+    )
+
+
+def open_model(options: RuntimeOptions, min_score: float) -> Model:
     """Open a bundle's folder or a checkpoint file; None for the bundle that ships.
 
     Raises:
         AscaError: missing, damaged, or not to be run as asked; one line.
     """
-    if path is not None and (path.is_file() or path.suffix == ".ckpt"):
-        return _open_checkpoint(path, min_score, provider, precision, threads)
-    return _open_bundle(path, min_score, provider, precision, threads)
+    if options.bundle is not None and (options.bundle.is_file() or options.bundle.suffix == ".ckpt"):
+        return _open_checkpoint(options.bundle, options, min_score)
+    return _open_bundle(options, min_score)
 
 
-def _open_bundle(
-    path: Path | None, min_score: float, provider: str, precision: str | None, threads: int | None
-) -> Model:
+def _open_bundle(options: RuntimeOptions, min_score: float) -> Model:
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are collected below
-    detector = Detector(
-        path,
-        provider=cast("Provider", provider),  # checked by Detector, as the precision is
-        precision=cast("Precision | None", precision),
-        threads=threads,
-        score_threshold=min_score,
-    )
+    detector = open_detector(options, min_score)
     bundle = detector.bundle
     unlike: list[str] = []
 
@@ -81,7 +89,8 @@ def _open_bundle(
     return Model(bundle.name, detect, bundle.spec, bundle.expected_input.camera_view, about, unlike)
 
 
-def _open_checkpoint(path: Path, min_score: float, provider: str, precision: str | None, threads: int | None) -> Model:
+def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float) -> Model:
+    provider, precision, threads = options.provider, options.precision, options.threads
     require("train")
     import torch
 

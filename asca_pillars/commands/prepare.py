@@ -1,18 +1,32 @@
 """`asca prepare`: what insertion needs of a dataset, computed before training instead of during its first epoch."""
 
-from dataclasses import replace
-from pathlib import Path
+from typing import Annotated
 
-from rich.console import Console
+import typer
 
 from asca_pillars.commands.extras import require
+from asca_pillars.commands.options import ConfigArgument, DataOption, OverridesOption
 
 
-def run(config: Path, data: Path, overrides: list[str], workers: int) -> None:
-    """See `asca prepare --help`."""
+def prepare(
+    config: ConfigArgument,
+    *,
+    data: DataOption,
+    override: OverridesOption = None,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+) -> None:
+    """Compute once what GT-Aug and RS-Aug need of a dataset: the object database and the maps of free ground.
+
+    Training does the same on first use; what is there and unchanged is used again. Without an insertion method in
+    the config, what RS-Aug needs is prepared.
+    """
+    from dataclasses import replace
+
+    from rich.console import Console
+
     from asca_pillars.config import load_config
 
-    settings = load_config(config, overrides)
+    settings = load_config(config, override or ())
     require("train")
     from asca_pillars.data.insertion.free_maps import prepare_free_spaces
     from asca_pillars.data.insertion.insert_objects import prepare_inserter

@@ -1,31 +1,51 @@
 """`asca train`: a YAML and a dataset in, a run's folder out."""
 
 from pathlib import Path
+from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from asca_pillars.commands.extras import require
-from asca_pillars.files import require_own
+from asca_pillars.commands.options import ConfigArgument, DataOption, OverridesOption
 
 INTERRUPTED = 130  # what a shell says of a command that Ctrl-C ended
 
 
-def run(
-    config: Path, data: Path, out: Path, overrides: list[str], devices: str, num_nodes: int, init: Path | None
+def train(
+    config: ConfigArgument,
+    *,
+    data: DataOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an interrupted run there is resumed.")],
+    override: OverridesOption = None,
+    devices: Annotated[str, typer.Option("--devices", help="Devices on this machine: a number or auto.")] = "auto",
+    num_nodes: Annotated[
+        int, typer.Option("--num-nodes", min=1, help="Machines that train together (torchrun or SLURM starts each).")
+    ] = 1,
+    init: Annotated[
+        Path | None,
+        typer.Option("--init", help="Checkpoint whose weights a new run starts from, to go on with other data."),
+    ] = None,
 ) -> None:
-    """See `asca train --help`."""
-    from asca_pillars.config import load_config
+    """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder.
 
-    settings = load_config(config, overrides)
+    After Ctrl-C or a kill the same command goes on exactly where the last checkpoint was written.
+
+    Example: asca train asca_small_sim --data data/sim --out runs/small -s train.batch_size=4
+    """
+    from rich.console import Console
+
+    from asca_pillars.config import load_config
+    from asca_pillars.files import require_own
+
+    settings = load_config(config, override or ())
     require("train")
     require_own(out, "asca train", "config.yaml", "environment.json", "train.log")  # the log is that of `asca ablate`
     console = Console(markup=False)
     with console.status("Loading PyTorch"):
         from asca_pillars.training.callbacks import TrainingInterruptedError
-        from asca_pillars.training.loop import train
+        from asca_pillars.training.loop import train as run_training
     try:
-        last = train(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)
+        last = run_training(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)
     except TrainingInterruptedError as stop:
         console.print(str(stop))
         raise typer.Exit(INTERRUPTED) from None

@@ -1,0 +1,112 @@
+"""The steps of `asca ablate`: one base for all runs, what the numbers depend on, and the timing."""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markdown import Markdown
+from rich.progress import track
+
+from asca_pillars.ablation.ablation_table import Speed, read_results, tables
+from asca_pillars.ablation.variants import VARIANTS, Run, Variant, evaluate_runs, runs, train_runs
+from asca_pillars.commands import prepare
+from asca_pillars.commands.extras import require
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.files import atomic_path, require_own
+from asca_pillars.schema import to_dict
+from asca_pillars.system import command_line, cpu_model, default_threads, package_versions
+
+TIMED_ROUNDS = 10
+
+
+def claim(out: Path, base: dict[str, Any]) -> None:
+    """Note what all runs in `out` have in common, or refuse to mix them with runs on another base."""
+    require_own(out, "asca ablate", "ablation.json", text='"config"')
+    path = out / "ablation.json"
+    if not path.exists():
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(base, indent=1) + "\n", encoding="utf-8")
+    elif json.loads(path.read_text(encoding="utf-8")) != base:
+        raise TrainingError(f"{path}: the runs there have another base configuration or data; choose another --out")
+
+
+def setup(todo: Sequence[Run], config: str, data: Path, jobs: int) -> str:
+    """What the numbers depend on: command, data, machine, time, versions."""
+    trained = [json.loads(one.trained.read_text(encoding="utf-8")) for one in todo]
+    hours = sum(record["seconds"] for record in trained) / 3600
+    frames = {name: len(KittiSplit(data, name).frame_ids) for name in ("train", "val")}
+    note = data / "simulation.json"
+    origin = f"simulated, seed {json.loads(note.read_text(encoding='utf-8'))['seed']}" if note.exists() else str(data)
+    versions = package_versions()
+    lines = (
+        f"Command: `{command_line()}`",
+        f"Data: {origin}; {frames['train']} frames for training, {frames['val']} for validation",
+        f"Base: {config}; {len(todo)} runs, {hours:.1f} hours of training in sum, {jobs} at a time, "
+        f"{trained[0]['threads']} thread(s) each",
+        f"Machine: {cpu_model()}; torch {versions['torch']}, onnxruntime {versions['onnxruntime']}",
+    )
+    return "".join(f"- {line}\n" for line in lines)
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Whole numbers with commas between them.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"--seeds {text}: whole numbers with commas between them, such as 0,1") from None
+
+
+def parse_variants(text: str) -> list[Variant]:
+    """Names with commas between them, or `all`.
+
+    Raises:
+        ConfigError: there is no such variant.
+    """
+    names = list(VARIANTS) if text == "all" else text.split(",")
+    for name in names:
+        if name not in VARIANTS:
+            raise ConfigError(f"--variants {name}: no such variant; there are {', '.join(VARIANTS)}")
+    return [VARIANTS[name] for name in names]
+
+
+def time_variants(todo: Sequence[Run], data: Path, console: Console) -> dict[str, Speed]:
+    """Export one checkpoint of every variant and time them in alternation on the same scans."""
+    from asca_deploy import Detector
+    from asca_deploy.benchmark import alternate
+    from asca_export.exporter import MIN_SCANS, export_bundle
+    from asca_pillars.data.frames import read_frame
+    from asca_pillars.models.checkpoint import load_checkpoint
+
+    split = KittiSplit(data, "val")
+    scans = [read_frame(split, frame_id, ()).points for frame_id in split.frame_ids[:MIN_SCANS]]
+    first = {one.variant.name: one for one in reversed(todo)}  # of several seeds the first one wins
+    detectors: dict[str, Detector] = {}
+    parameters: dict[str, int] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, one in track(first.items(), "Exporting", console=console):
+            checkpoint = load_checkpoint(one.checkpoint)
+            export_bundle(checkpoint, Path(folder) / name, scans)
+            detectors[name] = Detector(Path(folder) / name)
+            parameters[name] = sum(part.numel() for part in checkpoint.detector.parameters())
+        with console.status(f"Timing {len(detectors)} detectors in alternation"):
+            frames = alternate(detectors, scans, TIMED_ROUNDS)
+    times = {name: np.median(own, axis=1) for name, own in frames.items()}
+    reference = times[next(name for name in VARIANTS if name in times)]
+    return {
+        name: Speed(
+            fps=1e3 / float(np.median(own)),
+            ratio=float(np.median(own / reference)),
+            ratio_quartiles=(float(np.quantile(own / reference, 0.25)), float(np.quantile(own / reference, 0.75))),
+            parameters=parameters[name],
+        )
+        for name, own in times.items()
+    }

@@ -1,0 +1,207 @@
+"""The steps of `asca eval`: what goes together, running the model, reports and pictures."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from rich.console import Console
+
+from asca_pillars.commands.extras import missing_modules
+from asca_pillars.commands.models import Model, open_model
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.evaluation import gallery
+from asca_pillars.evaluation.curves import write_curves
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
+from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
+from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
+from asca_pillars.evaluation.report import (
+    BANDS_M,
+    EvalReport,
+    markdown_page,
+    print_report,
+    print_tables,
+    to_json,
+    to_markdown,
+)
+from asca_pillars.evaluation.waymo import waymo_detection
+from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
+from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
+from asca_pillars.files import atomic_directory, atomic_path, require_own, require_replaceable, write_json
+from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.system import describe_environment
+
+Protocol = Literal["kitti", "waymo"]
+
+TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
+GALLERY = 8
+COMMAND, MADE_BY = "asca eval", "made_by.json"  # the file marks a folder of predictions as ours to replace
+
+
+@dataclass(frozen=True)
+class Task:
+    """Predictions and labels to compare, from where they are, and where their scans are if anywhere."""
+
+    subject: str
+    predictions: Path
+    labels: Path
+    split: KittiSplit | None
+    ranges: Ranges
+    scores: dict[str, float]
+    about: dict[str, Any]
+
+
+def claim(out: Path) -> None:
+    """Make sure that nothing but earlier evaluations is in `out`.
+
+    Raises:
+        OutputError: there is; names it.
+    """
+    require_own(out, COMMAND, "report.json", "waymo.json", f"predictions/{MADE_BY}", text='"')
+    for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
+        require_replaceable(out / folder, COMMAND, marker)
+
+
+def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: float | None) -> Task:
+    """Finished predictions as KITTI text, counted from `score` on."""
+    scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE if score is None else score)
+    about = {"predictions": str(predictions), "labels": str(labels)}
+    return Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid().ranges, scores, about)
+
+
+def check_arguments(
+    model: Path | None,
+    data: Path | None,
+    predictions: Path | None,
+    labels: Path | None,
+    gallery_frames: int | None,
+    score: float | None,
+) -> None:
+    if predictions is not None and model is not None:
+        raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
+    if predictions is None and labels is not None:
+        raise ConfigError(f"--labels {labels} goes with --predictions DIR; a model is run on --data ROOT")
+    if predictions is None and data is None:
+        raise ConfigError("nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR")
+    if predictions is not None and labels is None and data is None:
+        raise ConfigError(f"--predictions {predictions} needs --labels DIR, or --data ROOT that has the labels")
+    if gallery_frames and data is None:
+        raise ConfigError(f"--gallery {gallery_frames} draws scans: give --data ROOT that has them")
+    if score is not None and not math.isfinite(score):
+        raise ConfigError(f"--score {score} must be a number")
+
+
+def check_protocol(protocol: str, gallery_frames: int | None, score: float | None) -> None:
+    if protocol not in get_args(Protocol):
+        raise ConfigError(f"--protocol {protocol}: choose {' or '.join(get_args(Protocol))}")
+    if protocol == "waymo" and (gallery_frames or score is not None):
+        option = f"--gallery {gallery_frames}" if gallery_frames else f"--score {score:g}"
+        raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
+
+
+def check_classes(task: Task, frames: ScoredFrames) -> None:
+    """Refuse what KITTI's protocol has nothing to say about; the report names single classes that are left out."""
+    known = {name.casefold() for name in CLASS_NAMES}
+    if frames.foreign_types and not any(
+        known & set(frame.folded_types.tolist()) for frame in (*frames.truth, *frames.detections)
+    ):
+        raise DatasetError(
+            f"{task.labels}: neither labels nor predictions are of a class that KITTI's protocol scores "
+            f"({', '.join(CLASS_NAMES)}); they have {', '.join(frames.foreign_types)}: give --protocol waymo, "
+            "which scores any class"
+        )
+
+
+def fixed_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
+    """For each class the score from which on detections count for precision and recall."""
+    known = {name.lower(): name for name in CLASS_NAMES}
+    scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
+    if not any(item.name.lower() in known for item in model.spec.classes):
+        raise ConfigError(
+            f"{model.name} detects {', '.join(item.name for item in model.spec.classes)}; KITTI's protocol scores "
+            f"{', '.join(CLASS_NAMES)}: give --protocol waymo, which scores any class"
+        )
+    for item in model.spec.classes:
+        if item.name.lower() not in known:
+            continue  # the report names it
+        fixed = item.score_threshold if score is None else score
+        if fixed < min_score:
+            raise ConfigError(
+                f"score {fixed:g} of {item.name} is below --min-score {min_score:g}, the lowest that {model.name} is "
+                "run with; lower --min-score"
+            )
+        scores[known[item.name.lower()]] = fixed
+    return scores
+
+
+def run_model(
+    model: Model, split: KittiSplit, labels: Path, scores: dict[str, float], out: Path, console: Console
+) -> Task:
+    """Write the model's predictions to `out`: what is scored is read from there, so that it can be scored again."""
+    about = {"model": model.about, "data": str(split.root), "split": split.name}
+    with atomic_directory(out / "predictions", COMMAND, MADE_BY) as folder:
+        write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
+        write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
+    if model.unlike:
+        console.print(
+            f"{len(model.unlike)} of {len(split.frame_ids)} scans are unlike those that {model.name} was trained on; "
+            f"the first: {model.unlike[0]}",
+            style="yellow",
+            soft_wrap=True,
+        )
+    subject = f"{model.name} on {split.root}, {split.name}"
+    return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
+
+
+def report_waymo(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
+    """Evaluate by Waymo's metric; print and write the table, and the JSON (to `json_path` too)."""
+    class_names = evaluated_classes(frames)
+    if not class_names:
+        raise DatasetError(f"{task.labels}: no label and no prediction is of a class to be evaluated")
+    prepared = waymo_frames(frames, class_names, task.split, console=console)
+    scores = waymo_detection(prepared.truth, prepared.detections, no_label=prepared.no_label, console=console)
+    about = task.about | {"environment": json.loads(describe_environment())}
+    report = WaymoReport(task.subject, frames, scores, task.split is not None, about)
+    tables, notes = [waymo_table(report)], waymo_notes(report)
+    print_tables(report.title, tables, notes, console)
+    content = waymo_json(report)
+    for path in (json_path, out / "waymo.json"):
+        if path is not None:
+            write_json(path, content)
+    with atomic_path(out / "waymo.md") as temporary:
+        temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
+
+
+def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
+    """Evaluate; print and write the tables, the JSON (to `json_path` too) and the curves."""
+    truth, found = frames.truth, frames.detections
+    ap = evaluate(truth, found, CLASS_NAMES, bands_m=tuple(BANDS_M), progress=True)
+    points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES)
+    about = task.about | {"environment": json.loads(describe_environment())}
+    report = EvalReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
+    print_report(report, console)
+    content = to_json(report)
+    for path in (json_path, out / "report.json"):
+        if path is not None:
+            write_json(path, content)
+    with atomic_path(out / "report.md") as temporary:
+        temporary.write_text(to_markdown(report), encoding="utf-8")
+    if missing_modules("eval"):
+        console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
+    else:
+        write_curves(out / "curves.png", ap.overall, report.title)
+
+
+def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:
+    count = GALLERY if count is None else count
+    if task.split is None or count == 0:
+        return
+    judged = matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
+    worst = gallery.worst_frames(judged, count)
+    folders = task.split, task.labels, task.predictions
+    with atomic_directory(out / "gallery", COMMAND, gallery.INDEX) as folder:
+        gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)

@@ -1,0 +1,80 @@
+"""What `asca export` reads beside the checkpoint, and how it reports 8 bits."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from asca_deploy.bundle import MANIFEST, Quantization
+from asca_pillars.commands.extras import require
+from asca_pillars.data.scans.find_scans import find_scans
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import ConfigError
+from asca_pillars.files import require_replaceable
+
+PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
+CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
+
+View = Literal["camera", "full"]
+
+
+def print_quantization(report: Quantization, console: Console) -> None:
+    """A line per layer, and what the boxes say."""
+    table = Table(title=f"In 8 bits, calibrated on {report.calibration_scans} scans")
+    if report.dropped_scans:
+        console.print(f"{report.dropped_scans} calibration scans left out: parity is proven on the same ones")
+    table.add_column("layer")
+    table.add_column("logit error if it alone stays float", justify="right")
+    table.add_column("kept float")
+    for layer in report.layers:
+        table.add_row(layer.layer, f"{layer.logit_rms_error:.4f}", "yes" if layer.kept_float else "")
+    console.print(table)
+    console.print(
+        f"Logit error {report.logit_rms_error:.4f}; of {report.boxes} boxes on {report.compared_scans} scans "
+        f"{report.boxes_matched} are there again, {report.boxes_added} are new. "
+        "What that costs in AP says `asca eval` on both bundles"
+    )
+
+
+def class_score(text: str) -> tuple[str, float]:
+    """`CLASS=VALUE` as a pair.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise ConfigError(f"--score {text}: write a class and its score, such as Car=0.35") from None
+
+
+def read_or_simulate(
+    folder: Path | None, console: Console, most: int, seed: int, view: View = "full"
+) -> list[NDArray[np.float32]]:
+    """Scans of a folder, evenly spaced if there are more than `most`; without a folder simulated ones."""
+    if folder is not None:
+        paths = find_scans(folder)
+        chosen = paths if len(paths) <= most else [paths[i * len(paths) // most] for i in range(most)]
+        return [read_scan(path).points for path in chosen]
+    require("sim")
+    from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
+
+    config = SimulationConfig(field_of_view=view)
+    frames = track(range(most), f"Simulating {most} scans", console=console, transient=True)
+    return [simulate_frame(seed, index, config).points for index in frames]
+
+
+def run_environment(checkpoint: Path) -> dict[str, Any]:
+    """What the run wrote of itself, if the checkpoint still lies in its run's folder."""
+    path = checkpoint.parent.parent / "environment.json"
+    if not path.exists():
+        return {}
+    environment: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return environment
