@@ -172,16 +172,41 @@ def simulate(
     ] = 0.1,
     report: Annotated[
         bool,
-        typer.Option("--report", help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/."),
+        typer.Option(
+            "--report",
+            help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/. "
+            "Needs matplotlib: pip install 'asca-pillars[eval]'.",
+        ),
     ] = False,
+    like: Annotated[
+        Path | None,
+        typer.Option(
+            "--like",
+            help="Labelled real frames in KITTI's layout: compare each object in them with simulated ones at like "
+            "distance, angle of view and occlusion; table, JSON and picture in OUT/report/. Needs matplotlib, too.",
+        ),
+    ] = None,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(
+            "--bundle",
+            "-b",
+            help="With --like: also compare the scores that this bundle (or checkpoint) gives to real objects and "
+            "their look-alikes, and how often it fires at what has no label.",
+        ),
+    ] = None,
 ) -> None:
     """Write simulated street scans with labels in KITTI's layout, and say how like real ones they are.
 
-    With --report, a folder that holds scans already, simulated or real, is compared as it is unless --frames is given.
+    With --report or --like, a folder that holds scans already, simulated or real, is compared as it is unless --frames
+    is given.
+
+    Examples: asca simulate data/sim -n 10000 --view camera; asca simulate data/all -n 10000 --view around;
+    asca simulate data/sim --report --like data/kitti --bundle my_bundle.
     """
     from asca_pillars.commands.simulate import run
 
-    run(out, frames, seed, workers, config, view, val_share, report)
+    run(out, frames, seed, workers, config, view, val_share, report, like, bundle)
 
 
 @app.command()
