@@ -25,11 +25,16 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (detect, bench, simulate, inspect, prepare, train):
-    app.command()(command)
+app.command()(detect)
+app.command()(bench)
+app.command()(simulate)
+app.command()(inspect)
+app.command()(prepare)
+app.command()(train)
 app.command("eval")(evaluate)
-for command in (export, ablate, doctor):
-    app.command()(command)
+app.command()(export)
+app.command()(ablate)
+app.command()(doctor)
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ _VALUES = re.compile(
     r"|ind(ex|ices)|masks?|counts?|logits?|scores?|probabilit(y|ies)|shares?|reflectances?|labels?|bool|features?"
     r"|gray|RGB|BGR|colou?rs?|weights?|losses|loss|boxes|points)\b|_(m|rad|px|ms)\b"
 )
-_UNITS = re.compile(r"\b(boxes|points|labels?|features?|frames?|weights?)\b")  # alone these name the thing, not its unit
+_UNITS = re.compile(r"\b(boxes|points|labels?|features?|frames?|weights?)\b")  # name the thing, not its unit
 
 
 class Documented(NamedTuple):
@@ -71,7 +71,9 @@ def _functions(tree: ast.Module) -> Iterator[tuple[ast.ClassDef | None, ast.Func
                     yield node, part
 
 
-def main(missing: Annotated[bool, typer.Option("--missing", help="Name every function that lacks one.")] = False) -> None:
+def main(
+    missing: Annotated[bool, typer.Option("--missing", help="Name every function that lacks one.")] = False,
+) -> None:
     """Print the shares."""
     found = list(documented())
     for package in (*PACKAGES, "all"):

@@ -15,9 +15,7 @@ def ablate(
     data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with ImageSets/{train,val}.txt.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the runs; finished ones there are kept.")],
     override: OverridesOption = None,
-    seeds: Annotated[
-        str, typer.Option("--seeds", help="Seeds of every variant, with commas between them.")
-    ] = "0,1",
+    seeds: Annotated[str, typer.Option("--seeds", help="Seeds of every variant, with commas between them.")] = "0,1",
     variants: Annotated[str, typer.Option("--variants", help="Names with commas between them, or all.")] = "all",
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Trainings at a time; they share the CPU cores.")] = 1,
 ) -> None:

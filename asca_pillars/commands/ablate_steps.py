@@ -8,18 +8,14 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markdown import Markdown
 from rich.progress import track
 
-from asca_pillars.ablation.ablation_table import Speed, read_results, tables
-from asca_pillars.ablation.variants import VARIANTS, Run, Variant, evaluate_runs, runs, train_runs
-from asca_pillars.commands import prepare
-from asca_pillars.commands.extras import require
+from asca_pillars.ablation.ablation_table import Speed
+from asca_pillars.ablation.variants import VARIANTS, Run, Variant
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path, require_own
-from asca_pillars.schema import to_dict
-from asca_pillars.system import command_line, cpu_model, default_threads, package_versions
+from asca_pillars.system import command_line, cpu_model, package_versions
 
 TIMED_ROUNDS = 10
 

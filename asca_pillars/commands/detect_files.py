@@ -20,7 +20,7 @@ RUN_FILE = "detections.jsonl"
 
 
 class ResultWriter:
-    """Writes the results of scan after scan to a folder; `detections.jsonl` appears when the block ends without an error.
+    """Writes the results of scan after scan to a folder; `detections.jsonl` appears when the block ends well.
 
     Args:
         out: the folder; files of other names in it stay.

@@ -24,7 +24,7 @@ def evaluate(
         Path | None,
         typer.Option(
             "--predictions",
-            help="Folder of KITTI text with scores, instead of a model; one file per frame, empty if nothing was found.",
+            help="Folder of KITTI text with scores, instead of a model; a file per frame, empty if nothing was found.",
         ),
     ] = None,
     labels: Annotated[
@@ -57,7 +57,7 @@ def evaluate(
         Literal["kitti", "waymo"],
         typer.Option(
             "--protocol",
-            help="kitti: AP and AOS of Car, Pedestrian and Cyclist. waymo: AP and APH of any class, by level and range.",
+            help="kitti: AP and AOS of Car, Pedestrian and Cyclist. waymo: AP and APH of any class by level and range.",
         ),
     ] = "kitti",
     provider: ProviderOption = "cpu",

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 from rich.console import Console
 
 from asca_pillars.commands.extras import missing_modules
-from asca_pillars.commands.models import Model, open_model
+from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
@@ -17,7 +17,7 @@ from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
-from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
+from asca_pillars.evaluation.predictions import ScoredFrames, write_predictions
 from asca_pillars.evaluation.report import (
     BANDS_M,
     EvalReport,

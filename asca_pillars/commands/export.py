@@ -32,14 +32,14 @@ def export(
         Path | None,
         typer.Option(
             "--calibrate",
-            help="Folder of scans like those trained on, to calibrate with; 96, evenly spaced. Default: simulated ones.",
+            help="Scans like those trained on, to calibrate with; 96 of the folder, evenly spaced. Default: simulated.",
         ),
     ] = None,
 ) -> None:
     """Export to ONNX and compare with PyTorch on scans, head maps and boxes; fails if they differ.
 
-    With --int8 the graphs that passed become 8-bit ones; bundle.json says how far they are from the float ones, layer by
-    layer, and which layers stay in floating point because of it.
+    With --int8 the graphs that passed become 8-bit ones; bundle.json says how far they are from the float ones, layer
+    by layer, and which layers stay in floating point because of it.
 
     Example: asca export runs/small/checkpoints/last.ckpt -o my_bundle --score Car=0.4
     """

@@ -1,7 +1,6 @@
 """What `asca export` reads beside the checkpoint, and how it reports 8 bits."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,12 +10,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from asca_deploy.bundle import MANIFEST, Quantization
+from asca_deploy.bundle import Quantization
 from asca_pillars.commands.extras import require
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError
-from asca_pillars.files import require_replaceable
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
 CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1

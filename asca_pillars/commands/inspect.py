@@ -52,7 +52,9 @@ def inspect(
         f"{inspection.frames_in_split} frames{', evenly spaced' if inspection.sampled else ''}; "
         f"{inspection.frames_without_objects} without an object"
     )
-    console.print(show.types(inspection, spec.class_names), show.objects(inspection, min_points), show.sizes(inspection), sep="\n")
+    console.print(
+        show.types(inspection, spec.class_names), show.objects(inspection, min_points), show.sizes(inspection), sep="\n"
+    )
     console.print(show.matching(inspection), show.scans(inspection, spec.limits, view), sep="\n")
     errors = [finding for finding in found if finding.level == "error"]
     for finding in found:

@@ -1,20 +1,11 @@
 """What `asca inspect` prints: a table for each thing that can go wrong before training."""
 
-import dataclasses
-import json
 from collections.abc import Sequence
-from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.config import load_config
 from asca_pillars.data.frames import NEIGHBOR_TYPES
-from asca_pillars.data.inspection.findings import findings
-from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread, inspect_dataset
-from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path
+from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread
 from asca_pillars.pillars.pillarize import PillarLimits
 
 

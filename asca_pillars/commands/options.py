@@ -36,7 +36,9 @@ ThreadsOption = Annotated[
     int | None, typer.Option("--threads", help="CPU threads. Default: the physical cores granted to the process.")
 ]
 DataOption = Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")]
-ConfigArgument = Annotated[Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")]
+ConfigArgument = Annotated[
+    Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")
+]
 OverridesOption = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20"),

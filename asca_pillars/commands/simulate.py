@@ -1,56 +1,115 @@
 """`asca simulate`: a folder of labelled street scans, for tools that read KITTI, and how like real ones they are."""
 
 from pathlib import Path
+from typing import Annotated
 
-from rich.console import Console
+import typer
 
 from asca_pillars.commands.extras import require
-from asca_pillars.files import require_own
 
 FRAMES = 100
 
 
-def run(
-    out: Path,
-    frames: int | None,
-    seed: int,
-    workers: int,
-    config_path: str | None,
-    view: str | None,
-    val_share: float,
-    report: bool,
+def simulate(
+    out: Annotated[Path, typer.Argument(help="Folder for the KITTI-layout dataset.")],
+    *,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            "--frames",
+            "-n",
+            min=1,
+            help="Frames to write. Default: 100; with --report none where there are scans already.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number of workers.")
+    ] = 0,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+    config: Annotated[
+        str | None,
+        typer.Option(
+            "--config", "-c", help="YAML of scenes and sensor, or the name of one that ships. Default: KITTI's."
+        ),
+    ] = None,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            help="full: 360 degrees, of which the camera's part is labelled, as in KITTI; around: 360 degrees, all "
+            "of it labelled; camera: only what the camera sees, 6x smaller. Default: the config's; else full.",
+        ),
+    ] = None,
+    val_share: Annotated[
+        float, typer.Option("--val-share", min=0, max=1, help="Share of the frames listed in ImageSets/val.txt.")
+    ] = 0.1,
+    report: Annotated[
+        bool,
+        typer.Option(
+            "--report",
+            help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/. "
+            "Needs matplotlib: pip install 'asca-pillars[eval]'.",
+        ),
+    ] = False,
+    like: Annotated[
+        Path | None,
+        typer.Option(
+            "--like",
+            help="Labelled real frames in KITTI's layout: compare each object in them with simulated ones at like "
+            "distance, angle of view and occlusion; table, JSON and picture in OUT/report/. Needs matplotlib, too.",
+        ),
+    ] = None,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(
+            "--bundle",
+            "-b",
+            help="With --like: also compare the scores that this bundle (or checkpoint) gives to real objects and "
+            "their look-alikes, and how often it fires at what has no label.",
+        ),
+    ] = None,
 ) -> None:
-    """See `asca simulate --help`."""
+    """Write simulated street scans with labels in KITTI's layout, and say how like real ones they are.
+
+    With --report or --like, a folder that holds scans already, simulated or real, is compared as it is unless --frames
+    is given.
+
+    Examples:
+
+    asca simulate data/sim -n 10000 --view camera
+
+    asca simulate data/all -n 10000 --view around
+
+    asca simulate data/sim --report --like data/kitti --bundle my_bundle
+    """
     require("sim")
-    if report:
+    if report or like is not None:
         require("eval")
-    from asca_pillars.sim.simulation import simulate
+    from rich.console import Console
+
+    from asca_pillars.data.kitti import KittiSplit
+    from asca_pillars.errors import ConfigError
+    from asca_pillars.files import require_own
+    from asca_pillars.sim.simulation import simulate as write_frames
     from asca_pillars.sim.simulation_configs import load_simulation_config
 
+    if bundle is not None and like is None:
+        raise ConfigError(f"--bundle {bundle} scores the objects of a real folder: give --like FOLDER, too")
+    if like is not None:
+        KittiSplit(like).frame_ids  # noqa: B018 - a wrong folder is named before the work
     console = Console(markup=False)
-    config = load_simulation_config(config_path, view)
-    if frames is not None or not (report and any((out / "training" / "velodyne").glob("*.bin"))):
+    settings = load_simulation_config(config, view)
+    there = any((out / "training" / "velodyne").glob("*.bin"))
+    if frames is not None or not (there and (report or like is not None)):
         frames = frames or FRAMES
         require_own(out, "asca simulate", "simulation.json", text='"seed"')
-        simulate(out, frames, seed, workers, config, val_share)
+        write_frames(out, frames, seed, workers, settings, val_share)
         console.print(f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin")
     if report:
-        _report(out, console)
+        from asca_pillars.commands.simulate_reports import report_statistics
 
+        report_statistics(out, console)
+    if like is not None:
+        from asca_pillars.commands.simulate_reports import report_like_for_like
 
-def _report(out: Path, console: Console) -> None:
-    """Compare the frames below `out` with KITTI; print the tables and write them, and the plots, to out/report/."""
-    from asca_pillars.sim.report.comparison import compare
-    from asca_pillars.sim.report.measured import measure
-    from asca_pillars.sim.report.plots import write_plots
-    from asca_pillars.sim.report.reference import kitti_reference
-    from asca_pillars.sim.report.tables import print_comparison, write_report
-
-    folder = out / "report"
-    require_own(folder, "asca simulate --report", "report.json", "reflectance.png")
-    reference = kitti_reference()
-    measured = measure(out)
-    comparison = compare(measured, reference.statistics)
-    print_comparison(comparison, console)
-    write_report(folder, comparison, write_plots(folder, comparison, measured, reference.sensor))
-    console.print(f"All rows and plots: {folder}/report.md; all numbers: {folder}/report.json", soft_wrap=True)
+        report_like_for_like(out, like, bundle, console)

@@ -1,5 +1,6 @@
 """`asca simulate --report` as a user meets it: when it simulates, what it compares, what it leaves alone."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -45,3 +46,25 @@ def test_plots_need_matplotlib_and_say_so_before_the_work(tmp_path: Path, monkey
     with pytest.raises(AscaError, match=r"asca-pillars\[eval\]"):
         simulate(tmp_path / "out", 2)
     assert not (tmp_path / "out").exists()
+
+
+def test_objects_are_compared_with_those_of_a_real_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    real = write_set(tmp_path / "real")
+    simulate(tmp_path / "sim", 24, report=False)
+    before = written(real)
+    run(tmp_path / "sim", None, 0, 1, None, None, 0.5, False, real)
+    told = capsys.readouterr().out
+    assert "Percentile: of the real object among them" in told
+    report = json.loads((tmp_path / "sim/report/like_for_like.json").read_text())
+    assert report["real"]["frames"] == 6 and report["detector"] is None and report["firing"] is None
+    assert {row["class_name"] for row in report["rows"]} <= {"Car", "Pedestrian", "Cyclist", "All"}
+    assert (tmp_path / "sim/report/like_for_like.png").stat().st_size > 10_000
+    assert written(real) == before
+
+
+def test_a_wrong_real_folder_and_a_bundle_without_one_are_told_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"no \*\.bin scans"):
+        run(tmp_path / "sim", 2, 0, 1, None, "camera", 0.5, False, tmp_path / "nothing")
+    with pytest.raises(AscaError, match="give --like"):
+        run(tmp_path / "sim", 2, 0, 1, None, "camera", 0.5, False, None, Path("asca_small_sim"))
+    assert not (tmp_path / "sim").exists()

@@ -1,6 +1,5 @@
 """Scan files of any common format to points (N, 4) float32: x, y, z in metres, reflectance in 0..1."""
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -42,17 +42,19 @@ def write_plots(folder: Path, comparison: Comparison, measured: Measured, sensor
     if comparison.simulated.scan.points is not None:
         pictures["scans"] = _scans(comparison, sensor)
     pictures["labels"] = _labels(comparison)
-    return tuple(_save(folder / f"{name}.png", figure) for name, figure in pictures.items())
+    return tuple(save_figure(folder / f"{name}.png", figure) for name, figure in pictures.items())
 
 
-def _figure(rows: int, columns: int, width: float, height: float) -> tuple["Figure", list["Axes"]]:
+def new_figure(rows: int, columns: int, width: float, height: float) -> tuple["Figure", list["Axes"]]:
+    """A figure of `rows` by `columns` plots of `width` by `height` inches, and these plots."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width * columns, height * rows), layout="tight", dpi=100)
     return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
-def _save(path: Path, figure: "Figure") -> str:
+def save_figure(path: Path, figure: "Figure") -> str:
+    """Write a figure as PNG; its file name."""
     # Neither pyplot nor its backends: a figure of its own leaves no global state and needs no display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -65,7 +67,7 @@ def _reflectance(comparison: Comparison) -> "Figure":
     """Shares of the 21 bins, of each material; exactly 0 is the first."""
     real, ours = comparison.real.scan.reflectance, comparison.simulated.scan.reflectance
     rows = {row.name: row for row in comparison.rows}
-    figure, plots = _figure(2, 4, 4.0, 3.0)
+    figure, plots = new_figure(2, 4, 4.0, 3.0)
     for plot, name in zip(plots, MATERIALS, strict=False):
         for side, style in ((real, _REAL), (ours, _OURS)):
             if name in side:
@@ -83,7 +85,7 @@ def _reflectance(comparison: Comparison) -> "Figure":
 
 def _cars(comparison: Comparison, measured: Measured) -> "Figure":
     """Points of unoccluded cars over distance, the fits, and the bars about KITTI's."""
-    figure, (plot,) = _figure(1, 1, 7.0, 5.0)
+    figure, (plot,) = new_figure(1, 1, 7.0, 5.0)
     cars = np.concatenate([record.cars for record in measured.records])
     plot.plot(cars[:, 0], cars[:, 1], ".", color=_OURS["color"], alpha=0.4, label="a car of this set")
     for side, style in ((comparison.real.scan, _REAL), (comparison.simulated.scan, _OURS)):
@@ -112,7 +114,7 @@ def _cars(comparison: Comparison, measured: Measured) -> "Figure":
 def _scans(comparison: Comparison, sensor: Sensor) -> "Figure":
     """Where the returns of whole scans are."""
     real, ours = comparison.real.scan, comparison.simulated.scan
-    figure, (rings, sectors, ranges, heights, reflectances, last) = _figure(2, 3, 5.0, 3.4)
+    figure, (rings, sectors, ranges, heights, reflectances, last) = new_figure(2, 3, 5.0, 3.4)
     for side, style in ((real, _REAL), (ours, _OURS)):
         if side.points_per_ring is not None:
             rings.plot(side.points_per_ring, **style)
@@ -142,7 +144,7 @@ def _scans(comparison: Comparison, sensor: Sensor) -> "Figure":
 
 def _labels(comparison: Comparison) -> "Figure":
     """Distributions of the labels, a row for each class."""
-    figure, plots = _figure(len(CLASSES), 5, 3.7, 2.9)
+    figure, plots = new_figure(len(CLASSES), 5, 3.7, 2.9)
     for index, name in enumerate(CLASSES):
         far, yaw, number, hidden, sizes = plots[5 * index : 5 * index + 5]
         for side, style, offset in ((comparison.real, _REAL, -0.15), (comparison.simulated, _OURS, 0.15)):

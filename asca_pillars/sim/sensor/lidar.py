@@ -25,7 +25,8 @@ class Lidar:
     Attributes:
         elevation_deg: of each laser, from the top downwards.
         origin_z_m: heights in the LiDAR frame at which the lasers leave it: first and last laser of each block of
-            equally many lasers from the top, evenly spaced between.
+            equally many lasers from the top, evenly spaced between. Sensors that stand on each other are one list of
+            lasers whose blocks hold one laser each (configs/simulation/vlp_32c_pair.yaml).
         azimuth_counts: encoder counts of one revolution.
         azimuth_steps: counts from each firing to the next, repeated.
         ego_first_ring, ego_beyond_ring: rings [first, beyond) that the own car hides, per equal sector of azimuth from
@@ -143,7 +144,8 @@ def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool, coun
     rings, per_block = lidar.rings, lidar.rings // len(lidar.origin_z_m)
     origin_z = np.concatenate([np.linspace(*block, per_block) for block in lidar.origin_z_m])
     elevation = np.asarray(lidar.elevation_deg) + rng.normal(0.0, lidar.elevation_jitter_deg, rings)
-    elevation = np.sort(elevation)[::-1]  # the ring windows of the ray caster need descending slopes
+    from_the_top = np.argsort(-elevation, kind="stable")  # the ray caster's windows of rings need descending slopes
+    elevation, origin_z = elevation[from_the_top], origin_z[from_the_top]
     steps = np.roll(lidar.azimuth_steps, int(rng.integers(len(lidar.azimuth_steps))))
     columns = np.concatenate([[0], np.cumsum(np.resize(steps, lidar.azimuth_counts))])
     columns = columns[columns < lidar.azimuth_counts]

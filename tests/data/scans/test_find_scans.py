@@ -62,4 +62,6 @@ def test_names_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
 def test_names_stay_inside_the_folder_of_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     touch(tmp_path, "x/1.bin", "1.bin")
     monkeypatch.chdir(tmp_path / "x")
-    assert all(".." not in Path(name).parts and not Path(name).is_absolute() for name in names(Path("../1.bin"), Path()))
+    assert all(
+        ".." not in Path(name).parts and not Path(name).is_absolute() for name in names(Path("../1.bin"), Path())
+    )

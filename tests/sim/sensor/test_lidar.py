@@ -80,6 +80,20 @@ def test_a_street_is_scanned_within_the_sensor_s_range(name: str) -> None:
     assert 0.4 * SHEETS[name][0] * SHEETS[name][3] < len(distance)
 
 
+def test_two_stacked_sensors_are_one_list_of_lasers() -> None:
+    """An upright VLP-32C and one upside down below it: each laser leaves its own sensor."""
+    config = preset("vlp_32c_pair")
+    scan = flat_scan(config.lidar)
+    firings = draw_firings(config.lidar, np.random.default_rng(0), camera_only=False)
+    assert firings.hidden.shape == (64, 1808) and set(firings.origin_z_m) == {0.0, -0.115}
+    rho = np.hypot(scan.points[:, 0], scan.points[:, 1]).astype(float)
+    elevation = np.rad2deg(np.arctan2(scan.points[:, 2] - firings.origin_z_m[scan.ring], rho))
+    measured = np.array([np.median(elevation[scan.ring == ring]) for ring in range(64)])
+    upper = firings.origin_z_m == 0.0
+    np.testing.assert_allclose(measured[upper], -measured[~upper][::-1], atol=0.05)
+    assert (measured[upper].max(), measured[upper].min()) == pytest.approx((15.0, -25.0), abs=0.1)
+
+
 def test_the_sensor_of_kitti_has_its_pattern_and_its_car() -> None:
     firings = draw_firings(Lidar(), np.random.default_rng(1), camera_only=False)
     step = np.rad2deg(np.diff(firings.azimuth_rad))

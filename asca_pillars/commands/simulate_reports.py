@@ -1,0 +1,39 @@
+"""The comparisons of `asca simulate`: with KITTI's statistics, and of simulated objects with real ones."""
+
+from pathlib import Path
+
+from rich.console import Console
+
+from asca_pillars.commands.models import open_model
+from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.files import require_own
+from asca_pillars.sim.report.comparison import compare
+from asca_pillars.sim.report.like_for_like import MIN_SCORE, compare_like_for_like
+from asca_pillars.sim.report.like_tables import print_like, write_like
+from asca_pillars.sim.report.measured import measure
+from asca_pillars.sim.report.plots import write_plots
+from asca_pillars.sim.report.reference import kitti_reference
+from asca_pillars.sim.report.tables import print_comparison, write_report
+
+
+def report_statistics(out: Path, console: Console) -> None:
+    """Compare the frames below `out` with KITTI; print the tables and write them, and the plots, to out/report/."""
+    folder = out / "report"
+    require_own(folder, "asca simulate --report", "report.json", "reflectance.png", "like_for_like.json")
+    reference = kitti_reference()
+    measured = measure(out)
+    comparison = compare(measured, reference.statistics)
+    print_comparison(comparison, console)
+    write_report(folder, comparison, write_plots(folder, comparison, measured, reference.sensor))
+    console.print(f"All rows and plots: {folder}/report.md; all numbers: {folder}/report.json", soft_wrap=True)
+
+
+def report_like_for_like(out: Path, like: Path, bundle: Path | None, console: Console) -> None:
+    """Compare the objects below `out` with those of a real folder; print the tables and write them to out/report/."""
+    folder = out / "report"
+    require_own(folder, "asca simulate --like", "report.json", "reflectance.png", "like_for_like.json")
+    detect = None if bundle is None else open_model(RuntimeOptions(bundle=bundle), MIN_SCORE).detect
+    result = compare_like_for_like(like, out, detect, None if bundle is None else str(bundle))
+    print_like(result, console)
+    write_like(folder, result)
+    console.print(f"Written: {folder}/like_for_like.md, .json and .png", soft_wrap=True)
