@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 
 from asca_pillars.commands import extras
-from asca_pillars.commands.simulate import run
+from asca_pillars.commands import simulate as command
 from asca_pillars.errors import AscaError, DatasetError
 from tests.sim.report.made_up import write_set
 
 
 def simulate(out: Path, frames: int | None, *, view: str | None = "camera", report: bool = True) -> None:
-    run(out, frames, 0, 1, None, view, 0.5, report)
+    command.simulate(out, frames=frames, workers=1, view=view, val_share=0.5, report=report)
 
 
 def written(folder: Path) -> dict[str, bytes]:
@@ -52,7 +52,7 @@ def test_objects_are_compared_with_those_of_a_real_folder(tmp_path: Path, capsys
     real = write_set(tmp_path / "real")
     simulate(tmp_path / "sim", 24, report=False)
     before = written(real)
-    run(tmp_path / "sim", None, 0, 1, None, None, 0.5, False, real)
+    command.simulate(tmp_path / "sim", workers=1, val_share=0.5, like=real)
     told = capsys.readouterr().out
     assert "Percentile: of the real object among them" in told
     report = json.loads((tmp_path / "sim/report/like_for_like.json").read_text())
@@ -64,7 +64,7 @@ def test_objects_are_compared_with_those_of_a_real_folder(tmp_path: Path, capsys
 
 def test_a_wrong_real_folder_and_a_bundle_without_one_are_told_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no \*\.bin scans"):
-        run(tmp_path / "sim", 2, 0, 1, None, "camera", 0.5, False, tmp_path / "nothing")
+        command.simulate(tmp_path / "sim", frames=2, workers=1, view="camera", like=tmp_path / "nothing")
     with pytest.raises(AscaError, match="give --like"):
-        run(tmp_path / "sim", 2, 0, 1, None, "camera", 0.5, False, None, Path("asca_small_sim"))
+        command.simulate(tmp_path / "sim", frames=2, workers=1, view="camera", bundle=Path("asca_small_sim"))
     assert not (tmp_path / "sim").exists()

@@ -54,7 +54,7 @@ def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path) -> None:
 def test_a_bundle_to_compare_with_is_looked_at_first(
     tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("asca_pillars.commands.bench.benchmark", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("asca_pillars.commands.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
     with pytest.raises(BundleError, match="none: no such folder"):
         CliRunner().invoke(
             app, ["bench", "-b", str(tiny_bundle), "--compare", str(tmp_path / "none")], catch_exceptions=False

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 from torch.utils.data import DataLoader
 
-from asca_pillars.commands.prepare import run
+from asca_pillars.commands.prepare import prepare
 from asca_pillars.config import Config, DataConfig, InsertConfig, PillarModel
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
@@ -252,7 +252,7 @@ def test_prepare_leaves_nothing_for_training_to_compute(
     path = tmp_path / "model.yaml"
     path.write_text("augment: {insert: {method: rs_aug}}")
     overrides = [f"data.prepared={tmp_path / 'prepared'}"]
-    run(path, root, overrides, workers=1)
+    prepare(path, data=root, override=overrides, workers=1)
     assert f"{4 * FRAMES} objects of {FRAMES} frames" in capsys.readouterr().out
     made = {file: file.stat().st_mtime_ns for file in (tmp_path / "prepared").rglob("*.n*")}
     assert len(made) == FRAMES + 2

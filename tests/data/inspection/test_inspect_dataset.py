@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.commands.inspect import run
+from asca_pillars.commands.inspect import inspect
 from asca_pillars.config import Config, DataConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
@@ -296,7 +296,7 @@ def refusal(root: Path, config: Config, tmp_path: Path) -> str:
     path = tmp_path / "config.yaml"
     path.write_text(yaml.safe_dump(to_dict(config)))
     with pytest.raises(DatasetError) as error:
-        run(root, path, None, 500, tmp_path / "report.json")
+        inspect(root, config=path, json=tmp_path / "report.json")
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["findings"][0]["level"] == "error" and report["findings"][0]["text"] in str(error.value)
     assert "\n" not in str(error.value)
@@ -375,8 +375,8 @@ def test_runs_without_torch(clean: Path, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "from pathlib import Path; from asca_pillars.commands.inspect import run\n"
-        "run(Path(sys.argv[1]), Path(sys.argv[2]), None, 2, None)"
+        "from pathlib import Path; from asca_pillars.commands.inspect import inspect\n"
+        "inspect(Path(sys.argv[1]), config=Path(sys.argv[2]), frames=2)"
     )
     command = [sys.executable, "-W", "error", "-c", code, str(clean), str(tmp_path / "config.yaml")]
     result = subprocess.run(command, capture_output=True, text=True)
