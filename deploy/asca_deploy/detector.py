@@ -236,7 +236,7 @@ def _usable_points(points: NDArray[Any]) -> _Usable:
     if not finite.all():
         usable = finite.all(axis=1)
         scan, non_finite = scan[usable], int(len(scan) - usable.sum())
-    reflectance = scan[:, 3]
+    reflectance = scan[:, 3].copy()  # in one piece, which NumPy searches several times faster
     if not len(scan) or (reflectance.min() >= 0 and reflectance.max() <= 1):
         return _Usable(scan, scan, non_finite, 0)
     clipped = scan.copy()
