@@ -1,3 +1,57 @@
-"""LiDAR 3D detection with adaptive-scale pillars: ASCA-PointPillars, from the scan to the boxes."""
+"""LiDAR 3D detection with adaptive-scale pillars: ASCA-PointPillars, from the scan to the boxes.
+
+    from asca_pillars import Detector, read_scan
+
+    detections = Detector()(read_scan("scan.bin").points)
+
+The names below are the stable ones (docs/API.md). They are imported when they are first used, so that
+`import asca_pillars` costs nothing, and they never import PyTorch.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from asca_deploy import Bundle, Detector, load_bundle
+    from asca_pillars.data.scans.scan_reader import Scan, read_scan
+    from asca_pillars.errors import AscaError
+    from asca_pillars.geometry.detections import Detection, Detections
+    from asca_pillars.geometry.frame_report import FrameReport
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "AscaError",
+    "Bundle",
+    "Detection",
+    "Detections",
+    "Detector",
+    "FrameReport",
+    "Scan",
+    "__version__",
+    "load_bundle",
+    "read_scan",
+]
+
+_HOMES = {
+    "AscaError": "asca_pillars.errors",
+    "Bundle": "asca_deploy",
+    "Detection": "asca_pillars.geometry.detections",
+    "Detections": "asca_pillars.geometry.detections",
+    "Detector": "asca_deploy",
+    "FrameReport": "asca_pillars.geometry.frame_report",
+    "Scan": "asca_pillars.data.scans.scan_reader",
+    "load_bundle": "asca_deploy",
+    "read_scan": "asca_pillars.data.scans.scan_reader",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

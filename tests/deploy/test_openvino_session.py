@@ -100,10 +100,10 @@ def test_bytes_in_and_outputs_by_name(graph: Path, backend: str) -> None:
     assert session.inputs == {"image": Tensor("uint8", (2, 3))}
     assert session.outputs == {"double": Tensor("float32", (2, 3)), "sum": Tensor("float32", ())}
     image = np.arange(6, dtype=np.uint8).reshape(2, 3) + 200
-    total, double = session.run({"image": image}, ["sum", "double"])
+    total, double = session.run(["sum", "double"], {"image": image})
     np.testing.assert_array_equal(double, 2.0 * image)
     assert total == image.sum() and double.dtype == np.float32
-    np.testing.assert_array_equal(session.run({"image": image[::-1, ::-1]}, ["double"])[0], 2.0 * image[::-1, ::-1])
+    np.testing.assert_array_equal(session.run(["double"], {"image": image[::-1, ::-1]})[0], 2.0 * image[::-1, ::-1])
 
 
 @by_backend
@@ -111,7 +111,7 @@ def test_results_outlive_the_next_run_whichever_thread_asks(graph: Path, backend
     session = BACKENDS[backend](graph)
     images = [np.full((2, 3), value, np.uint8) for value in range(100)]
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda image: session.run({"image": image}, ["double"])[0], images))
+        found = list(pool.map(lambda image: session.run(["double"], {"image": image})[0], images))
     for image, double in zip(images, found, strict=True):
         np.testing.assert_array_equal(double, 2.0 * image)
 

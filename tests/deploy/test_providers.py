@@ -127,6 +127,9 @@ class StubSession:
 
     get_outputs = get_inputs
 
+    def run(self) -> None:
+        """Nothing runs here."""
+
 
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> StubSession:

@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,16 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+import typer
 
 from asca_deploy import Detector, load_bundle
-from asca_export import graphs
+from asca_export import graphs, reissue
 from asca_export.exporter import export_bundle
 from asca_export.fast_forms import FastBackbone
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
+from asca_pillars.data.expected_input import ExpectedInput, measure_expected_input
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -93,6 +96,29 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
         export_bundle(checkpoint, tmp_path / "bundle", SCANS)
     assert {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["bundle"], "temporary files are left"
+
+
+def test_the_expected_input_is_the_checkpoints_own(tmp_path: Path) -> None:
+    checkpoint = tiny_checkpoint("none")
+    measured = export_bundle(checkpoint, tmp_path / "measured", SCANS)
+    assert measured.expected_input == measure_expected_input(SCANS, checkpoint.config.data.camera_view)
+    assert measured.expected_input_from == "export"
+    known = ExpectedInput((1, 2), (0.1, 0.2), None, camera_view=False)
+    copied = export_bundle(checkpoint._replace(expected_input=known), tmp_path / "copied", SCANS)
+    assert (copied.expected_input, copied.expected_input_from) == (known, "training")
+
+
+def test_a_bundle_issued_again_runs_the_same_networks(tmp_path: Path) -> None:
+    export_bundle(tiny_checkpoint("none"), tmp_path / "old", SCANS)
+    (tmp_path / "scans").mkdir()
+    for number, points in enumerate(SCANS[:2]):
+        write_scan(tmp_path / "scans" / f"{number}.bin", points)
+    reissue.main(tmp_path / "old", tmp_path / "scans", tmp_path / "new", camera_view=True, training=True)
+    old, new = load_bundle(tmp_path / "old"), load_bundle(tmp_path / "new")
+    assert new.expected_input == measure_expected_input(SCANS[:2], camera_view=True)
+    assert new == replace(old, expected_input=new.expected_input, expected_input_from="training", graphs=new.graphs)
+    with pytest.raises(typer.BadParameter, match="exists"):
+        reissue.main(tmp_path / "old", tmp_path / "scans", tmp_path / "new")
 
 
 def test_too_few_scans_are_refused(tmp_path: Path) -> None:

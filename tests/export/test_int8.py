@@ -25,7 +25,8 @@ def export_int8(folder: Path) -> Bundle:
     checkpoint = checkpoint._replace(
         config=replace(checkpoint.config, model=replace(checkpoint.config.model, spec=spec))
     )
-    return export_bundle(checkpoint, folder, SCANS, calibration=CALIBRATION)
+    # Two of the compared scans are given to calibrate on as well.
+    return export_bundle(checkpoint, folder, SCANS, calibration=[*CALIBRATION, SCANS[3], SCANS[0].copy()])
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def test_the_bundle_says_what_it_is(folder: Path) -> None:
     assert any(bundle.pillar.canvas.empty), "attention makes features negative, so zero is not the lowest step"
     report = bundle.quantization
     assert report is not None and bundle.parity is not None
-    assert (report.calibration_scans, report.compared_scans) == (8, 8)
+    assert (report.calibration_scans, report.dropped_scans, report.compared_scans) == (8, 2, 8)
     assert len(report.layers) == 6 + 3 + 1 and not any(layer.kept_float for layer in report.layers)
     assert 0 < report.logit_rms_error <= int8.MAX_LOGIT_ERROR
     assert report.boxes > 20 and report.boxes_matched > 0.9 * report.boxes
@@ -109,3 +110,8 @@ def test_scans_that_cannot_calibrate(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(ExportError, match="an 8-bit canvas alone moves the class logits"):
         export_bundle(tiny_checkpoint("none"), tmp_path / "b", SCANS, calibration=CALIBRATION)
     assert not list(tmp_path.iterdir())
+
+
+def test_calibration_on_the_compared_scans_alone_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match=r"8 were left out because parity is proven on them.*other scans to --calib"):
+        export_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS, calibration=SCANS)

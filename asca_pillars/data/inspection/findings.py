@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
+from asca_pillars.data.expected_input import TOLERANCE_M
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
-from asca_pillars.geometry.sensor_height import TOLERANCE_M
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
 # From these shares on something is a mistake or costs recall; KITTI and the simulator stay well below all of them.

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import DataConfig
+from asca_pillars.data.expected_input import ground_z_m
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import stored_points
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.geometry.sensor_height import ground_z_m
 from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.pillars.pillar_spec import PillarSpec
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.sensor_height import ground_z_m
+from asca_pillars.data.expected_input import ground_z_m
 
 
 def street(count: int = 4000) -> NDArray[np.float32]:

@@ -1,0 +1,54 @@
+"""The files of this project that a scan passes through from its file to the boxes.
+
+    python -m benchmarks.call_path [SCAN]
+
+A file counts if at least one of its functions is called, those compiled by numba included; the detector is open and
+has seen a scan before.
+"""
+
+import sys
+from collections import Counter
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+
+import asca_deploy
+import asca_pillars
+from asca_deploy import Detector, sample_scan_path
+from asca_pillars.data.scans.scan_reader import read_scan
+
+ROOTS = [Path(package.__file__).parent for package in (asca_pillars, asca_deploy) if package.__file__]
+
+
+def main(scan: Annotated[Path | None, typer.Argument(help="A scan. Default: the sample.")] = None) -> None:
+    """Print each file with its functions and how often they were called."""
+    calls = called_functions(Detector(), sample_scan_path() if scan is None else scan)
+    files = sorted({name for name, _ in calls})
+    for name in files:
+        functions = [f"{function} {count}" for (file, function), count in calls.items() if file == name]
+        print(f"{name}: {', '.join(functions)}")
+    print(f"{len(files)} files, {sum(calls.values())} calls")
+
+
+def called_functions(detector: Detector, scan: Path) -> Counter[tuple[str, str]]:
+    """(file, function) of this project -> calls, from reading the scan to its boxes."""
+    calls: Counter[tuple[str, str]] = Counter()
+
+    def count(frame: FrameType, event: str, _: Any) -> None:
+        path = Path(frame.f_code.co_filename)
+        if event == "call" and any(path.is_relative_to(root) for root in ROOTS):
+            calls[path.name, frame.f_code.co_name] += 1
+
+    detector(read_scan(scan).points)  # tables that are made once
+    sys.setprofile(count)
+    try:
+        detector(read_scan(scan).points)
+    finally:
+        sys.setprofile(None)
+    return calls
+
+
+if __name__ == "__main__":
+    typer.run(main)
