@@ -9,7 +9,6 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -18,7 +17,7 @@ from asca_deploy import Detections, Detector, FrameReport, sample_scan_path
 from asca_deploy.auto import summary
 from asca_deploy.providers import Precision, Provider
 from asca_pillars.data.kitti import Calibration, read_calibration
-from asca_pillars.data.scans.scan_reader import find_scans, read_scan
+from asca_pillars.data.scans.scan_reader import Scan, find_scans, read_scan
 from asca_pillars.files import atomic_path
 from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
 
@@ -49,27 +48,32 @@ def run(
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     reports: list[FrameReport] = []
     results: list[tuple[Path, Detections]] = []
+    dropped: list[int] = []
     for path in track(paths, "Detecting", console=console, disable=len(paths) == 1):
         scan = read_scan(path)
         detections = detector(scan.points)
         reports.append(detections.report)
         results.append((path, detections))
-        _write(out, path, scan.points, detections, detector)
+        dropped.append(scan.dropped_points + detections.report.non_finite_points)
+        _write(out, path, scan, detections, detector)
     console.print(_table_of_boxes(*results[0]) if len(results) == 1 else _table_of_scans(results, reports))
     for path, report in zip(paths, reports, strict=True):
         for warning in report.warnings:
             console.print(f"{path.name}: {warning}", style="yellow")
+    if any(dropped):
+        scans_hit = sum(map(bool, dropped))
+        console.print(f"{sum(dropped)} points of {scans_hit} scan(s) are not finite and were dropped", style="yellow")
     while len(reports) < TIMED_FRAMES:
         reports.append(detector(scan.points).report)
     console.print(_timing(reports[1:], detector))
     console.print(f"Pictures and results: {out}/")
 
 
-def _write(out: Path, path: Path, points: NDArray[np.float32], detections: Detections, detector: Detector) -> None:
+def _write(out: Path, path: Path, scan: Scan, detections: Detections, detector: Detector) -> None:
     """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
     with atomic_path(out / f"{path.stem}.json") as temporary:
-        temporary.write_text(json.dumps(_to_json(path, detections), indent=1), encoding="utf-8")
-    write_png(out / f"{path.stem}_bev.png", draw_bev(points, detections, detector.spec.ranges))
+        temporary.write_text(json.dumps(_to_json(path, scan, detections), indent=1), encoding="utf-8")
+    write_png(out / f"{path.stem}_bev.png", draw_bev(scan.points, detections, detector.spec.ranges))
     calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
     if path.parent.name != "velodyne" or not calib_path.exists():
         return
@@ -89,14 +93,14 @@ def _write_kitti(path: Path, detections: Detections, calibration: Calibration, i
         temporary.write_text(detections.to_kitti(calibration, size_wh), encoding="utf-8")
 
 
-def _to_json(path: Path, detections: Detections) -> dict[str, Any]:
+def _to_json(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
     report = detections.report
     return {
         "scan": path.name,
         "frame": "lidar: x forward, y left, z up; box centers; yaw counter-clockwise from x",
         "boxes": detections.to_dicts(),
         **asdict(report.counts),
-        "points_not_finite": report.non_finite_points,
+        "points_not_finite": scan.dropped_points + report.non_finite_points,
         "reflectances_clipped": report.clipped_reflectances,
         "outputs_not_finite": report.non_finite_outputs,
         "warnings": list(report.warnings),

@@ -113,5 +113,5 @@ def test_scans_that_cannot_calibrate(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_calibration_on_the_compared_scans_alone_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="8 were left out because parity is proven on them.*other scans to --calib"):
+    with pytest.raises(ExportError, match=r"8 were left out because parity is proven on them.*other scans to --calib"):
         export_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS, calibration=SCANS)
