@@ -27,7 +27,7 @@ __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
 
 # Beyond these a mistyped number asks for more memory than there is.
 _FARTHEST_M = 10_000.0
-_MOST_PILLARS = 20_000  # along one axis
+_MOST_PILLARS = 1 << 17  # along one axis
 
 
 class GridTables(NamedTuple):
