@@ -12,7 +12,7 @@ import cv2
 from asca_deploy import Detections
 from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.scans.scan_reader import Scan
-from asca_pillars.files import atomic_path, write_json
+from asca_pillars.files import atomic_path, require_own, write_json
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
 
@@ -23,9 +23,12 @@ class ResultWriter:
     """Writes the results of scan after scan to a folder; `detections.jsonl` appears when the block ends well.
 
     Args:
-        out: the folder; files of other names in it stay.
+        out: the folder: absent, empty, or that of an earlier run. Results of other scans in it stay.
         ranges: what the bird's-eye pictures show.
         pictures: False writes no picture.
+
+    Raises:
+        OutputError: when the block is entered, if `out` holds files of something else.
     """
 
     def __init__(self, out: Path, ranges: Ranges, *, pictures: bool) -> None:
@@ -34,6 +37,10 @@ class ResultWriter:
         self._lines: IO[str]
 
     def __enter__(self) -> "ResultWriter":
+        require_own(self._out, "asca detect", RUN_FILE)
+        if not (self._out / RUN_FILE).exists():
+            with atomic_path(self._out / RUN_FILE):
+                pass  # marks the folder from the start, so that a run that was killed can be given again
         temporary = self._stack.enter_context(atomic_path(self._out / RUN_FILE))
         self._lines = self._stack.enter_context(temporary.open("w", encoding="utf-8"))
         return self
