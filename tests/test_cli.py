@@ -117,7 +117,7 @@ def test_doctor_names_the_missing_extras() -> None:
     assert "provider cpu: ok" in result.stdout
     assert "pip install 'asca-pillars[train]'" in result.stdout and "pip install 'asca-pillars[sim]'" in result.stdout
     assert "provider openvino is not installed: `pip install 'asca-pillars[openvino]'`" in result.stdout
-    assert "auto takes cpu float32" in result.stdout
+    assert "auto takes cpu int8" in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -207,8 +207,13 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     after = {spec["name"]: spec["score_threshold"] for spec in manifest["spec"]["classes"]}
     assert after == before | {"Pedestrian": 0.21}
     assert "add --int8" in refusal(full(*export, "--calibrate", scans))
-    quantized = full(*export, "--int8", "--calibrate", scans)
+    assert "8 were left out because parity is proven on them" in refusal(full(*export, "--int8", "--calibrate", scans))
+    others = tmp_path / "others"
+    for seed in range(7, 16):  # the first is among the scans of parity
+        write_scan(others / f"{seed}.bin", make_scene(seed)[0])
+    quantized = full(*export, "--int8", "--calibrate", others)
     assert quantized.returncode == 0, quantized.stderr
+    assert "1 calibration scans left out" in quantized.stdout
     assert "calibrated on 8 scans" in quantized.stdout and "logit error" in quantized.stdout.lower()
     assert json.loads((bundle / "bundle.json").read_text())["precision"] == "int8"
     detected = asca("detect", scans, "--bundle", bundle, "--out", tmp_path / "out")
