@@ -79,7 +79,7 @@ def test_detect_finds_boxes_in_the_sample_without_torch(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "Car" in result.stdout and "FPS" in result.stdout and "pillarize" in result.stdout
     out = tmp_path / "detections"
-    assert {path.name for path in out.iterdir()} == {"street.json", "street_bev.png"}
+    assert {path.name for path in out.iterdir()} == {"detections.jsonl", "street.json", "street_bev.png"}
     boxes = json.loads((out / "street.json").read_text())["boxes"]
     expected = Detector()(read_scan(sample_scan_path()).points)
     assert [box["class"] for box in boxes] == expected.names and len(boxes) >= 3
@@ -189,7 +189,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
 
     command = [sys.executable, "-c", "from asca_pillars.cli import main; main()", *map(str, export)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not list(tmp_path.glob(".bundle-*")):
+    while not list(tmp_path.glob(".bundle.asca-*")):
         assert process.poll() is None, "the export ended before it could be killed"
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)

@@ -34,15 +34,10 @@ class ResultWriter:
     def __init__(self, out: Path, ranges: Ranges, *, pictures: bool) -> None:
         self._out, self._ranges, self._pictures = out, ranges, pictures
         self._stack = ExitStack()
-        self._lines: IO[str]
+        self._lines: IO[str] | None = None
 
     def __enter__(self) -> "ResultWriter":
         require_own(self._out, "asca detect", RUN_FILE)
-        if not (self._out / RUN_FILE).exists():
-            with atomic_path(self._out / RUN_FILE):
-                pass  # marks the folder from the start, so that a run that was killed can be given again
-        temporary = self._stack.enter_context(atomic_path(self._out / RUN_FILE))
-        self._lines = self._stack.enter_context(temporary.open("w", encoding="utf-8"))
         return self
 
     def __exit__(
@@ -52,6 +47,8 @@ class ResultWriter:
 
     def __call__(self, path: Path, name: Path, scan: Scan, detections: Detections) -> None:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
+        if self._lines is None:
+            self._lines = self._open()
         content = _content(path, scan, detections)
         write_json(self._named(name, ".json"), content)
         self._lines.write(json.dumps(content) + "\n")
@@ -67,6 +64,13 @@ class ResultWriter:
         if image is not None and self._pictures:
             drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
             write_png(self._named(name, "_image.png"), drawn)
+
+    def _open(self) -> IO[str]:
+        if not (self._out / RUN_FILE).exists():
+            with atomic_path(self._out / RUN_FILE):
+                pass  # marks the folder from the start, so that a run that was killed can be given again
+        temporary = self._stack.enter_context(atomic_path(self._out / RUN_FILE))
+        return self._stack.enter_context(temporary.open("w", encoding="utf-8"))
 
     def _named(self, name: Path, ending: str) -> Path:
         # Not with_suffix: a name may hold dots of its own.

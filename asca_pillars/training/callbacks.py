@@ -1,7 +1,9 @@
 """What happens around the steps of a run: progress, Ctrl-C, the average of the weights."""
 
+import contextlib
 import signal
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import lightning as L  # noqa: N812  (Lightning's own convention)
@@ -31,10 +33,17 @@ class SaveOnInterrupt(Checkpoint):
         self.asked = False
         self._before: Any = None
 
-    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Take over SIGINT, which only the main thread may."""
-        if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._ask)
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take over SIGINT, which only the main thread may, and give it back after Lightning has restored its own."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        self._before = signal.signal(signal.SIGINT, self._ask)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, self._before)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
         """Save and stop, on all ranks together."""
@@ -46,12 +55,6 @@ class SaveOnInterrupt(Checkpoint):
         """Stop: the epoch was saved before its validation."""
         if not trainer.sanity_checking and self._any_rank_asked(trainer):
             self._stop(trainer)
-
-    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Give SIGINT back."""
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
-            self._before = None
 
     def _ask(self, *_: Any) -> None:
         self.asked = True

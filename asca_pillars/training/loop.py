@@ -8,7 +8,7 @@ from typing import Any
 import lightning as L  # noqa: N812  (Lightning's own convention)
 import torch
 from lightning.fabric.utilities.warnings import PossibleUserWarning
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import Checkpoint, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
@@ -79,8 +79,12 @@ def train(
     if init is not None and resumed is None:
         _start_from(module, init)
     files = AtomicCheckpointIO(keep_last=damage is None)
-    trainer = _trainer(config.train, out, files, int(devices) if devices.isdigit() else devices, num_nodes)
-    with warnings.catch_warnings():
+    last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
+    interrupt = SaveOnInterrupt(last)
+    trainer = _trainer(
+        config.train, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes
+    )
+    with warnings.catch_warnings(), interrupt.listening():
         # Of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")
         # EpochSampler starts at the step where the checkpoint stopped, which Lightning cannot know.
@@ -91,22 +95,24 @@ def train(
         # Advice on workers and logging that does not fit two cores and small data.
         warnings.filterwarnings("ignore", category=PossibleUserWarning)
         trainer.fit(module, data, ckpt_path=None if resumed is None else str(resumed), weights_only=True)
-    last = checkpoints / LAST
     if trainer.is_global_zero:
-        save_weights(last)
-    return last
+        save_weights(checkpoints / LAST)
+    return checkpoints / LAST
 
 
 def _trainer(
-    recipe: TrainConfig, out: Path, files: AtomicCheckpointIO, devices: int | str, num_nodes: int
+    recipe: TrainConfig,
+    out: Path,
+    files: AtomicCheckpointIO,
+    saving: list[Checkpoint],
+    devices: int | str,
+    num_nodes: int,
 ) -> L.Trainer:
     checkpoints = out / "checkpoints"
-    last = LastCheckpoint(checkpoints, recipe.checkpoint_steps)
     callbacks: list[Any] = [
         RunProgress(),
         LearningRateMonitor("step"),
-        last,
-        SaveOnInterrupt(last),
+        *saving,
         ModelCheckpoint(checkpoints, filename="best", save_top_k=1, enable_version_counter=False, monitor="val/loss"),
     ]
     if recipe.ema:

@@ -36,7 +36,7 @@ def test_scans_that_were_not_simulated_are_compared_and_never_added_to(tmp_path:
     simulate(tmp_path, None)
     assert {name: data for name, data in written(tmp_path).items() if not name.startswith("report/")} == before
     for report in (True, False):
-        with pytest.raises(DatasetError, match="holds scans that were not simulated; choose another folder"):
+        with pytest.raises(AscaError, match="nothing that `asca simulate` wrote; choose another folder"):
             simulate(tmp_path, 8, report=report)
     assert {name: data for name, data in written(tmp_path).items() if not name.startswith("report/")} == before
 

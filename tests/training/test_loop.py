@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -210,6 +211,26 @@ def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
     ):
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, msg=name)
     assert not list(broken.rglob(".*")), "temporary files of the killed run are left"
+
+
+def test_recall_is_that_of_all_ranks_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One rank has no car at all, the other finds one of four: the recall is 1/4, not a mean with NaN."""
+    module = DetectionModule(CONFIG)
+    other = torch.tensor([4, 1, 2, 0, 0, 0, 0, 0, 0, 3])  # objects, found, false of each class; frames
+
+    def add_other(counts: torch.Tensor, reduce_op: str) -> torch.Tensor:
+        assert reduce_op == "sum"
+        return counts + other
+
+    strategy = SimpleNamespace(reduce=add_other)
+    module._trainer = SimpleNamespace(strategy=strategy, sanity_checking=True)  # type: ignore[assignment]
+    module._fabric = None
+    logged: dict[str, float] = {}
+    monkeypatch.setattr(module, "log", lambda name, value: logged.update({name: value}))
+    module.recall.frames = 1
+    module.on_validation_epoch_end()
+    assert logged["val/recall/Car"] == 0.25 and logged["val/false_per_frame/Car"] == 0.5
+    assert module.recall.frames == 0
 
 
 def test_the_first_loss_that_is_not_finite_stops_and_names_term_and_frames(tmp_path: Path) -> None:
