@@ -216,7 +216,7 @@ def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
 def test_recall_is_that_of_all_ranks_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One rank has no car at all, the other finds one of four: the recall is 1/4, not a mean with NaN."""
     module = DetectionModule(CONFIG)
-    other = torch.tensor([4, 1, 2, 0, 0, 0, 0, 0, 0, 3])  # objects, found, false of each class; frames
+    other = torch.tensor([[4, 1, 2], [0, 0, 0], [0, 0, 0], [3, 0, 0]])  # objects, found, false of each class; frames
 
     def add_other(counts: torch.Tensor, reduce_op: str) -> torch.Tensor:
         assert reduce_op == "sum"
@@ -227,7 +227,7 @@ def test_recall_is_that_of_all_ranks_together(tmp_path: Path, monkeypatch: pytes
     module._fabric = None
     logged: dict[str, float] = {}
     monkeypatch.setattr(module, "log", lambda name, value: logged.update({name: value}))
-    module.recall.frames = 1
+    module.recall.counts[-1, 0] = 1
     module.on_validation_epoch_end()
     assert logged["val/recall/Car"] == 0.25 and logged["val/false_per_frame/Car"] == 0.5
     assert module.recall.frames == 0
