@@ -33,8 +33,9 @@ from asca_pillars.data.kitti import KittiSplit
 POLL_S = 0.002
 FRAMES = 10
 CONFIG = """name: tiny
-detector: {grid: {x_range_m: [4.8, 25.28], y_range_m: [-6.4, 7.68], v_max_m: 0.32, zones: 2}}
-network: {pillar_channels: 16, block_channels: [16, 24, 32], block_convs: [1, 1, 1], upsample_channels: 16}
+model:
+  spec: {grid: {x_range_m: [4.8, 25.28], y_range_m: [-6.4, 7.68], v_max_m: 0.32, zones: 2}}
+  network: {pillar_channels: 16, block_channels: [16, 24, 32], block_convs: [1, 1, 1], upsample_channels: 16}
 augment: {insert: {method: rs_aug, min_points: 1}}
 data: {workers: 2}
 train: {epochs: 4, batch_size: 2, checkpoint_steps: 1}
