@@ -1,6 +1,7 @@
 """Does the memory of a detector grow with the number of scans?
 
-    python -m benchmarks.memory --scans 10000
+    python -m benchmarks.memory --scans 50000                  # half in calls, half in streams
+    python -m benchmarks.memory --scans 50000 --only streams
 
 Scans are crops of the sample of many sizes, so that everything whose size depends on the scan keeps changing. Half of
 them go through single calls and half through streams that are opened and closed again.
@@ -11,7 +12,7 @@ import logging
 from collections.abc import Iterator
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -36,20 +37,21 @@ def main(
     provider: Annotated[str, typer.Option()] = "cpu",
     precision: Annotated[str, typer.Option(help="float32 or reduced.")] = "float32",
     threads: Annotated[int | None, typer.Option()] = None,
+    only: Annotated[Literal["calls", "streams"] | None, typer.Option(help="Default: half of each.")] = None,
     out: Annotated[Path | None, typer.Option("--json", help="Also write the samples to this file.")] = None,
 ) -> None:
     """Run, sample the resident memory along the way, print start, middle, end and slope."""
     console = Console(markup=False, highlight=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # crops are unlike any training scan
     detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
-    samples = [(done, _resident()) for done in _run(detector, scans, console)]
+    samples = [(done, _resident()) for done in _run(detector, scans, only, console)]
     counts, resident = np.array(samples).T
     warm = counts >= WARM_SHARE * scans
     slope = np.polyfit(counts[warm], resident[warm], 1)[0] * 1000
     start, middle, end = resident[warm][0], resident[warm][warm.sum() // 2], resident[-1]
     console.print(
         f"{scans} scans, {provider} {precision}: resident {start:.1f} MiB after {counts[warm][0]:.0f} scans, "
-        f"{middle:.1f} in the middle, {end:.1f} at the end, peak {peak_memory_mib():.1f}; "
+        f"{middle:.1f} in the middle, {end:.1f} at the end ({end - start:+.2f}), peak {peak_memory_mib():.1f}; "
         f"slope {slope:+.3f} MiB per 1,000 scans after the first {WARM_SHARE:.0%}",
         soft_wrap=True,
     )
@@ -58,14 +60,15 @@ def main(
             path.write_text(json.dumps({"scans": scans, "slope_mib_per_1000": slope, "samples": samples}) + "\n")
 
 
-def _run(detector: Detector, count: int, console: Console) -> Iterator[int]:
+def _run(detector: Detector, count: int, only: str | None, console: Console) -> Iterator[int]:
     """Run `count` scans and yield after every CHUNK how many are done."""
     source = crops(read_scan(sample_scan_path()).points)
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("scans", total=count)
         for number, done in enumerate(range(0, count, CHUNK)):
             chunk = islice(source, min(CHUNK, count - done))
-            for _ in detector.stream(chunk) if number % 2 == 0 else map(detector, chunk):
+            streamed = only == "streams" or (only is None and number % 2 == 0)
+            for _ in detector.stream(chunk) if streamed else map(detector, chunk):
                 progress.advance(task)
             yield min(done + CHUNK, count)
 
