@@ -82,7 +82,7 @@ def detect(
     if not results:
         raise ScanError(f"none of the {len(named)} scans can be read")
     console.print(show.boxes(path, detections) if len(named) == 1 else show.scans(results, detector.spec.class_names))
-    for line in show.notes(results):
+    for line in (*show.notes(results), *write.remarks[:1]):
         console.print(line, style="yellow", soft_wrap=True)
     reports = [result.report for result in results]
     while len(reports) < TIMED_FRAMES:

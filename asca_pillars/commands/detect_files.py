@@ -35,6 +35,8 @@ class ResultWriter:
         self._out, self._ranges, self._pictures = out, ranges, pictures
         self._stack = ExitStack()
         self._lines: IO[str] | None = None
+        self.remarks: list[str] = []
+        """What could not be drawn, and why; for the user."""
 
     def __enter__(self) -> "ResultWriter":
         require_own(self._out, "asca detect", RUN_FILE)
@@ -60,6 +62,8 @@ class ResultWriter:
         calibration = read_calibration(calib_path)
         image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
         image = cv2.imread(str(image_path)) if image_path.exists() else None
+        if image is None and image_path.exists():
+            self.remarks.append(f"{image_path}: cannot be read as an image; the boxes are not drawn on it")
         _write_kitti(self._named(name, ".txt"), detections, calibration, image)
         if image is not None and self._pictures:
             drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)

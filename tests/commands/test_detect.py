@@ -10,8 +10,10 @@ import pytest
 from asca_deploy import sample_scan_path
 from asca_pillars.commands.detect import detect
 from asca_pillars.commands.detect_files import ResultWriter
+from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import OutputError, ScanError
+from tests.scenes import write_dataset
 
 POINTS = read_scan(sample_scan_path()).points[::10].copy()
 
@@ -97,3 +99,12 @@ def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"torn")
     with pytest.raises(ScanError, match="none of the 2 scans can be read"):
         detect([tmp_path], out=tmp_path / "out", threads=1)
+
+
+def test_an_image_that_cannot_be_read_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    root = write_dataset(tmp_path / "kitti", 1)
+    image = KittiSplit(root).image_path("000000")
+    image.parent.mkdir()
+    image.write_bytes(b"no picture")
+    detect([KittiSplit(root).scan_path("000000")], out=tmp_path / "out", threads=1)
+    assert "000000.png: cannot be read as an image" in " ".join(capfd.readouterr().out.split())

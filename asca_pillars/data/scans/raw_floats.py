@@ -14,6 +14,7 @@ MAX_POINTS = 50_000_000
 MAX_COLUMNS = 16
 _FAR_M = 1000.0
 _MAX_RING = 512
+_FEW = 100
 _FOUR, _FIVE = "x, y, z, reflectance", "x, y, z, reflectance, ring"
 
 
@@ -50,13 +51,18 @@ def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:
 def _columns(path: Path, size: int, data: NDArray[np.float32]) -> int:
     """Four, unless five fit better.
 
-    Five are plausible if the fifth counts rings (whole, small, not all the same). Of such a file read in fours, the
-    reflectances are now and then heights or coordinates: negative, as no sensor's are.
+    Five are plausible if the fifth counts rings (whole and small; all 0 where an exporter left them out). Of such a
+    file read in fours, the reflectances are now and then heights or coordinates: negative, as no sensor's are.
     """
-    five = size % 20 == 0 and _plausible(data.reshape(-1, 5)) and _rings(data[4::5])
-    if not five:
+    rings = data[4::5]
+    if size % 20 or not _plausible(data.reshape(-1, 5)) or not _whole_and_small(rings):
         return 4
+    varied = bool((rings != rings[0]).any())
+    if not varied and len(rings) < _FEW:
+        return 4  # too few to tell from a file that is cut off
     if size % 16 == 0 and _plausible(data.reshape(-1, 4)):
+        if not varied:
+            return 4
         raise ScanError(f"{path}: may be four columns ({_FOUR}) or five ({_FIVE}); state which (columns)")
     return 5
 
@@ -68,7 +74,6 @@ def _plausible(table: NDArray[np.float32]) -> bool:
         return bool(((table[:, 3] >= 0) & (table[:, 3] <= 65535) & near).mean() >= 0.99)
 
 
-def _rings(values: NDArray[np.float32]) -> bool:
+def _whole_and_small(values: NDArray[np.float32]) -> bool:
     with np.errstate(invalid="ignore"):
-        whole = (values >= 0) & (values < _MAX_RING) & (values == np.floor(values))
-    return bool(whole.all() and (values != values[0]).any())
+        return bool(((values >= 0) & (values < _MAX_RING) & (values == np.floor(values))).all())

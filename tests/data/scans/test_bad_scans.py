@@ -169,6 +169,13 @@ def test_five_columns_are_found_and_said(tmp_path, count):
     assert "5 columns" in scan.notes.remarks[0]
 
 
+def test_five_columns_are_found_where_an_exporter_left_the_rings_out(tmp_path):
+    points = np.column_stack([STREET[:4000, :4], np.zeros(4000, np.float32)]).astype("<f4")
+    points.tofile(tmp_path / "a.bin")
+    scan = read_scan(tmp_path / "a.bin")
+    assert len(scan.points) == 4000 and "5 columns" in scan.notes.remarks[0]
+
+
 def test_columns_can_be_stated(tmp_path):
     (tmp_path / "a.bin").write_bytes(NUSCENES.tobytes())
     np.testing.assert_array_equal(read_scan(tmp_path / "a.bin", columns=5).points, STREET)
