@@ -4,9 +4,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.models.pillar.pillar_detector import PillarBatch, PillarDetector, batch_pillars
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, batch_pillars, frame_maps
 from asca_pillars.pillars.spec import DetectorSpec
 
 
@@ -25,14 +24,9 @@ class ScanDetector:
 
     def __call__(self, points: NDArray[np.float32]) -> Detections:
         """(N, 4) x, y, z in metres (LiDAR frame) and reflectance 0..1 -> boxes, best first."""
-        features, pillar_index, point_counts, cells, frame_pillars = batch_pillars([self.spec.pillarize(points)])
-        batch = PillarBatch(
-            features.to(self._device),
-            pillar_index.to(self._device),
-            point_counts.to(self._device),
-            cells.to(self._device),
-            frame_pillars,
-        )
+        pillars = self.spec.pillarize(points)
+        batch = batch_pillars([pillars], [self.network.neck_tables(pillars)]).to(self._device)
         with torch.inference_mode():
             maps = self.network(batch)
-        return self.spec.decode(HeadMaps(*(part[0].float().cpu().numpy() for part in maps)))
+        ((found, cells),) = frame_maps(maps, batch)
+        return self.spec.decode(found, cells)

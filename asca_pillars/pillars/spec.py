@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,6 @@ class DetectorSpec:
         """Pillars of an (N, 4) scan on this detector's grid, see `pillarize`."""
         return pillarize(points, self.grid, self.limits, rng)
 
-    def decode(self, maps: HeadMaps[NDArray[np.float32]]) -> Detections:
-        """Detections in this detector's head maps, see `decode`."""
-        return decode(maps, self.anchors, self.classes, self.post)
+    def decode(self, maps: HeadMaps[NDArray[np.float32]], cells: NDArray[np.integer[Any]] | None = None) -> Detections:
+        """Detections in this detector's head maps, or in rows of these head cells, see `decode`."""
+        return decode(maps, self.anchors, self.classes, self.post, cells)

@@ -11,6 +11,8 @@ The head computes at the union of the three levels' cells, as it sees it: where 
 head cells below it.
 """
 
+import math
+from collections.abc import Sequence
 from typing import Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -59,6 +61,8 @@ class NeckTables(NamedTuple, Generic[Array]):
     """(H,) flat index of the active cells on the head's map, of a batch counted through the maps of its frames."""
     frame_rows: tuple[int, ...]
     """Active head cells of each frame."""
+    map_shape: tuple[int, int]
+    """(rows, columns) of one frame's head map."""
 
 
 class NeckTableBuilder:
@@ -114,7 +118,7 @@ class NeckTableBuilder:
                 )
             )
             before = output
-        return NeckTables(tuple(tables), self._head.cells.astype(np.int32), (len(self._head),))
+        return NeckTables(tuple(tables), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
 
     def _inverse(self, source: CellMap, target: CellMap, convolution: Convolution) -> NDArray[np.int32]:
         if not self.training:
@@ -127,21 +131,20 @@ def _reads(target: CellMap, source: CellMap, convolution: Convolution) -> NDArra
 
 
 def stack_neck_tables(
-    frames: list[NeckTables[NDArray[np.int32]]], pillars: list[int], cells_per_head_map: int
+    frames: Sequence[NeckTables[NDArray[np.int32]]], pillars: Sequence[int]
 ) -> NeckTables[NDArray[np.int32]]:
     """Tables of a batch from those of its frames.
 
     Args:
-        frames: of each frame.
-        pillars: of each frame.
-        cells_per_head_map: head cells of one frame, active or not.
+        frames: at least one, all of one map.
+        pillars: how many each frame has.
     """
-    levels, before = [], pillars
+    levels, before = [], list(pillars)
+    map_cells = math.prod(frames[0].map_shape)
     for number in range(LEVELS):
         parts = [frame.levels[number] for frame in frames]
         strided = [len(part.strided_cells) for part in parts]
         outputs = [len(part.cells) for part in parts]
-        map_cells = cells_per_head_map >> (2 * number)
         levels.append(
             LevelTables(
                 strided=stack_rows([part.strided for part in parts], before),
@@ -149,14 +152,15 @@ def stack_neck_tables(
                 same=stack_rows([part.same for part in parts], outputs),
                 strided_back=stack_rows([part.strided_back for part in parts], strided),
                 first_back=stack_rows([part.first_back for part in parts], outputs),
-                strided_cells=stack_cells([part.strided_cells for part in parts], map_cells),
-                cells=stack_cells([part.cells for part in parts], map_cells),
+                strided_cells=stack_cells([part.strided_cells for part in parts], map_cells >> (2 * number)),
+                cells=stack_cells([part.cells for part in parts], map_cells >> (2 * number)),
                 places=stack_rows([part.places for part in parts], [count << (2 * number) for count in outputs]),
             )
         )
         before = outputs
     return NeckTables(
         tuple(levels),
-        stack_cells([frame.head_cells for frame in frames], cells_per_head_map),
+        stack_cells([frame.head_cells for frame in frames], map_cells),
         tuple(len(frame.head_cells) for frame in frames),
+        frames[0].map_shape,
     )

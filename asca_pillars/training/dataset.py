@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from asca_pillars.config import Config
@@ -15,18 +16,20 @@ from asca_pillars.data.frames import LabeledFrame, read_frame, within_grid
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.geometry.targets import Targets, assign_targets
-from asca_pillars.models.pillar.loss import TargetBatch
-from asca_pillars.models.pillar.pillar_detector import PillarBatch, batch_pillars
+from asca_pillars.models.pillar.loss import TargetBatch, targets_at
+from asca_pillars.models.pillar.pillar_detector import batch_pillars
 from asca_pillars.pillars.pillarize import Pillars
+from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One frame, ready for the network: its pillars, and the targets of its anchors."""
+    """One frame, ready for the network: its pillars, the targets of its anchors, and the tables of a sparse neck."""
 
     frame: LabeledFrame
     pillars: Pillars
     targets: Targets
+    tables: NeckTables[NDArray[np.int32]] | None = None
 
 
 class Batch:
@@ -43,21 +46,19 @@ class Batch:
         self.frame_ids = [sample.frame.frame_id for sample in samples]
         self.boxes = [sample.frame.boxes for sample in samples]
         self.labels = [sample.frame.labels for sample in samples]
-        self.pillars = batch_pillars([sample.pillars for sample in samples])
+        self.pillars = batch_pillars([sample.pillars for sample in samples], [sample.tables for sample in samples])
         self.targets = _collate_targets([sample.targets for sample in samples])
 
     def to(self, device: Any) -> "Batch":
         """Move the tensors, in place, as Lightning expects of a batch."""
-        pillars = self.pillars
-        self.pillars = PillarBatch(
-            pillars.features.to(device),
-            pillars.pillar_index.to(device),
-            pillars.point_counts.to(device),
-            pillars.cells.to(device),
-            pillars.frame_pillars,
-        )
+        self.pillars = self.pillars.to(device)
         self.targets = TargetBatch(*(part.to(device) for part in self.targets))
         return self
+
+    def seen_targets(self) -> TargetBatch:
+        """Targets of the anchors that the network has: all, or those at the active head cells of a sparse neck."""
+        neck = self.pillars.neck
+        return self.targets if neck is None else targets_at(self.targets, neck.head_cells)
 
 
 class KittiDataset(Dataset[Sample]):
@@ -103,7 +104,12 @@ class KittiDataset(Dataset[Sample]):
             frame = augment(frame, self.config.augment, rng)
         frame = within_grid(frame, spec.grid)
         pillars = spec.pillarize(frame.points, rng)
-        return Sample(frame, pillars, assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels))
+        targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
+        network, tables = self.config.network, None
+        if network.neck == "sparse":
+            builder = NeckTableBuilder(spec.grid.ny, spec.grid.nx, network.active_cells, training=self.training)
+            tables = builder.build(pillars.cells)
+        return Sample(frame, pillars, targets, tables)
 
 
 def _collate_targets(frames: Sequence[Targets]) -> TargetBatch:

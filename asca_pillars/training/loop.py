@@ -20,10 +20,9 @@ from asca_pillars.config import Config, load_config
 from asca_pillars.errors import TrainingError
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.files import atomic_path
-from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.loss import LossTerms, detection_loss
-from asca_pillars.models.pillar.pillar_detector import build_detector
+from asca_pillars.models.pillar.pillar_detector import build_detector, frame_maps
 from asca_pillars.schema import to_dict
 from asca_pillars.system import describe_environment
 from asca_pillars.training.dataset import Batch, KittiDataset
@@ -106,12 +105,11 @@ class DetectionModule(L.LightningModule):
 
     def validation_step(self, batch: Batch, _: int) -> None:
         maps = self.detector(batch.pillars)
-        terms = detection_loss(maps, batch.targets, self.config.loss)
+        terms = detection_loss(maps, batch.seen_targets(), self.config.loss)
         self.log_dict(self._named(terms, "val"), sync_dist=True, batch_size=len(batch.frame_ids))
-        arrays = [part.float().cpu().numpy() for part in maps]
-        for frame, (boxes, labels) in enumerate(zip(batch.boxes, batch.labels, strict=True)):
-            detections = self.config.detector.decode(HeadMaps(*(part[frame] for part in arrays)))
-            self.recall.add(detections, boxes, labels)
+        frames = frame_maps(maps, batch.pillars)
+        for (found, cells), boxes, labels in zip(frames, batch.boxes, batch.labels, strict=True):
+            self.recall.add(self.config.detector.decode(found, cells), boxes, labels)
 
     def on_validation_epoch_end(self) -> None:
         rows = self.recall.rows()
@@ -153,7 +151,7 @@ class DetectionModule(L.LightningModule):
         return len(data.training_set) // (self.config.train.batch_size * self.trainer.world_size)
 
     def _loss(self, batch: Batch) -> LossTerms:
-        return detection_loss(self.detector(batch.pillars), batch.targets, self.config.loss)
+        return detection_loss(self.detector(batch.pillars), batch.seen_targets(), self.config.loss)
 
     def _named(self, terms: LossTerms, stage: str) -> dict[str, torch.Tensor]:
         named = {f"{stage}/{name}": value.detach() for name, value in terms._asdict().items()}

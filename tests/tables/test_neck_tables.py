@@ -61,7 +61,7 @@ def test_a_batch_holds_its_frames(rule: MaskRule) -> None:
     builder = NeckTableBuilder(NY, NX, rule, training=True)
     pillars = [cells(share, seed) for seed, share in enumerate((0.1, 0.0, 0.3))]
     frames, counts = [builder.build(each) for each in pillars], [len(each) for each in pillars]
-    batch = stack_neck_tables(frames, counts, NY * NX // 4)
+    batch = stack_neck_tables(frames, counts)
     assert batch.frame_rows == tuple(len(frame.head_cells) for frame in frames)
     rows = np.cumsum([0, *batch.frame_rows])
     rng = np.random.default_rng(0)
