@@ -164,3 +164,12 @@ def stack_neck_tables(
         tuple(len(frame.head_cells) for frame in frames),
         frames[0].map_shape,
     )
+
+
+def table_inputs(tables: NeckTables[Array]) -> dict[str, Array]:
+    """What a graph of the neck can ask for, by the names of its inputs; it takes what its layers read."""
+    return {
+        f"{kind}_{number}": getattr(level, kind)
+        for number, level in enumerate(tables.levels)
+        for kind in ("strided", "first", "same", "places")
+    }
