@@ -107,7 +107,7 @@ class KittiDataset(Dataset[Sample]):
         targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
         network, tables = self.config.network, None
         if network.neck == "sparse":
-            builder = NeckTableBuilder(spec.grid.ny, spec.grid.nx, network.active_cells, training=self.training)
+            builder = NeckTableBuilder(spec.grid.ny, spec.grid.nx, network.active_cells, training=True)
             tables = builder.build(pillars.cells)
         return Sample(frame, pillars, targets, tables)
 

@@ -65,6 +65,10 @@ def export_bundle(
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector, steps = checkpoint
+    if config.network.neck == "sparse":
+        raise ExportError(
+            "network.neck = sparse has no bundle yet; its weights fit network.neck=dense, but were not trained for it"
+        )
     say("Exporting and proving parity")
     with atomic_directory(out) as folder:
         graphs.export_encoder(detector, folder / ENCODER)

@@ -15,7 +15,7 @@ from asca_deploy.sparse_backbone import NeckTableStage, SparseBackboneGraph
 from asca_export.quantize import STEPS, canvas_steps
 from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
-from asca_export.sparse_quantize import SparseSample, read_moments, round_products, scale_rows_to_steps
+from asca_export.sparse_quantize import SparseSample, quantized_backbone, scale_rows_to_steps
 from asca_pillars.config import Config
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
@@ -107,7 +107,7 @@ def test_eight_bits_are_near_and_the_same_for_any_number_of_threads(tmp_path: Pa
     with torch.inference_mode():  # scaled, it is still the same function
         exact = SparseBackbone(detector)(*samples[0]).scores
         assert float((backbone(*counted[0]).scores - exact).square().mean().sqrt()) < 0.05 * float(exact.std())
-    round_products(backbone, list(backbone.products), read_moments(backbone, counted))
+    backbone = quantized_backbone(detector, samples, steps)
     export_sparse_backbone(backbone, tmp_path / "int8.onnx", list(backbone.products), steps=True)
     graphs = {threads: open_graph(tmp_path / "int8.onnx", threads, "uint8") for threads in (1, 2, 4)}
     for sample in samples[:2]:
@@ -127,10 +127,7 @@ def test_the_eight_bit_graph_runs_in_integers(tmp_path: Path) -> None:
     detector = sparse_detector("fine")
     samples = [sample_of(detector, SPEC.pillarize(points)) for points in SCANS[:2]]
     steps = canvas_steps(sample.features.numpy() for sample in samples)
-    backbone = SparseBackbone(detector, steps)
-    counted = [sample.in_steps(steps) for sample in samples]
-    scale_rows_to_steps(backbone, counted)
-    round_products(backbone, list(backbone.products), read_moments(backbone, counted))
+    backbone = quantized_backbone(detector, samples, steps)
     export_sparse_backbone(backbone, tmp_path / "int8.onnx", list(backbone.products), steps=True)
     options = onnxruntime.SessionOptions()
     options.optimized_model_filepath = str(tmp_path / "optimized.onnx")

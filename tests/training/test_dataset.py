@@ -190,7 +190,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
     assert all(boxes is sample.frame.boxes for boxes, sample in zip(batch.boxes, chosen, strict=True))
     assert all(labels is sample.frame.labels for labels, sample in zip(batch.labels, chosen, strict=True))
 
-    features, pillar_index, point_counts, cells, frame_pillars = batch.pillars
+    features, pillar_index, point_counts, cells, frame_pillars, _ = batch.pillars
     assert list(frame_pillars) == [len(sample.pillars.cells) for sample in chosen]
     first_pillar = first_point = first_positive = 0
     for i, sample in enumerate(chosen):
