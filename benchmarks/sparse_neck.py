@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from asca_deploy import sample_scan_path
 from asca_deploy.canvas import Canvas, CanvasFormat
 from asca_deploy.ort_session import OrtSession
-from asca_deploy.sparse_backbone import FEATURES, NeckTableStage
+from asca_deploy.sparse_backbone import FEATURES
 from asca_export import graphs, qdq
 from asca_export.fast_forms import FastBackbone
 from asca_export.quantize import STEPS, canvas_steps, layer_names, scale_to_steps
@@ -34,7 +34,7 @@ from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import batch_pillars, build_detector
 from asca_pillars.system import cpu_model
-from asca_pillars.tables.neck_tables import table_inputs
+from asca_pillars.tables.neck_tables import NeckTableBuilder, table_inputs
 from benchmarks.host_path import CAMERA_VIEW
 from benchmarks.random_weights import random_weights
 
@@ -70,7 +70,7 @@ class _Forms:
         network = replace(load_config(config).network, neck="sparse")
         self.spec, self.sparse = dense.config.detector, build_detector(replace(dense.config, network=network)).eval()
         self.sparse.load_state_dict(dense.detector.state_dict())
-        self.tables = NeckTableStage(self.spec.grid.ny, self.spec.grid.nx, network.active_cells)
+        self.tables = NeckTableBuilder(self.spec.grid.ny, self.spec.grid.nx, network.active_cells)
         sample = self._sample(points)
         self.steps = canvas_steps([sample.features.numpy()])
         channels, grid = network.pillar_channels, self.spec.grid
@@ -92,7 +92,7 @@ class _Forms:
         """One frame in each of FORMS."""
         cells, sample = self.spec.pillarize(points).cells, self._sample(points)
         features = sample.features.numpy(), self._whole(sample)
-        tables = table_inputs(self.tables(cells))
+        tables = table_inputs(self.tables.build(cells))
         steps: list[Callable[[], Any]] = []
         for session, feature, canvas in zip(self.sessions, np.repeat([0, 1], 2), np.repeat([0, 1], 2), strict=True):
             if "canvas" in session.inputs:
@@ -101,11 +101,11 @@ class _Forms:
                 given = {FEATURES: features[feature], **tables}
                 inputs = {name: given[name] for name in session.inputs}
             steps.append(lambda session=session, inputs=inputs: session.run(inputs, list(HeadMaps._fields)))
-        return [*steps, lambda: self.tables(cells)]
+        return [*steps, lambda: self.tables.build(cells)]
 
     def _sample(self, points: NDArray[np.float32]) -> SparseSample:
         pillars = self.spec.pillarize(points)
-        batch = batch_pillars([pillars], [self.tables(pillars.cells)])
+        batch = batch_pillars([pillars], [self.tables.build(pillars.cells)])
         assert batch.neck is not None
         with torch.inference_mode():
             features = self.sparse.encode(batch.features, batch.pillar_index, batch.point_counts)

@@ -1,7 +1,7 @@
-"""The sparse neck and head on the vehicle: tables from the pillars' cells, then one graph over active cells alone.
+"""The sparse neck and head on the vehicle: one graph over active cells alone.
 
-It takes the places of the canvas and of the dense backbone: nothing is scattered, and the head speaks of active head
-cells only, which `decode` takes as they are.
+With the tables of a `NeckTableBuilder` it takes the places of the canvas and of the dense backbone: nothing is
+scattered, and the head speaks of active head cells only, which `decode` takes as they are.
 """
 
 from pathlib import Path
@@ -12,25 +12,9 @@ from numpy.typing import NDArray
 
 from asca_deploy.graph import Graph, Session, Tensor
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.tables.neck_tables import LEVELS, MaskRule, NeckTableBuilder, NeckTables, table_inputs
+from asca_pillars.tables.neck_tables import LEVELS, NeckTables, table_inputs
 
 FEATURES = "pillar_features"
-
-
-class NeckTableStage:
-    """Builds the tables of one stream of scans; valid for one thread at a time, as a canvas is.
-
-    Args:
-        ny, nx: pillars of the map.
-        rule: which cells are active, as in training.
-    """
-
-    def __init__(self, ny: int, nx: int, rule: MaskRule) -> None:
-        self._builder = NeckTableBuilder(ny, nx, rule)
-
-    def __call__(self, cells: NDArray[np.int64]) -> NeckTables[NDArray[np.int32]]:
-        """Flat indices of the pillars (P,), ascending -> tables; they are the caller's to keep."""
-        return self._builder.build(cells)
 
 
 class SparseBackboneGraph:

@@ -9,7 +9,7 @@ import pytest
 from asca_deploy import sample_scan_path
 from asca_deploy.graph import Tensor
 from asca_deploy.ort_session import OrtSession
-from asca_deploy.sparse_backbone import NeckTableStage, SparseBackboneGraph
+from asca_deploy.sparse_backbone import SparseBackboneGraph
 from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_export.graphs import export_encoder
 from asca_export.sparse_forms import SparseBackbone
@@ -20,6 +20,7 @@ from asca_pillars.errors import BundleError, ExportError
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.pillar.pillar_detector import build_detector
 from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.tables.neck_tables import NeckTableBuilder
 from tests.export.tiny import NETWORK, tiny_checkpoint
 from tests.scenes import SPEC
 
@@ -41,13 +42,13 @@ def test_the_vehicle_finds_what_pytorch_finds(checkpoint: Checkpoint, tmp_path: 
     session = OrtSession(tmp_path / "backbone.onnx", "cpu", "float32", 2)
     channels, anchors = NETWORK.pillar_channels, SPEC.anchors.shape[2]
     backbone = SparseBackboneGraph(tmp_path / "backbone.onnx", session, channels, "float32", anchors)
-    stage = NeckTableStage(SPEC.grid.ny, SPEC.grid.nx, CONFIG.network.active_cells)
+    stage = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, CONFIG.network.active_cells)
 
     spec = SPEC.with_score_threshold(0.05)  # nobody trained these weights
     pillars = spec.pillarize(points)
     inputs = {name: getattr(pillars, name) for name in ("features", "pillar_index", "point_counts")}
     (features,) = encoder.run(inputs, ["pillar_features"])
-    tables = stage(pillars.cells)
+    tables = stage.build(pillars.cells)
     found = spec.decode(backbone.run(features, tables), tables.head_cells)
 
     expected = ScanDetector(detector, spec)(points)

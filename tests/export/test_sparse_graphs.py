@@ -11,7 +11,7 @@ import torch
 from torch.utils._pytree import tree_map_only
 
 from asca_deploy.ort_session import OrtSession
-from asca_deploy.sparse_backbone import NeckTableStage, SparseBackboneGraph
+from asca_deploy.sparse_backbone import SparseBackboneGraph
 from asca_export.quantize import STEPS, canvas_steps
 from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
@@ -89,10 +89,10 @@ def test_the_graph_is_the_network_and_the_same_for_any_number_of_threads(rule: s
 def test_a_scan_without_pillars_and_one_with_a_single_one(tmp_path: Path) -> None:
     detector = sparse_detector("fine")
     export_sparse_backbone(SparseBackbone(detector), tmp_path / "backbone.onnx")
-    graph, stage = open_graph(tmp_path / "backbone.onnx", 1), NeckTableStage(SPEC.grid.ny, SPEC.grid.nx, "fine")
-    nothing = graph.run(np.empty((0, NETWORK.pillar_channels), np.float32), stage(np.empty(0, np.int64)))
+    graph, stage = open_graph(tmp_path / "backbone.onnx", 1), NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, "fine")
+    nothing = graph.run(np.empty((0, NETWORK.pillar_channels), np.float32), stage.build(np.empty(0, np.int64)))
     assert [part.shape for part in nothing] == [(0, 6), (0, 42), (0, 12)]
-    tables = stage(np.array([37]))
+    tables = stage.build(np.array([37]))
     one = graph.run(np.ones((1, NETWORK.pillar_channels), np.float32), tables)
     assert one.scores.shape == (len(tables.head_cells), 6) and np.isfinite(one.scores).all()
 
