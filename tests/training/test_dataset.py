@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig
+from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.scans.scan_reader import write_scan
@@ -221,9 +221,22 @@ def test_a_batch_moves_as_a_whole(tmp_path: Path) -> None:
     batch = Batch(samples(tmp_path))
     frame_pillars = list(batch.pillars.frame_pillars)
     assert batch.to("meta") is batch
-    *tensors, found = batch.pillars
+    *tensors, found, _ = batch.pillars
     assert {tensor.device.type for tensor in (*tensors, *batch.targets)} == {"meta"}
     assert list(found) == frame_pillars and isinstance(batch.boxes[0], np.ndarray)
+
+
+def test_the_tables_of_a_sparse_neck_move_with_the_batch(tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, network=NetworkConfig(neck="sparse"))
+    frames = KittiDataset(write_dataset(tmp_path, 3), config, training=True)
+    batch = Batch([frames[0, 0], frames[0, 1]])
+    neck = batch.pillars.neck
+    assert neck is not None and sum(neck.frame_rows) == len(neck.head_cells)
+    assert len(neck.levels[0].strided_back) == len(batch.pillars.cells)
+    assert len(batch.seen_targets().state) == len(neck.head_cells)
+    moved = batch.to("meta").pillars.neck
+    assert moved is not None and moved.frame_rows == neck.frame_rows
+    assert {part.device.type for level in moved.levels for part in level} == {"meta"}
 
 
 @pytest.mark.parametrize(
