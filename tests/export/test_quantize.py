@@ -125,7 +125,7 @@ def test_rounding_together_loses_less_than_rounding_alone() -> None:
     squares = inputs.T @ inputs / len(inputs)
     unit = weight.abs().amax(dim=1, keepdim=True) / WEIGHT_STEPS
     alone = (weight / unit).round() * unit
-    together = quantize._round_together(weight, squares)
+    together = quantize.round_together(weight, squares)
 
     def error(rounded: torch.Tensor) -> float:
         return float(((rounded - weight) @ inputs.T).square().mean())
