@@ -18,6 +18,7 @@ from asca_export.graphs import OPSET
 from asca_export.quantize import WEIGHT_STEPS
 from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.tables.neck_tables import NeckTables, table_inputs
 
 FEATURES = "pillar_features"
 _TINY = 1e-12
@@ -40,6 +41,17 @@ def export_sparse_backbone(
     )
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, path)
+
+
+def multiply_accumulates(backbone: SparseBackbone, tables: NeckTables[NDArray[np.int32]]) -> int:
+    """What the products cost on the scan that these tables are of."""
+    inputs, total = table_inputs(tables), 0
+    for level in backbone.levels:
+        for layer in level.convolutions:
+            rows = len(inputs[layer.table])
+            total += rows * backbone.product(layer.name).weight.numel()
+        total += rows * backbone.product(level.upsample).weight.numel()
+    return total + len(tables.head_cells) * backbone.product(HEAD).weight.numel()
 
 
 class _Graph:

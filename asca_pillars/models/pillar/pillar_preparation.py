@@ -75,7 +75,7 @@ class PillarPreparation:
         spec = self.spec
         pillars = spec.pillarize(frame.points, rng)
         targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
-        return PreparedPillars(pillars, targets, self._tables(pillars))
+        return PreparedPillars(pillars, targets, self.tables(pillars))
 
     def collate(self, frames: Sequence[PreparedPillars]) -> LabeledPillars:
         """Frames as one batch."""
@@ -84,7 +84,8 @@ class PillarPreparation:
             _batch_targets([frame.targets for frame in frames]),
         )
 
-    def _tables(self, pillars: Pillars) -> NeckTables[NDArray[np.int32]] | None:
+    def tables(self, pillars: Pillars) -> NeckTables[NDArray[np.int32]] | None:
+        """What a sparse neck reads of a frame besides the features; None for a dense one."""
         if self.active_cells is None:
             return None
         grid = self.spec.grid
