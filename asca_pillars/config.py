@@ -15,6 +15,7 @@ from pydantic import Discriminator, Tag
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import Strict, parse
+from asca_pillars.tables.neck_tables import MaskRule
 from asca_pillars.yaml_text import MAX_CHARACTERS, parse_yaml
 
 T = TypeVar("T")
@@ -33,6 +34,8 @@ class NetworkConfig(Strict):
         block_channels: output channels of Block1..3 (Table 1).
         block_convs: stride-1 convolutions that follow each block's strided one (Table 1: 3).
         upsample_channels: output channels of each DeBlock (Table 1: 128).
+        neck: `dense` computes everywhere, `sparse` at active cells alone; the weights fit both.
+        active_cells: which cells are active in a sparse neck, see `tables.neck_tables`.
     """
 
     cpa: CpaReading = "channel"
@@ -40,10 +43,17 @@ class NetworkConfig(Strict):
     block_channels: tuple[int, int, int] = (64, 128, 256)
     block_convs: tuple[int, int, int] = (3, 3, 3)
     upsample_channels: int = 128
+    neck: Literal["dense", "sparse"] = "dense"
+    active_cells: MaskRule = "fine"
 
     def __post_init__(self) -> None:
         _require("model.network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
         _require("model.network", self, ("block_convs",), low=0)
+        if self.neck == "sparse" and self.active_cells == "fine" and not self.block_convs[0]:
+            raise ConfigError(
+                "model.network.active_cells = fine grows in the first block's stride-1 convolutions, of which "
+                "model.network.block_convs has none; give it one, or set model.network.active_cells=sub"
+            )
 
 
 @dataclass(frozen=True)

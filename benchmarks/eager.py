@@ -113,7 +113,7 @@ def map_difference(runtime: Detector, form: PaddedDetector, scans: Scans) -> tup
     """Largest absolute difference of any head map over the scans, and the smallest standard deviation of a map."""
     worst, spread = 0.0, np.inf
     for points in scans:
-        maps = runtime.pipeline.infer(runtime.pipeline.prepare(points, []), [])
+        maps = runtime.pipeline.infer(runtime.pipeline.prepare(points, []), []).maps
         expected = form.head_maps(points)
         for name, ours, theirs in zip(HeadMaps._fields, maps, expected, strict=True):
             if ours.shape != tuple(theirs.shape):

@@ -100,7 +100,7 @@ def _column(
 
 def _maps(detector: Detector, points: NDArray[np.float32]) -> HeadMaps[NDArray[np.float32]]:
     pipeline = detector.pipeline
-    return pipeline.infer(pipeline.prepare(points, []), [])
+    return pipeline.infer(pipeline.prepare(points, []), []).maps
 
 
 def _best_anchors(logits: NDArray[np.float32]) -> tuple[NDArray[np.int64], ...]:

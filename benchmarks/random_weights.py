@@ -56,7 +56,8 @@ def random_weights(config: str, points: NDArray[np.float32]) -> Checkpoint:
     for norm in norms:
         norm.momentum = 1.0  # the running statistics become those of this scan
     with torch.no_grad():
-        network(batch_pillars([resolved.model.spec.pillarize(points)]))
+        pillars = resolved.model.spec.pillarize(points)
+        network(batch_pillars([pillars], [network.preparation.tables(pillars)]))
     return Checkpoint(resolved, network.eval(), 0)
 
 

@@ -40,7 +40,8 @@ Map = TypeVar("Map")
 class HeadMaps(NamedTuple, Generic[Map]):
     """What the head says of one scan (NumPy arrays) or of a batch of them (tensors, with a leading axis B).
 
-    Channels are anchor-major, A anchors as in `make_anchors`.
+    Channels are anchor-major, A anchors as in `make_anchors`. Where the head computes at active cells alone, there
+    are rows (M, channels) instead of maps (channels, H, W), one for each of these cells.
     """
 
     scores: Map
@@ -56,6 +57,7 @@ def decode(
     anchors: NDArray[np.float32],
     classes: tuple[ClassSpec, ...],
     post: PostProcess,
+    cells: NDArray[np.integer[Any]] | None = None,
 ) -> Detections:
     """Detections of one scan, best first.
 
@@ -66,21 +68,26 @@ def decode(
     Args:
         maps: logits and residuals on the head's map.
         anchors: (H, W, A, 7) from `make_anchors` for the same grid and classes.
+        cells: (M,) flat index of the head cell of each of the maps' rows, ascending; None if they are maps.
 
     Raises:
         ValueError: if maps, anchors and classes do not belong together.
     """
     height, width, count, _ = anchors.shape
-    expected = tuple((channels * count, height, width) for channels in (1, 7, 2))
+    expected = tuple(
+        (channels * count, height, width) if cells is None else (len(cells), channels * count) for channels in (1, 7, 2)
+    )
     if tuple(m.shape for m in maps) != expected or count != len(classes) * len(ANCHOR_YAWS_RAD):
         raise ValueError(
             f"head maps of {len(classes)} classes on anchors {anchors.shape} must have shapes {expected}, "
             f"not {tuple(m.shape for m in maps)}"
         )
-    anchor, cell = _candidates(maps.scores, classes, post.candidates)
-    logits = maps.scores.reshape(count, -1)[anchor, cell]
-    residuals = maps.boxes.reshape(count, 7, -1)[anchor, :, cell]
-    directions = maps.directions.reshape(count, 2, -1)[anchor, :, cell]
+    rows = maps if cells is not None else HeadMaps(*(part.reshape(len(part), -1).T for part in maps))
+    anchor, row = _candidates(rows.scores, classes, post.candidates)
+    cell = row if cells is None else cells[row]
+    logits = rows.scores[row, anchor]
+    residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
+    directions = rows.directions.reshape(-1, count, 2)[row, anchor]
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
         boxes = decode_boxes(residuals, directions.argmax(axis=-1), anchors.reshape(-1, count, 7)[cell, anchor])
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)
@@ -105,26 +112,26 @@ def decode(
 def _candidates(
     scores: NDArray[np.float32], classes: tuple[ClassSpec, ...], limit: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Anchor (n,) and cell (n,) of the best anchors of each class, class by class, best first.
+    """Anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
 
-    Of equal scores the one that stands earlier in the map (A, H, W) goes first.
+    Of equal scores that of the earlier anchor goes first, and among those that of the earlier row.
     """
-    count = len(scores)
+    count = scores.shape[1]
     # The backbone's maps lie in memory with the channels last: no copy, and one look at every logit. Logits are
     # compared rather than scores: the sigmoid is monotonic, and few anchors ever need it.
-    logits = scores.reshape(count, -1).T.reshape(-1)
+    logits = scores.reshape(-1)
     floors = [_logit(spec.score_threshold) for spec in classes]
     above = np.flatnonzero(logits >= min(floors))
     logits = logits[above]
-    cell, anchor = np.divmod(above, count)
+    row, anchor = np.divmod(above, count)
     chosen = []
     for label, floor in enumerate(floors):
         own = np.flatnonzero((anchor // len(ANCHOR_YAWS_RAD) == label) & (logits >= floor))
         if len(own) > limit:
             own = own[logits[own] >= np.partition(logits[own], -limit)[-limit]]
-        chosen.append(own[np.lexsort((cell[own], anchor[own], -logits[own]))[:limit]])
+        chosen.append(own[np.lexsort((row[own], anchor[own], -logits[own]))[:limit]])
     best = np.concatenate(chosen)
-    return anchor[best], cell[best]
+    return anchor[best], row[best]
 
 
 def _logit(probability: float) -> float:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,6 @@ class DetectorSpec(ABC):
             ),
         )
 
-    def decode(self, maps: HeadMaps[NDArray[np.float32]]) -> Detections:
-        """Detections in this detector's head maps, see `decode`."""
-        return decode(maps, self.anchors, self.classes, self.post)
+    def decode(self, maps: HeadMaps[NDArray[np.float32]], cells: NDArray[np.integer[Any]] | None = None) -> Detections:
+        """Detections in this detector's head maps, or in rows of these head cells, see `decode`."""
+        return decode(maps, self.anchors, self.classes, self.post, cells)

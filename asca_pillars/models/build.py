@@ -21,6 +21,7 @@ def build_preparation(model: ModelConfig) -> Preparation:
     """What makes batches for that network; without it, for whoever only looks at samples."""
     match model:
         case PillarModel():
-            return PillarPreparation(model.spec)
+            network = model.network
+            return PillarPreparation(model.spec, network.active_cells if network.neck == "sparse" else None)
         case _:
             assert_never(model)

@@ -17,6 +17,7 @@ from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import BundleError, ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import Strict
+from asca_pillars.tables.neck_tables import MaskRule
 
 SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
@@ -72,7 +73,7 @@ class PillarSection(Strict):
     """What only bundles of kind pillar have.
 
     Raises:
-        ConfigError: channels and canvas do not fit each other.
+        ConfigError: channels and canvas, or neck and active_cells, do not fit each other.
     """
 
     cpa: str
@@ -80,10 +81,16 @@ class PillarSection(Strict):
     channels: int
     """C, features of one pillar."""
     canvas: CanvasFormat
+    neck: Literal["dense", "sparse"] = "dense"
+    """`sparse`: backbone.onnx takes rows and neighbor tables, and answers at active head cells alone."""
+    active_cells: MaskRule | None = None
+    """Which cells are active in a sparse neck, see `asca_pillars.tables.neck_tables`; None of a dense one."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.channels <= _MOST_CHANNELS:
             raise ConfigError(f"channels {str(self.channels)[:20]} must lie between 1 and {_MOST_CHANNELS}")
+        if (self.neck == "sparse") != (self.active_cells is not None):
+            raise ConfigError(f"neck {self.neck} does not go with active_cells {self.active_cells}")
         allowed = (self.channels,) if self.canvas.type == "uint8" else (0, self.channels)
         if len(self.canvas.empty) not in allowed:
             raise ConfigError(
@@ -164,7 +171,7 @@ class Bundle(Strict):
     precision: Literal["float32", "int8"]
     """What the slowest graph, backbone.onnx, computes in."""
     backbone_gmac: float
-    """Multiply-accumulates of backbone.onnx, 10^9."""
+    """Multiply-accumulates of backbone.onnx, 10^9; of a sparse neck in the mean over the scans of `parity`."""
     graphs: Mapping[str, GraphFile]
     """By name; a pillar detector has PILLAR_GRAPHS."""
     parity: Parity | None

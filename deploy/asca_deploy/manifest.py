@@ -21,6 +21,9 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
 
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
+# Of `pillar`, and what they are where they are not written: bundles made before there were sparse necks. The graphs'
+# metadata tells whether they were taken out.
+_LATER_KEYS = {"neck": "dense", "active_cells": None}
 _LARGEST_BYTES = 1 << 20
 _LONGEST_REASON = 300
 _EXPORT_AGAIN = "export the bundle again with `asca export`"
@@ -42,7 +45,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         data = upgrade_schema_2(data)
     layout = None
     if isinstance(section := data.get("pillar"), dict):
-        data["pillar"] = dict(section)
+        data["pillar"] = _LATER_KEYS | section
         layout = data["pillar"].pop("layout", None)
     try:
         bundle = parse(Bundle, data, str(manifest))

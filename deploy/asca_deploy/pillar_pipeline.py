@@ -1,72 +1,40 @@
-"""The pillar family's pipeline: pillarize, encode, scatter, neck and head, decode (paper section 3)."""
+"""The pillar family's pipeline: pillarize, encode, scatter or tables, neck and head, decode (paper section 3)."""
 
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
-from asca_deploy.bundle import BACKBONE, ENCODER, Bundle, CanvasFormat
+from asca_deploy.bundle import BACKBONE, ENCODER, Bundle
+from asca_deploy.canvas_backbone import CanvasBackbone
 from asca_deploy.graph import Session, Tensor, check_interface
+from asca_deploy.pillar_backbone import HeadAnswer, PillarBackbone
 from asca_deploy.pipeline import Laps, Pipeline
-from asca_pillars.geometry.decode import HeadMaps, decode
+from asca_deploy.table_backbone import TableBackbone
+from asca_pillars.errors import ProviderError
+from asca_pillars.geometry.decode import decode
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES, PillarCounts, Pillars, pillarize
 
-Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
-
-
-class Canvas:
-    """The pseudo-image (1, ny + 1, nx + 1, C), channels last, allocated once and kept from frame to frame.
-
-    Its first row and column are the padding of the network's first convolution, so that they can hold whatever stands
-    for zero. Channels last, a pillar is one run of memory. A frame fills a few percent of the cells: clearing only the
-    cells of the frame before is many times faster than a new image, 64 MB for the paper's grid.
-    """
-
-    def __init__(self, channels: int, grid: PillarGrid, format: CanvasFormat | None = None) -> None:
-        format = format or CanvasFormat()
-        self.image: NDArray[Any] = np.empty((1, grid.ny + 1, grid.nx + 1, channels), format.type)
-        self._empty = np.array(format.empty or [0] * channels, format.type)
-        self._cells = self.image.reshape(-1, channels)
-        self._cells[:] = self._empty
-        self._nx = grid.nx
-        self._occupied = np.empty(0, np.int64)
-
-    def scatter(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> NDArray[Any]:
-        """Write each pillar's features into its cell; every other cell is empty.
-
-        Args:
-            pillar_features: (P, C), of the format's type.
-            cells: (P,) flat indices row * nx + column, each at most once.
-
-        Returns:
-            The pseudo-image (1, ny + 1, nx + 1, C). It is this object's own memory: valid until the next call.
-        """
-        self._cells[self._occupied] = self._empty
-        rows, columns = np.divmod(cells, self._nx)
-        self._occupied = (rows + 1) * (self._nx + 1) + columns + 1
-        self._cells[self._occupied] = pillar_features
-        return self.image
+_NO_SPARSE_NECK = {
+    "openvino": "it needs outputs of fixed shapes",
+    "tensorrt": "it would build another engine for every number of pillars",
+}
 
 
 class PreparedPillars(NamedTuple):
-    """A scan's pillars, encoded and scattered."""
+    """A scan's pillars, encoded and placed for the backbone."""
 
-    canvas: Canvas
+    placed: Any
     counts: PillarCounts
 
 
 class PillarPipeline:
     """See `pipeline.Pipeline`. The encoder always runs on onnxruntime's CPU provider.
-
-    Every scan between `prepare` and `infer` has a canvas of its own, taken from those that are free. There are as many
-    as there ever were such scans at once: one in single calls, two in a stream, one per thread with several threads;
-    each takes (nx + 1)(ny + 1) C values, 5 MiB in the 8-bit bundle that ships and 20 MiB in the float one.
 
     Args:
         folder: of the bundle.
@@ -75,10 +43,9 @@ class PillarPipeline:
 
     Raises:
         BundleError: a graph cannot be run or is not what the manifest says.
-        ProviderError: the provider does not start.
+        ProviderError: the provider does not start, or cannot run this backbone.
     """
 
-    stages = ("pillarize", "encode", "scatter", "neck+head", "decode")
     network_stages = ("encode", "neck+head")
 
     def __init__(
@@ -92,34 +59,29 @@ class PillarPipeline:
         self.bundle = bundle
         self.spec: PillarSpec = bundle.spec
         self._encoder = _open_encoder(folder, bundle)
-        self._backbone = _open_backbone(folder, bundle, provider, precision, threads)
+        self.backbone = open_backbone(folder / bundle.graphs[BACKBONE].file, bundle, provider, precision, threads)
+        self.stages = ("pillarize", "encode", self.backbone.stage, "neck+head", "decode")
         self._anchors = self.spec.anchors
-        self._free = [self.new_canvas()]
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedPillars:
-        """Points (N, 4) -> the pseudo-image, on a canvas that `infer` gives back."""
+        """Points (N, 4) -> the input of the backbone."""
         pillars = self.pillarize(points)
         laps.append(("pillarize", perf_counter()))
         features = self.encode(pillars)
         laps.append(("encode", perf_counter()))
-        try:
-            canvas = self._free.pop()  # atomic, as append is: two threads never get the same one
-        except IndexError:
-            canvas = self.new_canvas()
-        canvas.scatter(features, pillars.cells)
-        laps.append(("scatter", perf_counter()))
-        return PreparedPillars(canvas, pillars.stats)
+        placed = self.backbone.place(features, pillars.cells)
+        laps.append((self.backbone.stage, perf_counter()))
+        return PreparedPillars(placed, pillars.stats)
 
-    def infer(self, prepared: PreparedPillars, laps: Laps) -> Maps:
-        """The canvas -> logits and residuals on the head's map."""
-        maps = self.neck_and_head(prepared.canvas.image)
-        self._free.append(prepared.canvas)
+    def infer(self, prepared: PreparedPillars, laps: Laps) -> HeadAnswer:
+        """The placed pillars -> logits and residuals."""
+        answer = self.backbone.run(prepared.placed)
         laps.append(("neck+head", perf_counter()))
-        return maps
+        return answer
 
-    def finish(self, raw: Maps, laps: Laps) -> Detections:
-        """Head maps -> boxes above the score threshold that survive the rotated NMS."""
-        detections = decode(raw, self._anchors, self.spec.classes, self.spec.post)
+    def finish(self, raw: HeadAnswer, laps: Laps) -> Detections:
+        """Logits and residuals -> boxes above the score threshold that survive the rotated NMS."""
+        detections = decode(raw.maps, self._anchors, self.spec.classes, self.spec.post, raw.cells)
         laps.append(("decode", perf_counter()))
         return detections
 
@@ -133,16 +95,6 @@ class PillarPipeline:
             return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
         values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three
         return self._encoder.run(("pillar_features",), values)[0]
-
-    def new_canvas(self) -> Canvas:
-        """An empty canvas of this bundle's format."""
-        return Canvas(self.bundle.pillar.channels, self.spec.grid, self.bundle.pillar.canvas)
-
-    def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
-        """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
-        channels_last = self._backbone.run(HeadMaps._fields, {"canvas": canvas})
-        scores, boxes, directions = (maps[0].transpose(2, 0, 1) for maps in channels_last)
-        return HeadMaps(scores, boxes, directions)
 
 
 def _open_encoder(folder: Path, bundle: Bundle) -> Session:
@@ -159,17 +111,22 @@ def _open_encoder(folder: Path, bundle: Bundle) -> Session:
     return check_interface(path, providers.open_session(path, "cpu", "float32", threads=1), inputs, outputs)
 
 
-def _open_backbone(
-    folder: Path, bundle: Bundle, provider: providers.Provider, precision: providers.Precision, threads: int
-) -> Session:
-    grid, anchors = bundle.spec.grid, bundle.spec.anchors.shape[2]
-    path = folder / bundle.graphs[BACKBONE].file
-    inputs = {"canvas": Tensor(bundle.pillar.canvas.type, (1, grid.ny + 1, grid.nx + 1, bundle.pillar.channels))}
-    outputs = {
-        name: Tensor("float32", (1, *grid.head_shape, channels * anchors))
-        for name, channels in (("scores", 1), ("boxes", 7), ("directions", 2))
-    }
-    return check_interface(path, providers.open_session(path, provider, precision, threads), inputs, outputs)
+def open_backbone(
+    path: Path, bundle: Bundle, provider: providers.Provider, precision: providers.Precision, threads: int
+) -> PillarBackbone:
+    """Open backbone.onnx of a dense or of a sparse neck.
+
+    Raises:
+        BundleError: the graph cannot be run or is not what the manifest says.
+        ProviderError: the provider does not start, or cannot run a sparse neck.
+    """
+    if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
+        raise ProviderError(
+            f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
+            "choose provider cpu"
+        )
+    session = providers.open_session(path, provider, precision, threads)
+    return (CanvasBackbone if bundle.pillar.neck == "dense" else TableBackbone)(path, session, bundle)
 
 
-_: type[Pipeline[PreparedPillars, Maps]] = PillarPipeline  # mypy compares them
+_: type[Pipeline[PreparedPillars, HeadAnswer]] = PillarPipeline  # mypy compares them

@@ -15,6 +15,8 @@ from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
 from asca_export.int8 import quantize_bundle
 from asca_export.parity import prove_parity
+from asca_export.sparse_forms import SparseBackbone
+from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
 from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
@@ -63,14 +65,20 @@ def export_bundle(
     say("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         graphs.export_encoder(detector, graphs.graph_path(folder, ENCODER))
-        graphs.export_backbone(FastBackbone(detector), detector.grid, graphs.graph_path(folder, BACKBONE))
+        gmac = _export_backbone(detector, graphs.graph_path(folder, BACKBONE), scans)
         draft = Bundle(
             name=config.name,
             kind="pillar",
             spec=config.model.spec,
-            pillar=PillarSection(config.model.network.cpa, config.model.network.pillar_channels, CanvasFormat()),
+            pillar=PillarSection(
+                config.model.network.cpa,
+                config.model.network.pillar_channels,
+                CanvasFormat(),
+                config.model.network.neck,
+                detector.preparation.active_cells,
+            ),
             precision="float32",
-            backbone_gmac=graphs.multiply_accumulates(graphs.graph_path(folder, BACKBONE)) / 1e9,
+            backbone_gmac=gmac,
             graphs={},
             parity=None,
             quantization=None,
@@ -96,3 +104,14 @@ def export_bundle(
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, say)
     return bundle
+
+
+def _export_backbone(detector: PillarDetector, path: Path, scans: Sequence[NDArray[np.float32]]) -> float:
+    """Write backbone.onnx; its multiply-accumulates, 10^9, of a sparse neck in the mean over the scans."""
+    if detector.preparation.active_cells is None:
+        graphs.export_backbone(FastBackbone(detector), detector.grid, path)
+        return graphs.multiply_accumulates(path) / 1e9
+    backbone, preparation = SparseBackbone(detector), detector.preparation
+    export_sparse_backbone(backbone, path)
+    tables = [preparation.tables(preparation.spec.pillarize(scan)) for scan in scans]
+    return float(np.mean([multiply_accumulates(backbone, each) for each in tables if each is not None])) / 1e9

@@ -1,6 +1,5 @@
 """A proven float bundle becomes an 8-bit one that says how far it is from it."""
 
-import copy
 import hashlib
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -10,19 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from asca_deploy.bundle import BACKBONE, ENCODER, Bundle, CanvasFormat, LayerQuantization, Quantization
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import write_bundle_manifest
-from asca_deploy.ort_session import OrtSession
-from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
+from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
 from asca_export import graphs, qdq
-from asca_export.fast_forms import CanvasSteps, FastBackbone
-from asca_export.parity import COMPARED_ANCHORS
-from asca_export.quantize import STEPS, canvas_steps, input_moments, layer_names, round_weights, scale_to_steps
+from asca_export.parity import COMPARED_ANCHORS, by_class
+from asca_export.quantize import canvas_steps
+from asca_export.rounded_backbones import Encoded, round_backbone
 from asca_pillars.errors import ExportError
-from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
@@ -34,13 +30,6 @@ MAX_LOGIT_ERROR = 0.08
 SAME_IOU = 0.5
 
 Points = NDArray[np.float32]
-
-
-class _Encoded(NamedTuple):
-    """A scan on its way to the canvas."""
-
-    features: NDArray[np.float32]
-    cells: NDArray[np.int64]
 
 
 class _Sensitivity(NamedTuple):
@@ -77,62 +66,46 @@ def quantize_bundle(
     runtime = Detector(folder)
     pipeline, shown = runtime.pipeline, {_digest(points) for points in scans}
     own = [points for points in calibration if _digest(points) not in shown]
-    encoded = [each for each in (_encode(pipeline, points) for points in own) if len(each.cells)]
+    encoded = [each for each in (_encode(pipeline, points) for points in own) if len(each.features)]
     if len(encoded) < MIN_CALIBRATION:
         raise ExportError(
             f"{len(encoded)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are "
             f"needed; {len(calibration) - len(own)} were left out because parity is proven on them: "
             "give other scans to --calibrate"
         )
-    say("Calibrating")
     steps = canvas_steps(each.features for each in encoded)
     form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
-    rounded = FastBackbone(detector, steps).eval()
-    scale_to_steps(rounded, _canvases(encoded, bundle, form, steps), steps)
-    say("Rounding the weights")
-    moments = input_moments(rounded, _canvases(encoded, bundle, form, steps), steps)
-    exact, layers = copy.deepcopy(rounded), layer_names(rounded)
-    round_weights(exact, [], moments)
-    round_weights(rounded, layers, moments)
-
+    eight_bit_form = replace(bundle, pillar=replace(bundle.pillar, canvas=form))
     compared = [_encode(pipeline, points) for points in scans]
-    canvas = pipeline.new_canvas()
-    expected = [pipeline.neck_and_head(canvas.scatter(*each)) for each in compared]
+    answers = (pipeline.backbone.run(pipeline.backbone.place(each.features, each.pillars.cells)) for each in compared)
+    expected = [answer.maps.scores for answer in answers]
     boxes = [runtime(points) for points in scans]
     with tempfile.TemporaryDirectory() as work:
-        template, trial = Path(work) / "template.onnx", Path(work) / "trial.onnx"
-        graphs.export_backbone(exact, detector.grid, template)
+        say("Calibrating and rounding the weights")
+        rounded, trial = round_backbone(detector, encoded, steps, Path(work)), Path(work) / "trial.onnx"
 
         def error_of(eight_bit: Sequence[str]) -> float:
-            qdq.quantize_backbone(template, trial, eight_bit, _parameters(exact, rounded, eight_bit))
-            session = OrtSession(trial, "cpu", "float32", runtime.threads)
-            canvases = _canvases(compared, bundle, form, steps)
-            logits = (session.run(["scores"], {"canvas": canvas})[0] for canvas in canvases)
-            return _logit_error(expected, logits, len(bundle.spec.classes))
+            rounded.write(trial, eight_bit)
+            backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
+            placed = (backbone.place(each.in_steps(steps), each.pillars.cells) for each in compared)
+            found = (backbone.run(each).maps.scores for each in placed)
+            return _logit_error(expected, found, len(bundle.spec.classes))
 
-        found = _sweep(layers, error_of, say)
-        eight_bit = [layer for layer in layers if layer not in found.kept_float]
-        qdq.quantize_backbone(
-            template, graphs.graph_path(folder, BACKBONE), eight_bit, _parameters(exact, rounded, eight_bit)
-        )
+        found = _sweep(rounded.layers, error_of, say)
+        eight_bit = [layer for layer in rounded.layers if layer not in found.kept_float]
+        rounded.write(graphs.graph_path(folder, BACKBONE), eight_bit)
     qdq.quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
     report = Quantization(
         calibration_scans=len(encoded),
         dropped_scans=len(calibration) - len(own),
         compared_scans=len(scans),
-        layers=tuple(LayerQuantization(name, found.alone[name], name in found.kept_float) for name in layers),
+        layers=tuple(LayerQuantization(name, found.alone[name], name in found.kept_float) for name in rounded.layers),
         logit_rms_error=found.total,
         boxes=sum(map(len, boxes)),
         boxes_matched=0,
         boxes_added=0,
     )
-    draft = replace(
-        bundle,
-        name=f"{bundle.name}_int8",
-        precision="int8",
-        pillar=replace(bundle.pillar, canvas=form),
-        quantization=report,
-    )
+    draft = replace(eight_bit_form, name=f"{bundle.name}_int8", precision="int8", quantization=report)
     draft = graphs.sign(folder, draft)
     write_bundle_manifest(folder, draft)
     quantized = replace(draft, quantization=_count_boxes(report, boxes, list(map(Detector(folder), scans))))
@@ -173,42 +146,19 @@ def _digest(points: Points) -> bytes:
     return hashlib.sha256(points.tobytes()).digest()
 
 
-def _encode(pipeline: PillarPipeline, points: Points) -> _Encoded:
+def _encode(pipeline: PillarPipeline, points: Points) -> Encoded:
     pillars = pipeline.pillarize(points)
-    return _Encoded(pipeline.encode(pillars), pillars.cells)
+    return Encoded(pipeline.encode(pillars), pillars)
 
 
-def _canvases(
-    encoded: Sequence[_Encoded], bundle: Bundle, form: CanvasFormat, steps: CanvasSteps
-) -> Iterator[NDArray[np.uint8]]:
-    """The canvas of each scan, valid until the next."""
-    canvas = Canvas(bundle.pillar.channels, bundle.spec.grid, form)
-    scale, empty = steps.scale.numpy(), steps.empty.numpy()
-    for features, cells in encoded:
-        counted = np.clip(np.round(features / scale + empty), 0, STEPS)
-        yield canvas.scatter(counted.astype(np.uint8), cells)
-
-
-def _parameters(exact: FastBackbone, rounded: FastBackbone, eight_bit: Sequence[str]) -> dict[str, Tensor]:
-    """Parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
-    own = dict(rounded.named_parameters())
-    return {
-        name: own[name] if name.rpartition(".")[0] in eight_bit else parameter
-        for name, parameter in exact.named_parameters()
-    }
-
-
-def _logit_error(
-    expected: Sequence[HeadMaps[NDArray[np.float32]]], logits: Iterator[NDArray[np.float32]], classes: int
-) -> float:
+def _logit_error(expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], classes: int) -> float:
     """RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
     squares = []
-    for maps, found in zip(expected, logits, strict=True):
-        want = maps.scores.reshape(classes, -1)
-        got = np.moveaxis(found[0], -1, 0).reshape(classes, -1)
-        for ours, theirs in zip(want, got, strict=True):
-            best = np.argpartition(-ours, min(COMPARED_ANCHORS, ours.size - 1))[:COMPARED_ANCHORS]
-            squares.append(np.square(ours[best] - theirs[best]).mean())
+    for want, got in zip(expected, found, strict=True):
+        for ours, theirs in zip(by_class(want, classes), by_class(got, classes), strict=True):
+            if len(ours):
+                best = np.argpartition(-ours, min(COMPARED_ANCHORS, ours.size - 1))[:COMPARED_ANCHORS]
+                squares.append(np.square(ours[best] - theirs[best]).mean())
     return float(np.sqrt(np.mean(squares)))
 
 

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
+from asca_deploy.canvas_backbone import Canvas
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.boxes import wrap_angle
@@ -16,7 +17,7 @@ from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
@@ -45,29 +46,42 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
     Raises:
         ExportError: they differ; names the first stage that does, and the scan.
     """
-    spec, canvas = runtime.spec, runtime.new_canvas()
+    spec = runtime.spec
     worst_map = worst_box = worst_yaw = 0.0
     for number, points in enumerate(scans):
         pillars = spec.pillarize(points)
-        batch = batch_pillars([pillars])
+        batch = batch_pillars([pillars], [detector.preparation.tables(pillars)])
         with torch.inference_mode():
             expected_features = detector.encode(batch.features, batch.pillar_index, batch.point_counts)
-            pseudo_image = detector.scatter(expected_features, batch.cells, batch.frame_pillars)
-            expected_maps: Maps = HeadMaps(*(m[0].numpy() for m in detector.head(detector.neck(pseudo_image))))
+            expected_maps = _maps(detector, batch)
         features = runtime.encode(pillars)
-        image = canvas.scatter(features, pillars.cells)
-        maps = runtime.neck_and_head(image)
+        placed = runtime.backbone.place(features, pillars.cells)
         # Features have no unit, and some readings of the attention sum over thousands of pillars: their scale counts.
         allowed = MAP_TOLERANCE * max(1.0, float(expected_features.abs().max()) if len(expected_features) else 0.0)
         _require_close("encode", expected_features.numpy(), features, allowed, number)
-        expected_canvas = np.pad(pseudo_image.numpy().transpose(0, 2, 3, 1), ((0, 0), (1, 0), (1, 0), (0, 0)))
-        _require_close("scatter", expected_canvas, image, allowed, number)
+        if isinstance(placed, Canvas):
+            with torch.inference_mode():
+                pseudo_image = detector.scatter(expected_features, batch.cells, batch.frame_pillars).numpy()
+            expected_canvas = np.pad(pseudo_image.transpose(0, 2, 3, 1), ((0, 0), (1, 0), (1, 0), (0, 0)))
+            _require_close("scatter", expected_canvas, placed.image, allowed, number)
+        maps, cells = runtime.backbone.run(placed)
         for name, expected, found in zip(HeadMaps._fields, expected_maps, maps, strict=True):
             error = _require_close(f"head `{name}`", expected, found, MAP_TOLERANCE, number)
             worst_map = max(worst_map, error)
-        boxes = compare_boxes(expected_maps, maps, spec, number)
+        boxes = compare_boxes(expected_maps, maps, spec, number, cells)
         worst_box, worst_yaw = max(worst_box, boxes.center_size_m), max(worst_yaw, boxes.yaw_rad)
     return Parity(worst_map, worst_box, worst_yaw, len(scans), MAP_TOLERANCE)
+
+
+def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:
+    """What PyTorch says of a batch of one frame: maps, or rows of its active head cells."""
+    maps = (part.numpy() for part in detector(batch))
+    return HeadMaps(*(part if batch.neck is not None else part[0] for part in maps))
+
+
+def by_class(scores: NDArray[np.float32], classes: int) -> NDArray[np.float32]:
+    """Logits (A, H, W), or rows (M, A), of each class: (classes, n)."""
+    return (scores if scores.ndim == 3 else scores.T).reshape(classes, scores.size // classes)
 
 
 def _require_close(
@@ -83,26 +97,33 @@ def _require_close(
     return error
 
 
-def compare_boxes(expected: Maps, found: Maps, spec: PillarSpec, scan: int = 0) -> BoxDifference:
+def compare_boxes(
+    expected: Maps, found: Maps, spec: PillarSpec, scan: int = 0, cells: NDArray[np.int32] | None = None
+) -> BoxDifference:
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
     Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
     suppression nothing but the thresholds can excuse a difference; after it, which of two overlapping boxes of equal
     score survives can.
 
+    Args:
+        expected, found: maps, or rows of the same head cells.
+        spec: of both detectors.
+        scan: its number, for messages.
+        cells: (M,) the head cells of rows, see `decode`.
+
     Raises:
         ExportError: a box without a partner within the tolerances that no tie between scores explains.
     """
-    by_class = expected.scores.reshape(len(spec.classes), -1)
     classes = tuple(
         replace(class_, score_threshold=min(class_.score_threshold, _score_of_rank(logits)))
-        for class_, logits in zip(spec.classes, by_class, strict=True)
+        for class_, logits in zip(spec.classes, by_class(expected.scores, len(spec.classes)), strict=True)
     )
     uncut = replace(spec.post, max_detections=spec.post.candidates * len(classes))
     worst = BoxDifference(0.0, 0.0)
     for post in (replace(uncut, nms_iou=1.0), uncut):
         lowered = replace(spec, classes=classes, post=post)
-        ours, theirs = lowered.decode(expected), lowered.decode(found)
+        ours, theirs = lowered.decode(expected, cells), lowered.decode(found, cells)
         forward, our_lone = _pair(ours, theirs)
         backward, their_lone = _pair(theirs, ours)
         _require_ties(ours[our_lone], theirs[their_lone], ours, theirs, lowered, scan)
@@ -111,6 +132,8 @@ def compare_boxes(expected: Maps, found: Maps, spec: PillarSpec, scan: int = 0) 
 
 
 def _score_of_rank(logits: NDArray[np.float32]) -> float:
+    if not logits.size:  # a sparse neck on a scan without pillars
+        return 1.0
     rank = min(COMPARED_ANCHORS, logits.size)
     logit = np.partition(logits.reshape(-1), logits.size - rank)[logits.size - rank]
     return float(1 / (1 + np.exp(-logit.astype(np.float64))))

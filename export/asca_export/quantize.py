@@ -129,14 +129,14 @@ def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Mome
         layer = backbone.get_submodule(name)
         parameter, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
         weight = parameter.T if name == HEAD else parameter.flatten(1)  # (outputs, inputs * window)
-        rounded = _round_together(weight, moments.squares[name]) if name in layers else weight
+        rounded = round_together(weight, moments.squares[name]) if name in layers else weight
         read = (empty / STEP_VALUE).round() * STEP_VALUE
         sums, rounded_sums = (each.unflatten(1, (len(empty), -1)).sum(dim=2) for each in (weight, rounded))
         bias.add_(sums @ empty - rounded_sums @ read)
         parameter.copy_(rounded.T if name == HEAD else rounded.reshape(parameter.shape))
 
 
-def _round_together(weight: Tensor, squares: Tensor) -> Tensor:
+def round_together(weight: Tensor, squares: Tensor) -> Tensor:
     """(outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output, so that the outputs change little.
 
     The largest weight of an output stays at the end of its grid, from which the graph's writer takes the grid's unit.

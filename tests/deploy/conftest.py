@@ -24,6 +24,7 @@ needs_openvino = pytest.mark.skipif(
 )
 
 CHANNELS = 8
+STAGES = ("pillarize", "encode", "scatter", "neck+head", "decode")
 # 8 + 16 + 32 columns of 0.32, 0.16 and 0.08 m by 24 rows: rectangular, off center, with a positive minimum.
 SPEC = PillarSpec(
     grid=PillarGrid(x_range_m=(2.0, 9.68), y_range_m=(-1.28, 2.56), z_range_m=(-3.0, 1.0)),

@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.benchmark import benchmark
-from asca_deploy.pillar_pipeline import PillarPipeline
+from tests.deploy.conftest import STAGES
 
 
 def test_report(tiny_bundle: Path, scans: list[NDArray[np.float32]]) -> None:
     report = benchmark(Detector(tiny_bundle, threads=1), scans, rounds=4, warmup=1)
     assert report.frames == 4 * len(scans)
-    assert tuple(report.stages_ms) == ("input", *PillarPipeline.stages)
+    assert tuple(report.stages_ms) == ("input", *STAGES)
     for times in (report.total_ms, *report.stages_ms.values()):
         assert 0 < times.min <= times.p50 <= times.p95
     assert report.fps == pytest.approx(1000 / report.total_ms.p50)

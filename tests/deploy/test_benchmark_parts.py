@@ -11,8 +11,8 @@ from asca_deploy.benchmark import resident_memory as process_memory
 from asca_deploy.benchmark.roofline import SIZE, gemm_rate
 from asca_deploy.benchmark.scaling import resample
 from asca_deploy.benchmark.throughput import FRAMES
-from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_pillars.errors import AscaError
+from tests.deploy.conftest import STAGES
 
 Points = NDArray[np.float32]
 
@@ -41,7 +41,7 @@ def test_scaling_has_a_row_for_each_size(tiny_bundle: Path, scan: Points) -> Non
     assert [row.points for row in rows] == [10, 100, 3000]
     assert rows[0].pillars < rows[1].pillars <= rows[2].pillars <= 300
     for row in rows:
-        assert tuple(row.stages_ms) == ("input", *PillarPipeline.stages) and row.total_ms > 0
+        assert tuple(row.stages_ms) == ("input", *STAGES) and row.total_ms > 0
 
 
 def test_throughput_of_stream_and_single_calls(tiny_bundle: Path, scans: list[Points]) -> None:

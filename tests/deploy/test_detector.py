@@ -9,11 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector, load_bundle
-from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_pillars.errors import BundleError, ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.pillarize import PillarCounts
-from tests.deploy.conftest import make_scan
+from tests.deploy.conftest import STAGES, make_scan
 
 Points = NDArray[np.float32]
 
@@ -180,7 +179,7 @@ def test_report(tiny_bundle: Path, scan: Points) -> None:
     assert detector.load_s > 0
     assert (detector.provider, detector.runs_on) == ("cpu", "cpu float32")
     report = detector(scan).report
-    assert tuple(report.times_ms) == ("input", *PillarPipeline.stages)
+    assert tuple(report.times_ms) == ("input", *STAGES)
     assert all(time_ms > 0 for time_ms in report.times_ms.values())
     assert report.total_ms == pytest.approx(sum(report.times_ms.values()))
     assert report.counts == load_bundle(tiny_bundle).spec.pillarize(scan).stats
@@ -233,11 +232,12 @@ def test_what_is_not_finite_in_the_networks_answer_is_left_out_and_counted(
     infer = detector.pipeline.infer
 
     def overflow(*arguments: Any) -> Any:
-        maps = infer(*arguments)
+        answer = infer(*arguments)
+        maps = answer.maps
         maps.scores[0, 0, :3] = np.nan, np.inf, -np.inf
         best = np.unravel_index(maps.scores[:, 1:].argmax(), maps.scores[:, 1:].shape)
         maps.boxes[7 * best[0], best[1] + 1, best[2]] = np.nan
-        return maps
+        return answer
 
     monkeypatch.setattr(detector.pipeline, "infer", overflow)
     detections = detector(scan)

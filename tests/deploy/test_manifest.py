@@ -235,7 +235,7 @@ def test_duplicate_keys_and_deep_nesting(bundle_copy: Path) -> None:
 def as_schema_2(folder: Path) -> Path:
     """The bundle as the version before schema 3 wrote it."""
     data = json.loads((folder / MANIFEST).read_text())
-    pillar = data.pop("pillar")
+    pillar = {key: value for key, value in data.pop("pillar").items() if key not in ("neck", "active_cells")}
     for key in ("kind", "expected_input_from"):
         del data[key]
     del data["expected_input"]["camera_view"]
@@ -250,6 +250,15 @@ def as_schema_2(folder: Path) -> Path:
         data["graphs"][name]["sha256"] = graph_files(folder)[name].sha256
     (folder / MANIFEST).write_text(json.dumps(data))
     return folder
+
+
+def test_a_bundle_that_names_no_neck_has_a_dense_one(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
+    assert "neck" not in json.loads((folder / MANIFEST).read_text())["pillar"]
+    section = load_bundle(folder).pillar
+    assert (section.neck, section.active_cells) == ("dense", None)
+    edit(folder, lambda data: data["pillar"].update(neck="sparse", active_cells="fine"))
+    assert_refused(folder, NOT_THE_GRAPHS.format("pillar"))
 
 
 def test_schema_2_is_read_as_kind_pillar(tiny_bundle: Path, bundle_copy: Path, scan: NDArray[np.float32]) -> None:

@@ -38,8 +38,8 @@ def maps_and_boxes(
     where = {} if precision is None else {"provider": "openvino", "precision": precision}
     detector = Detector(bundle, **where)  # type: ignore[arg-type]
     pipeline = detector.pipeline
-    maps = pipeline.infer(pipeline.prepare(read_scan(sample_scan_path()).points, []), [])
-    return maps, pipeline.finish(maps, []), detector
+    answer = pipeline.infer(pipeline.prepare(read_scan(sample_scan_path()).points, []), [])
+    return answer.maps, pipeline.finish(answer, []), detector
 
 
 def test_float32_is_what_the_stock_cpu_computes() -> None:

@@ -151,10 +151,9 @@ def test_a_call_between_two_scans_of_a_stream_disturbs_neither(tiny_bundle: Path
 def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     detector, scans = Detector(tiny_bundle), [make_scan(seed, 50 + 20 * seed) for seed in range(5)]
     images = set()
-    neck_and_head = detector.pipeline.neck_and_head
-    monkeypatch.setattr(
-        detector.pipeline, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image)
-    )
+    backbone = detector.pipeline.backbone
+    neck_and_head = backbone.neck_and_head
+    monkeypatch.setattr(backbone, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image))
     most_threads = 0
     for _ in detector.stream(scans[number % 5] for number in range(300)):
         most_threads = max(most_threads, threading.active_count())

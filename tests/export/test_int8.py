@@ -68,8 +68,8 @@ def test_onnxruntime_computes_what_the_graph_says(folder: Path) -> None:
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     plain = onnxruntime.InferenceSession(folder / "backbone.onnx", options, providers=["CPUExecutionProvider"])
     for points in SCANS[:3]:
-        canvas = detector.pipeline.prepare(points, []).canvas.image
-        fast = detector.pipeline.neck_and_head(canvas)
+        canvas = detector.pipeline.prepare(points, []).placed.image
+        fast = detector.pipeline.backbone.neck_and_head(canvas)
         for name, maps in zip(("scores", "boxes", "directions"), fast, strict=True):
             (expected,) = plain.run([name], {"canvas": canvas})
             error = np.abs(np.moveaxis(expected[0], -1, 0) - maps)

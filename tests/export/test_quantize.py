@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.pillar_pipeline import Canvas
+from asca_deploy.canvas_backbone import Canvas
 from asca_export import quantize
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone
 from asca_export.quantize import WEIGHT_STEPS, canvas_steps, input_moments, layer_names, round_weights, scale_to_steps
@@ -125,7 +125,7 @@ def test_rounding_together_loses_less_than_rounding_alone() -> None:
     squares = inputs.T @ inputs / len(inputs)
     unit = weight.abs().amax(dim=1, keepdim=True) / WEIGHT_STEPS
     alone = (weight / unit).round() * unit
-    together = quantize._round_together(weight, squares)
+    together = quantize.round_together(weight, squares)
 
     def error(rounded: torch.Tensor) -> float:
         return float(((rounded - weight) @ inputs.T).square().mean())

@@ -1,6 +1,7 @@
 """A checkpoint small enough to be exported again and again, and scans for it."""
 
 import dataclasses
+from typing import Any
 
 import torch
 
@@ -14,10 +15,10 @@ NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_c
 SCANS = [make_scene(seed)[0] for seed in range(8)]
 
 
-def tiny_checkpoint(cpa: str, spec: PillarSpec = SPEC) -> Checkpoint:
+def tiny_checkpoint(cpa: str, spec: PillarSpec = SPEC, **network: Any) -> Checkpoint:
     """Fresh random weights, with statistics and scores that differ from place to place."""
     torch.manual_seed(1)
-    config = Config(name="tiny", model=PillarModel(spec=spec, network=dataclasses.replace(NETWORK, cpa=cpa)))
+    config = Config(name="tiny", model=PillarModel(spec=spec, network=dataclasses.replace(NETWORK, cpa=cpa, **network)))
     detector = build_pillar_detector(config.model)
     with torch.no_grad():
         for name, buffer in detector.named_buffers():

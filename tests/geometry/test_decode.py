@@ -183,3 +183,22 @@ def test_maps_of_another_model_are_refused() -> None:
 def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):
         PostProcess(**settings)  # type: ignore[arg-type]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.1, 1.0]))
+def test_rows_of_active_cells_decode_as_maps_in_which_the_others_say_no(seed: int, share: float) -> None:
+    maps, quiet = noisy_maps(seed, -1.0), quiet_maps()
+    cells = np.flatnonzero(np.random.default_rng(seed).random(HEIGHT * WIDTH) < share)
+    for part, silent in zip(maps, quiet, strict=True):
+        silent.reshape(len(part), -1)[:, cells] = part.reshape(len(part), -1)[:, cells]
+    rows = HeadMaps(*(np.ascontiguousarray(part.reshape(len(part), -1)[:, cells].T) for part in maps))
+    expected, found = (
+        decode(quiet, ANCHORS, CLASSES, PostProcess()),
+        decode(rows, ANCHORS, CLASSES, PostProcess(), cells),
+    )
+    np.testing.assert_array_equal(found.boxes, expected.boxes)
+    np.testing.assert_array_equal(found.scores, expected.scores)
+    np.testing.assert_array_equal(found.labels, expected.labels)
+    with pytest.raises(ValueError, match="must have shapes"):
+        decode(rows, ANCHORS, CLASSES, PostProcess(), np.arange(len(cells) + 1))

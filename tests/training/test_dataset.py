@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig, PillarModel
+from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.scans.scan_reader import write_scan
@@ -204,7 +204,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
     assert all(boxes is sample.frame.boxes for boxes, sample in zip(batch.boxes, chosen, strict=True))
     assert all(labels is sample.frame.labels for labels, sample in zip(batch.labels, chosen, strict=True))
 
-    features, pillar_index, point_counts, cells, frame_pillars = pillar_batch
+    features, pillar_index, point_counts, cells, frame_pillars, _ = pillar_batch
     assert list(frame_pillars) == [len(sample.prepared.pillars.cells) for sample in chosen]
     first_pillar = first_point = first_positive = 0
     for i, sample in enumerate(chosen):
@@ -235,9 +235,22 @@ def test_a_batch_moves_as_a_whole(tmp_path: Path) -> None:
     batch = collated(samples(tmp_path))
     frame_pillars = list(batch.inputs.pillars.frame_pillars)
     assert batch.to("meta") is batch
-    *tensors, found = batch.inputs.pillars
+    *tensors, found, _ = batch.inputs.pillars
     assert {tensor.device.type for tensor in (*tensors, *batch.inputs.targets)} == {"meta"}
     assert list(found) == frame_pillars and isinstance(batch.boxes[0], np.ndarray)
+
+
+def test_the_tables_of_a_sparse_neck_move_with_the_batch(tmp_path: Path) -> None:
+    model = PillarModel(spec=SPEC, network=NetworkConfig(neck="sparse"))
+    frames = open_dataset(write_dataset(tmp_path, 3), dataclasses.replace(CONFIG, model=model), training=True)
+    batch = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
+    assert isinstance(batch, Batch)
+    neck = batch.inputs.pillars.neck
+    assert neck is not None and sum(neck.frame_rows) == len(neck.head_cells)
+    assert len(neck.levels[0].strided_back) == len(batch.inputs.pillars.cells)
+    moved = batch.to("meta").inputs.pillars.neck
+    assert moved is not None and moved.frame_rows == neck.frame_rows
+    assert {part.device.type for level in moved.levels for part in level} == {"meta"}
 
 
 @pytest.mark.parametrize(

@@ -37,10 +37,13 @@ CONFIG = Config(
 )
 
 
-@pytest.mark.parametrize("cpa", ["none", "paper", "channel", "point"])
-def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: str) -> None:
+@pytest.mark.parametrize(
+    ("cpa", "neck"),
+    [("none", "dense"), ("paper", "dense"), ("channel", "dense"), ("point", "dense"), ("channel", "sparse")],
+)
+def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: str, neck: str) -> None:
     torch.manual_seed(0)
-    model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa=cpa))
+    model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa=cpa, neck=neck))
     config = dataclasses.replace(CONFIG, model=model, data=DataConfig(train_set="val", workers=0))
     frames = open_dataset(write_dataset(tmp_path, 2, val_frames=2), config, training=False)
     batch = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])

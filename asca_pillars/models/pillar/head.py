@@ -3,6 +3,7 @@
 import math
 
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.geometry.decode import HeadMaps
 
@@ -26,3 +27,8 @@ class SSDHead(nn.Module):
     def forward(self, features: Tensor) -> HeadMaps[Tensor]:
         """(B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W)."""
         return HeadMaps(self.scores(features), self.boxes(features), self.directions(features))
+
+    def at_cells(self, features: Tensor) -> HeadMaps[Tensor]:
+        """The same at single cells: (M, C) -> scores (M, A), boxes (M, 7A), directions (M, 2A)."""
+        parts = self.scores, self.boxes, self.directions
+        return HeadMaps(*(F.linear(features, part.weight[:, :, 0, 0], part.bias) for part in parts))

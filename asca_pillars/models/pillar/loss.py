@@ -43,21 +43,45 @@ def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossCon
     """Eq. (15): focal loss over anchors, smooth L1 and direction over the positive ones, per positive anchor.
 
     Args:
-        maps: scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W).
-        targets: what they should be.
+        maps: scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W); or rows (M, A), (M, 7A), (M, 2A) at
+            active head cells.
+        targets: what they should be; of rows those that `targets_at` returns.
         config: weights and shape parameters.
     """
     positives = max(len(targets.positives), 1)
-    logits = maps.scores.float().permute(0, 2, 3, 1)  # (B, H, W, A)
-    classification = focal_loss(logits, targets.state, config.focal_alpha, config.focal_gamma)
-    residuals = _at_anchors(maps.boxes, targets.positives, values=7)
-    directions = _at_anchors(maps.directions, targets.positives, values=2)
+    logits = _by_anchor(maps.scores, values=1)[:, 0].float()
+    classification = focal_loss(logits, targets.state.flatten(), config.focal_alpha, config.focal_gamma)
+    residuals = _by_anchor(maps.boxes, values=7)[targets.positives].float()
+    directions = _by_anchor(maps.directions, values=2)[targets.positives].float()
     box = box_loss(residuals, targets.residuals, config.smooth_l1_beta)
     direction = F.cross_entropy(directions, targets.directions, reduction="sum")
     return LossTerms(
         config.box_weight * box / positives,
         config.class_weight * classification / positives,
         config.direction_weight * direction / positives,
+    )
+
+
+def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
+    """The targets of the anchors at M active head cells; the others take no part.
+
+    Args:
+        targets: of whole maps.
+        cells: (M,) flat index into (B, H, W), ascending.
+
+    Returns:
+        `state` is (M, A), and `positives` are flat indices into it.
+    """
+    anchors = targets.state.shape[-1]
+    rows = targets.state.new_full((targets.state[..., 0].numel(),), -1, dtype=torch.int64)
+    rows[cells.long()] = torch.arange(len(cells), device=cells.device)
+    row = rows[targets.positives // anchors]
+    active = row >= 0
+    return TargetBatch(
+        targets.state.view(-1, anchors)[cells.long()],
+        (row * anchors + targets.positives % anchors)[active],
+        targets.residuals[active],
+        targets.directions[active],
     )
 
 
@@ -80,8 +104,7 @@ def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
     return position_size + F.smooth_l1_loss(sine, torch.zeros_like(sine), beta=beta, reduction="sum")
 
 
-def _at_anchors(maps: Tensor, anchor_index: Tensor, values: int) -> Tensor:
-    """Values of the anchors `anchor_index`, flat in (B, H, W, A): (B, A * values, H, W) -> (n, values)."""
-    batch, channels, height, width = maps.shape
-    by_anchor = maps.permute(0, 2, 3, 1).reshape(batch * height * width * channels // values, values)
-    return by_anchor[anchor_index].float()
+def _by_anchor(maps: Tensor, values: int) -> Tensor:
+    """(B, A * values, H, W) or (M, A * values) -> (anchors, values), in the order of the targets."""
+    rows = maps if maps.ndim == 2 else maps.permute(0, 2, 3, 1)
+    return rows.reshape(-1, values)

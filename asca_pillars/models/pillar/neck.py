@@ -1,16 +1,20 @@
 """Detection neck: the region proposal network of Table 1."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.pillar.encoder import NORM_EPS, NORM_MOMENTUM
+from asca_pillars.models.table_conv import at_active_cells, table_conv
 from asca_pillars.pillars.grid import HEAD_STRIDE, NECK_STRIDE
+from asca_pillars.tables.neck_tables import MaskRule, NeckTables
 
 
-class RPNNeck(nn.Module):
-    """Three blocks that halve the map, three deblocks that bring it back to the head's resolution, concatenated.
+class RPNLayers(nn.Module):
+    """Three blocks that halve the map, three deblocks that bring it back to the head's resolution.
 
     Args:
         in_channels: channels of the pseudo-image.
@@ -39,6 +43,10 @@ class RPNNeck(nn.Module):
             raise ValueError(f"{len(block_channels)} blocks end at stride {stride}, the grid is made for {NECK_STRIDE}")
         self.out_channels = upsample_channels * len(self.blocks)
 
+
+class RPNNeck(RPNLayers):
+    """The neck of Table 1, everywhere on the map; its three levels are concatenated."""
+
     def forward(self, canvas: Tensor) -> Tensor:
         """(B, C, H, W) -> (B, out_channels, H / 2, W / 2); 384 channels with Table 1's widths."""
         maps = []
@@ -46,6 +54,65 @@ class RPNNeck(nn.Module):
             canvas = block(canvas)
             maps.append(deblock(canvas))
         return torch.cat(maps, dim=1)
+
+
+class SparseRPNNeck(RPNLayers):
+    """The same neck, computed at active cells alone; its weights have the names and shapes of `RPNNeck`'s.
+
+    Batch normalization is over active cells. A convolution's missing inputs are zero, and so are the upsampled values
+    of a level at head cells where only another level is active.
+
+    Args:
+        rule: which cells are active, see `tables.neck_tables`.
+        widths: as for `RPNLayers`.
+    """
+
+    def __init__(self, *widths: Any, rule: MaskRule) -> None:
+        super().__init__(*widths)
+        self.rule: MaskRule = rule
+
+    def forward(self, pillars: Tensor, tables: NeckTables[Tensor]) -> Tensor:
+        """Pillar features (P, C) -> (M, out_channels) at M active head cells."""
+        maps = []
+        for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
+            for number, (convolution, norm) in enumerate(_convolutions(block)):
+                table, back = (
+                    (level.strided, level.strided_back),
+                    (level.first, level.first_back),
+                    (level.same, None),
+                )[min(number, 2)]
+                pillars = torch.relu(at_active_cells(norm, table_conv(pillars, convolution.weight, table, back)))
+            maps.append(_upsampled(deblock, pillars, level.places))
+        return torch.cat(maps, dim=1)
+
+    def forward_dense(self, canvas: Tensor, tables: NeckTables[Tensor]) -> Tensor:
+        """The same function by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
+        maps = []
+        for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
+            for number, (convolution, norm) in enumerate(_convolutions(block)):
+                everywhere = convolution(canvas).permute(0, 2, 3, 1)  # (B, h, w, outputs)
+                cells = (level.cells if number else level.strided_cells).long()
+                active = torch.relu(at_active_cells(norm, everywhere.flatten(0, 2)[cells]))
+                masked = active.new_zeros(everywhere.shape).flatten(0, 2).index_put((cells,), active)
+                canvas = masked.view(everywhere.shape).permute(0, 3, 1, 2)
+            maps.append(_upsampled(deblock, active, level.places))
+        return torch.cat(maps, dim=1)
+
+
+def _convolutions(block: nn.Module) -> Iterator[tuple[Any, Any]]:
+    """Each convolution of a block, and the normalization that follows it."""
+    children = list(block.children())
+    return zip(children[0::3], children[1::3], strict=True)
+
+
+def _upsampled(deblock: nn.Module, features: Tensor, places: Tensor) -> Tensor:
+    """A deblock at active parents (N, C), read at head cells: (M, upsample_channels)."""
+    transposed, norm, _ = deblock.children()
+    assert isinstance(transposed, nn.ConvTranspose2d)
+    by_place = transposed.weight.permute(2, 3, 0, 1).flatten(0, 1)  # (stride^2, C, channels)
+    outputs = (features @ by_place.transpose(0, 1).flatten(1)).view(-1, by_place.shape[2])
+    outputs = torch.relu(at_active_cells(norm, outputs))  # (N * stride^2, channels), one parent after the other
+    return F.pad(outputs, (0, 0, 0, 1)).index_select(0, places)
 
 
 def _block(in_channels: int, channels: int, convs: int) -> nn.Sequential:

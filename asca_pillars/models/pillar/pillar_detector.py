@@ -1,6 +1,8 @@
 """The whole network between pillars and head maps, and its side of training (`models.trainable.Trainable`)."""
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from torch import Tensor, nn
 
@@ -10,10 +12,23 @@ from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.models.pillar.encoder import PillarEncoder
 from asca_pillars.models.pillar.head import SSDHead
-from asca_pillars.models.pillar.loss import detection_loss
-from asca_pillars.models.pillar.neck import RPNNeck
+from asca_pillars.models.pillar.loss import detection_loss, targets_at
+from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, PillarPreparation
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.tables.neck_tables import NeckTables
+
+
+class PillarOutputs(NamedTuple):
+    """What the network says of B frames.
+
+    Attributes:
+        maps: head maps, or rows of the active head cells of a sparse neck, see `SSDHead`.
+        neck: the tables that say which cells those are; None for maps.
+    """
+
+    maps: HeadMaps[Tensor]
+    neck: NeckTables[Tensor] | None
 
 
 class PillarDetector(nn.Module):
@@ -23,43 +38,63 @@ class PillarDetector(nn.Module):
         spec: grid, limits and classes that its parts were made for.
         loss_weights: what training weighs its terms with.
         encode: points of pillars to pillar features (section 3.2 and 3.3).
-        neck: pseudo-image to features (section 3.4).
+        neck: pseudo-image, or pillars and tables, to features (section 3.4).
         head: features to head maps.
     """
 
     def __init__(
-        self, spec: PillarSpec, loss_weights: LossConfig, encode: PillarEncoder, neck: RPNNeck, head: SSDHead
+        self,
+        spec: PillarSpec,
+        loss_weights: LossConfig,
+        encode: PillarEncoder,
+        neck: RPNNeck | SparseRPNNeck,
+        head: SSDHead,
     ) -> None:
         super().__init__()
         self.grid = spec.grid
-        self.preparation = PillarPreparation(spec)
+        self.preparation = PillarPreparation(spec, neck.rule if isinstance(neck, SparseRPNNeck) else None)
         self.loss_weights = loss_weights
         self.encode = encode
         self.neck = neck
         self.head = head
 
     def forward(self, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Pillars of B frames -> head maps, see `SSDHead`."""
+        """Pillars of B frames -> head maps, or rows of the active head cells of a sparse neck, see `SSDHead`."""
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
+        if batch.neck is not None and not pillar_features.is_cuda:
+            return self.head.at_cells(self.neck(pillar_features, batch.neck))
         canvas = self.scatter(pillar_features, batch.cells, batch.frame_pillars)  # (B, C, ny, nx)
+        if batch.neck is not None:  # where a dense convolution costs less than gathering
+            assert isinstance(self.neck, SparseRPNNeck)
+            return self.head.at_cells(self.neck.forward_dense(canvas, batch.neck))
         maps: HeadMaps[Tensor] = self.head(self.neck(canvas))
         return maps
 
-    def predict(self, batch: LabeledPillars) -> HeadMaps[Tensor]:
-        """Head maps of B labelled frames."""
-        maps: HeadMaps[Tensor] = self(batch.pillars)
-        return maps
+    def predict(self, batch: LabeledPillars) -> PillarOutputs:
+        """Head maps of B labelled frames, and the cells that they are of."""
+        return PillarOutputs(self(batch.pillars), batch.pillars.neck)
 
-    def loss(self, outputs: HeadMaps[Tensor], batch: LabeledPillars) -> Mapping[str, Tensor]:
-        """The terms of eq. (15) by name, see `detection_loss`."""
-        return detection_loss(outputs, batch.targets, self.loss_weights)._asdict()
+    def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
+        """The terms of eq. (15) by name, see `detection_loss`; anchors at inactive head cells take no part."""
+        neck, targets = outputs.neck, batch.targets
+        seen = targets if neck is None else targets_at(targets, neck.head_cells)
+        return detection_loss(outputs.maps, seen, self.loss_weights)._asdict()
 
-    def detect(self, outputs: HeadMaps[Tensor], spec: DetectorSpec) -> list[Detections]:
+    def detect(self, outputs: PillarOutputs, spec: DetectorSpec) -> list[Detections]:
         """Boxes in the head maps of each frame, with the thresholds of `spec`."""
-        arrays = [part.float().cpu().numpy() for part in outputs]
-        return [spec.decode(HeadMaps(*frame)) for frame in zip(*arrays, strict=True)]
+        arrays = [part.float().cpu().numpy() for part in outputs.maps]
+        neck = outputs.neck
+        if neck is None:
+            return [spec.decode(HeadMaps(*frame)) for frame in zip(*arrays, strict=True)]
+        cells, map_cells, first, found = neck.head_cells.cpu().numpy(), math.prod(neck.map_shape), 0, []
+        for frame, rows in enumerate(neck.frame_rows):
+            own = slice(first, first + rows)
+            maps = HeadMaps(*(part[own] for part in arrays))
+            found.append(spec.decode(maps, cells[own] - frame * map_cells))
+            first += rows
+        return found
 
     def scatter(self, pillar_features: Tensor, cells: Tensor, frame_pillars: Sequence[int]) -> Tensor:
         """Put each pillar's features at its cell of an empty pseudo-image: (P, C) -> (B, C, ny, nx)."""
@@ -75,7 +110,9 @@ class PillarDetector(nn.Module):
 def build_pillar_detector(model: PillarModel) -> PillarDetector:
     """The network that `model` describes, with fresh random weights."""
     network, spec = model.network, model.spec
-    neck = RPNNeck(network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels)
+    widths = network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels
+    neck: RPNNeck | SparseRPNNeck
+    neck = RPNNeck(*widths) if network.neck == "dense" else SparseRPNNeck(*widths, rule=network.active_cells)
     return PillarDetector(
         spec=spec,
         loss_weights=model.loss,

@@ -6,20 +6,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.targets import Targets, assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import Pillars
+from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, NeckTables, stack_neck_tables
 
 
 class PreparedPillars(NamedTuple):
-    """One frame: its pillars, and the targets of its anchors."""
+    """One frame: its pillars, the targets of its anchors, and the tables of a sparse neck."""
 
     pillars: Pillars
     targets: Targets
+    tables: NeckTables[NDArray[np.int32]] | None = None
 
 
 class PillarBatch(NamedTuple):
@@ -31,6 +35,7 @@ class PillarBatch(NamedTuple):
         point_counts: (P,) points of each pillar.
         cells: (P,) flat index (row * nx + column) of each pillar in its own frame.
         frame_pillars: pillars of each frame.
+        neck: what a sparse neck reads; None for the dense one.
     """
 
     features: Tensor
@@ -38,6 +43,7 @@ class PillarBatch(NamedTuple):
     point_counts: Tensor
     cells: Tensor
     frame_pillars: Sequence[int]
+    neck: NeckTables[Tensor] | None = None
 
 
 class LabeledPillars(NamedTuple):
@@ -48,38 +54,48 @@ class LabeledPillars(NamedTuple):
 
     def to(self, device: Any) -> "LabeledPillars":
         """The same with its tensors on `device`."""
-        pillars = self.pillars
-        moved = PillarBatch(
-            pillars.features.to(device),
-            pillars.pillar_index.to(device),
-            pillars.point_counts.to(device),
-            pillars.cells.to(device),
-            pillars.frame_pillars,
-        )
-        return LabeledPillars(moved, TargetBatch(*(part.to(device) for part in self.targets)))
+        moved: LabeledPillars = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
+        return moved
 
 
 @dataclass(frozen=True)
 class PillarPreparation:
-    """The `Preparation` of pillar detectors with the grid, limits and classes of `spec`."""
+    """The `Preparation` of pillar detectors.
+
+    Args:
+        spec: grid, limits and classes.
+        active_cells: of a sparse neck, whose tables are built here; None for a dense one.
+    """
 
     spec: PillarSpec
+    active_cells: MaskRule | None = None
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedPillars:
         """Pillars of a frame and the targets of its anchors; `rng` draws what the limits drop."""
         spec = self.spec
         pillars = spec.pillarize(frame.points, rng)
-        return PreparedPillars(pillars, assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels))
+        targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
+        return PreparedPillars(pillars, targets, self.tables(pillars))
 
     def collate(self, frames: Sequence[PreparedPillars]) -> LabeledPillars:
         """Frames as one batch."""
         return LabeledPillars(
-            batch_pillars([frame.pillars for frame in frames]), _batch_targets([frame.targets for frame in frames])
+            batch_pillars([frame.pillars for frame in frames], [frame.tables for frame in frames]),
+            _batch_targets([frame.targets for frame in frames]),
         )
 
+    def tables(self, pillars: Pillars) -> NeckTables[NDArray[np.int32]] | None:
+        """What a sparse neck reads of a frame besides the features; None for a dense one."""
+        if self.active_cells is None:
+            return None
+        grid = self.spec.grid
+        return NeckTableBuilder(grid.ny, grid.nx, self.active_cells, training=True).build(pillars.cells)
 
-def batch_pillars(frames: Sequence[Pillars]) -> PillarBatch:
-    """Pillars of several frames, one frame's after the other's."""
+
+def batch_pillars(
+    frames: Sequence[Pillars], tables: Sequence[NeckTables[NDArray[np.int32]] | None] = ()
+) -> PillarBatch:
+    """Pillars of several frames, one frame's after the other's, and the tables of each for a sparse neck."""
     frame_pillars = [len(frame.cells) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(frame_pillars)[:-1]]).astype(np.int64)
     return PillarBatch(
@@ -90,7 +106,17 @@ def batch_pillars(frames: Sequence[Pillars]) -> PillarBatch:
         point_counts=torch.from_numpy(np.concatenate([frame.point_counts for frame in frames])),
         cells=torch.from_numpy(np.concatenate([frame.cells for frame in frames])),
         frame_pillars=frame_pillars,
+        neck=_batch_tables([each for each in tables if each is not None], frame_pillars),
     )
+
+
+def _batch_tables(
+    tables: Sequence[NeckTables[NDArray[np.int32]]], frame_pillars: Sequence[int]
+) -> NeckTables[Tensor] | None:
+    if not tables:
+        return None
+    batch: NeckTables[Tensor] = tree_map_only(np.ndarray, torch.from_numpy, stack_neck_tables(tables, frame_pillars))
+    return batch
 
 
 def _batch_targets(frames: Sequence[Targets]) -> TargetBatch:

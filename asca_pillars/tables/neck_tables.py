@@ -1,0 +1,175 @@
+"""What a sparse neck reads: the active cells of its three levels, and a table for each of its convolutions.
+
+The neck is that of Table 1 (three blocks that halve the map, three upsamplings to the head's resolution), computed at
+active cells alone. Which cells are active is a rule:
+
+- `sub`: strided convolutions reach every output that sees an active input, all others stay where their input is;
+- `fine`: as `sub`, and the first stride-1 convolution of the finest block also writes to the eight neighbors of its
+  active cells. The coarser levels follow from the cells before that growth.
+
+The head computes at the union of the three levels' cells, as it sees it: where a coarser cell is active, so are the
+head cells below it.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Generic, Literal, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.tables.batching import stack_cells, stack_rows
+from asca_pillars.tables.cell_map import CellMap
+from asca_pillars.tables.convolution import Convolution, map_convolution
+
+MaskRule = Literal["sub", "fine"]
+
+LEVELS = 3
+STRIDED = map_convolution(3, stride=2, padding=1)
+SAME = map_convolution(3, padding=1)
+
+Array = TypeVar("Array")
+
+
+class LevelTables(NamedTuple, Generic[Array]):
+    """One block of the neck; M cells after its strided convolution, N after its first stride-1 convolution."""
+
+    strided: Array
+    """(M, 9) rows of the level before; of the pillars for the first."""
+    first: Array
+    """(N, 9) rows of the strided convolution's outputs; the same as `same` where nothing grows."""
+    same: Array
+    """(N, 9) rows of the N cells themselves."""
+    strided_back: Array
+    """(rows of the level before, 9) the inverse of `strided`, for training; empty without."""
+    first_back: Array
+    """(M, 9) the inverse of `first`, for training; empty without."""
+    strided_cells: Array
+    """(M,) flat index row * columns + column on this level's map, ascending."""
+    cells: Array
+    """(N,) likewise, of the block's outputs."""
+    places: Array
+    """(head cells,) rows of the upsampling's outputs, see `CellMap.places`."""
+
+
+class NeckTables(NamedTuple, Generic[Array]):
+    """Of one scan (NumPy), or of a batch (tensors), whose rows follow one another frame by frame."""
+
+    levels: tuple[LevelTables[Array], ...]
+    """From the finest to the coarsest."""
+    head_cells: Array
+    """(H,) flat index of the active cells on the head's map, of a batch counted through the maps of its frames."""
+    frame_rows: tuple[int, ...]
+    """Active head cells of each frame."""
+    map_shape: tuple[int, int]
+    """(rows, columns) of one frame's head map."""
+
+
+class NeckTableBuilder:
+    """Builds the tables of scan after scan, in memory of its own: for one thread at a time.
+
+    Args:
+        ny, nx: pillars of the map, multiples of 8.
+        rule: which cells are active.
+        training: also the tables that the backward pass reads.
+    """
+
+    def __init__(self, ny: int, nx: int, rule: MaskRule, *, training: bool = False) -> None:
+        self.rule: MaskRule = rule
+        self.training = training
+        shapes = [(1, ny >> level, nx >> level) for level in range(LEVELS + 1)]
+        self._pillars, *self._strided = (CellMap(shape) for shape in shapes)
+        self._grown = CellMap(shapes[1])
+        self._head = CellMap(shapes[1])
+
+    def build(self, cells: NDArray[np.int64]) -> NeckTables[NDArray[np.int32]]:
+        """Tables of a scan with pillars at these cells (P,): row * nx + column, ascending."""
+        self._pillars.activate(cells)
+        before = self._pillars
+        for level in self._strided:
+            level.activate_joined([(before, STRIDED.outputs(before.shape, level.shape))])
+            before = level
+        outputs = list(self._strided)
+        if self.rule == "fine":
+            self._grown.activate_joined([(outputs[0], SAME.outputs(outputs[0].shape, self._grown.shape))])
+            outputs[0] = self._grown
+        children = [map_convolution(1 << level, stride=1 << level) for level in range(LEVELS)]
+        self._head.activate_joined(
+            [
+                (level, child.inputs(level.shape, self._head.shape))
+                for level, child in zip(outputs, children, strict=True)
+            ]
+        )
+
+        tables, before = [], self._pillars
+        for number, (strided, output) in enumerate(zip(self._strided, outputs, strict=True)):
+            grows = output is not strided
+            same = _reads(output, output, SAME)
+            tables.append(
+                LevelTables(
+                    strided=_reads(strided, before, STRIDED),
+                    first=_reads(output, strided, SAME) if grows else same,
+                    same=same,
+                    strided_back=self._inverse(before, strided, STRIDED),
+                    first_back=self._inverse(strided, output, SAME),
+                    strided_cells=strided.cells.astype(np.int32),
+                    cells=output.cells.astype(np.int32),
+                    places=self._head.places(output, number),
+                )
+            )
+            before = output
+        return NeckTables(tuple(tables), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
+
+    def _inverse(self, source: CellMap, target: CellMap, convolution: Convolution) -> NDArray[np.int32]:
+        if not self.training:
+            return np.empty((0, convolution.taps), np.int32)
+        return source.table(target, convolution.outputs(source.shape, target.shape))
+
+
+def _reads(target: CellMap, source: CellMap, convolution: Convolution) -> NDArray[np.int32]:
+    return target.table(source, convolution.inputs(target.shape, source.shape))
+
+
+def stack_neck_tables(
+    frames: Sequence[NeckTables[NDArray[np.int32]]], pillars: Sequence[int]
+) -> NeckTables[NDArray[np.int32]]:
+    """Tables of a batch from those of its frames.
+
+    Args:
+        frames: at least one, all of one map.
+        pillars: how many each frame has.
+    """
+    levels, before = [], list(pillars)
+    map_cells = math.prod(frames[0].map_shape)
+    for number in range(LEVELS):
+        parts = [frame.levels[number] for frame in frames]
+        strided = [len(part.strided_cells) for part in parts]
+        outputs = [len(part.cells) for part in parts]
+        levels.append(
+            LevelTables(
+                strided=stack_rows([part.strided for part in parts], before),
+                first=stack_rows([part.first for part in parts], strided),
+                same=stack_rows([part.same for part in parts], outputs),
+                strided_back=stack_rows([part.strided_back for part in parts], strided),
+                first_back=stack_rows([part.first_back for part in parts], outputs),
+                strided_cells=stack_cells([part.strided_cells for part in parts], map_cells >> (2 * number)),
+                cells=stack_cells([part.cells for part in parts], map_cells >> (2 * number)),
+                places=stack_rows([part.places for part in parts], [count << (2 * number) for count in outputs]),
+            )
+        )
+        before = outputs
+    return NeckTables(
+        tuple(levels),
+        stack_cells([frame.head_cells for frame in frames], map_cells),
+        tuple(len(frame.head_cells) for frame in frames),
+        frames[0].map_shape,
+    )
+
+
+def table_inputs(tables: NeckTables[Array]) -> dict[str, Array]:
+    """What a graph of the neck can ask for, by the names of its inputs; it takes what its layers read."""
+    return {
+        f"{kind}_{number}": getattr(level, kind)
+        for number, level in enumerate(tables.levels)
+        for kind in ("strided", "first", "same", "places")
+    }

@@ -1,0 +1,84 @@
+"""Tables of a backbone over voxels: strided convolutions join its levels (SECOND, PV-RCNN)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.tables.cell_map import CellMap
+from asca_pillars.tables.convolution import Convolution, Shape
+
+SUBMANIFOLD = Convolution((3, 3, 3), (1, 1, 1), (1, 1, 1))
+PV_RCNN_STRIDED = (
+    Convolution((3, 3, 3), (2, 2, 2), (1, 1, 1)),
+    Convolution((3, 3, 3), (2, 2, 2), (1, 1, 1)),
+    Convolution((3, 3, 3), (2, 2, 2), (0, 1, 1)),
+    Convolution((3, 1, 1), (2, 1, 1), (0, 0, 0)),
+)
+"""conv2, conv3, conv4 and conv_out; they take 41 cells along z to 21, 11, 5 and 2."""
+
+
+class VoxelLevel(NamedTuple):
+    """N active cells of one level."""
+
+    cells: NDArray[np.int64]
+    """(N,) flat index (y * nx + x) * nz + z on this level's lattice, ascending."""
+    same: NDArray[np.int32]
+    """(N, 27) of submanifold convolutions; empty on a level that has none."""
+    strided: NDArray[np.int32]
+    """(N, K) rows of the level before; empty on the first."""
+    strided_back: NDArray[np.int32]
+    """(rows of the level before, K) the inverse of `strided`, for training; empty without."""
+
+
+class VoxelTableBuilder:
+    """Builds the tables of scan after scan, in memory of its own: for one thread at a time.
+
+    Args:
+        shape: of the first level's lattice, cells along z, y, x.
+        strided: convolutions from each level to the next.
+        submanifold: whether each level has submanifold convolutions, the first one included.
+        training: also the tables that the backward pass reads.
+
+    Raises:
+        ConfigError: a lattice that is too tall or too large, see `CellMap`.
+    """
+
+    def __init__(
+        self,
+        shape: Shape,
+        strided: Sequence[Convolution] = PV_RCNN_STRIDED,
+        submanifold: Sequence[bool] = (True, True, True, True, False),
+        *,
+        training: bool = False,
+    ) -> None:
+        if len(submanifold) != len(strided) + 1:
+            raise ValueError(f"{len(strided)} strided convolutions join {len(strided) + 1} levels, not {submanifold}")
+        self.strided, self.submanifold, self.training = tuple(strided), tuple(submanifold), training
+        self.maps = [CellMap(shape)]
+        """One for each level; the first is filled by whoever finds the voxels."""
+        for convolution in strided:
+            self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
+
+    def build(self) -> list[VoxelLevel]:
+        """Tables for the active cells of `maps[0]`, level by level."""
+        before, levels = self.maps[0], [self._level(self.maps[0], 0)]
+        for number, (convolution, level) in enumerate(zip(self.strided, self.maps[1:], strict=True), start=1):
+            readers = convolution.outputs(before.shape, level.shape)
+            level.activate_joined([(before, readers)])
+            back = before.table(level, readers) if self.training else _none(convolution.taps)
+            strided = level.table(before, convolution.inputs(level.shape, before.shape))
+            levels.append(self._level(level, number)._replace(strided=strided, strided_back=back))
+            before = level
+        return levels
+
+    def _level(self, level: CellMap, number: int) -> VoxelLevel:
+        same = _none(SUBMANIFOLD.taps)
+        if self.submanifold[number]:
+            same = level.table(level, SUBMANIFOLD.inputs(level.shape, level.shape))
+        return VoxelLevel(level.cells, same, _none(0), _none(0))
+
+
+def _none(taps: int) -> NDArray[np.int32]:
+    return np.empty((0, taps), np.int32)

@@ -1,0 +1,155 @@
+"""Points -> voxels: small boxes of space, each with the mean of its first points (SECOND, PV-RCNN)."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.schema import Strict
+from asca_pillars.tables.cell_map import MAX_Z_CELLS, CellMap
+from asca_pillars.tables.compiled_tables import load_table_kernels
+from asca_pillars.tables.convolution import Shape
+
+
+@dataclass(frozen=True)
+class VoxelGrid(Strict):
+    """Ranges and voxel sizes in metres, LiDAR frame; the defaults are PV-RCNN's on KITTI.
+
+    Attributes:
+        x_range_m, y_range_m, z_range_m: lower end inside, upper end outside.
+        size_m: of a voxel along x, y, z.
+        empty_layers: that lie on top of the range so that the strides of a backbone divide the height (SECOND: one).
+        max_points: of a voxel that enter its mean, the first ones of the scan.
+
+    Raises:
+        ConfigError: the voxels do not fill the ranges, or are more than MAX_Z_CELLS along z.
+    """
+
+    x_range_m: tuple[float, float] = (0.0, 70.4)
+    y_range_m: tuple[float, float] = (-40.0, 40.0)
+    z_range_m: tuple[float, float] = (-3.0, 1.0)
+    size_m: tuple[float, float, float] = (0.05, 0.05, 0.1)
+    empty_layers: int = 1
+    max_points: int = 5
+
+    def __post_init__(self) -> None:
+        for name, (low, high), size in zip(("x", "y", "z"), self.ranges_m, self.size_m, strict=True):
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise ConfigError(f"{name}_range_m [{low:g}, {high:g}] must be two finite numbers, the smaller first")
+            if not (math.isfinite(size) and size > 0):
+                raise ConfigError(f"size_m: {size:g} along {name} must be a positive size in metres")
+            cells = (high - low) / size
+            if round(cells) < 1 or abs(cells - round(cells)) > 1e-4 * cells:
+                nearest = (high - low) / max(round(cells), 1)
+                raise ConfigError(
+                    f"{name}_range_m [{low:g}, {high:g}] is not a whole number of voxels of {size:g} m; "
+                    f"{nearest:.6g} m would fit"
+                )
+        if self.empty_layers < 0 or self.max_points < 1:
+            raise ConfigError(f"empty_layers {self.empty_layers} must be at least 0, max_points {self.max_points} 1")
+        if self.shape[0] > MAX_Z_CELLS:
+            raise ConfigError(
+                f"{self.shape[0]} voxels along z are more than {MAX_Z_CELLS}; choose a larger size_m along z, or a "
+                "smaller z_range_m"
+            )
+
+    @property
+    def ranges_m(self) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+        """Along x, y, z."""
+        return self.x_range_m, self.y_range_m, self.z_range_m
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Cells along z, y, x, empty layers included."""
+        sizes = zip(self.ranges_m, self.size_m, strict=True)
+        x, y, z = (round((high - low) / size) for (low, high), size in sizes)
+        return z + self.empty_layers, y, x
+
+    def centers_m(self, cells: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Centers x, y, z of these voxels: (N,) -> (N, 3), metres."""
+        yx, z = np.divmod(cells, self.shape[0])
+        y, x = np.divmod(yx, self.shape[2])
+        lows = np.array([low for low, _ in self.ranges_m])
+        return (lows + (np.stack([x, y, z], axis=-1) + 0.5) * self.size_m).astype(np.float32)
+
+
+class Voxels(NamedTuple):
+    """The voxels of one scan that hold points."""
+
+    features: NDArray[np.float32]
+    """(N, C) mean of the first points: x, y, z in metres (LiDAR frame), reflectance and what else points have."""
+    cells: NDArray[np.int64]
+    """(N,) flat index (y * nx + x) * nz + z, ascending."""
+    points_outside: int
+    """Points outside the ranges, or not finite."""
+
+
+def voxelize(points: NDArray[np.float32], grid: VoxelGrid, cell_map: CellMap) -> Voxels:
+    """Sort points into voxels and average the first of each.
+
+    Sums are float64 in the scan's order, so the means do not depend on the machine.
+
+    Args:
+        points: (M, C >= 3) x, y, z in metres, LiDAR frame, and other values.
+        grid: where the voxels are.
+        cell_map: of the grid's shape; the voxels are its active cells afterwards.
+
+    Raises:
+        ValueError: `points` or `cell_map` has another shape.
+    """
+    if points.ndim != 2 or points.shape[1] < 3 or cell_map.shape != grid.shape:
+        raise ValueError(f"points {points.shape} must be (M, >=3), the map {cell_map.shape} of shape {grid.shape}")
+    points = np.require(points, np.float32, ["C", "ALIGNED"])
+    lows_m = np.array([low for low, _ in grid.ranges_m], np.float32)
+    highs_m = np.array([high for _, high in grid.ranges_m], np.float32)
+    sizes_m, shape = np.array(grid.size_m, np.float32), grid.shape
+    cell_of_point = np.empty(len(points), np.int64)
+    kernels = load_table_kernels()
+    if kernels is None:
+        cell_of_point = _cells_of_points(points[:, :3], lows_m, highs_m, sizes_m, shape)
+        cell_map.activate_points(cell_of_point)
+        features = _means(points, cell_of_point, cell_map.cells, grid.max_points)
+    else:
+        kernels.cells_of_points(points, lows_m, highs_m, sizes_m, shape, cell_of_point)
+        cell_map.activate_points(cell_of_point)
+        sums = np.zeros((len(cell_map), points.shape[1]))
+        features = np.empty(sums.shape, np.float32)
+        counts = np.zeros(len(cell_map), np.int64)
+        columns = cell_map.columns
+        kernels.sum_points(points, cell_of_point, shape[0], *columns, grid.max_points, sums, counts, features)
+    return Voxels(features, cell_map.cells, int((cell_of_point < 0).sum()))
+
+
+def _cells_of_points(
+    xyz: NDArray[np.float32],
+    lows_m: NDArray[np.float32],
+    highs_m: NDArray[np.float32],
+    sizes_m: NDArray[np.float32],
+    shape: Shape,
+) -> NDArray[np.int64]:
+    """(M,) flat index of each point's voxel, -1 outside; a border belongs to the voxel above it."""
+    inside = ((xyz >= lows_m) & (xyz < highs_m)).all(axis=1)
+    # float32 throughout, and the quotient may round up to the range's end: its last voxel has the point.
+    chosen = np.floor((xyz[inside] - lows_m) / sizes_m).astype(np.int64)
+    last = np.round((highs_m - lows_m) / sizes_m).astype(np.int64) - 1
+    x, y, z = np.minimum(chosen, last).T
+    cells = np.full(len(xyz), -1, np.int64)
+    cells[inside] = (y * shape[2] + x) * shape[0] + z
+    return cells
+
+
+def _means(
+    points: NDArray[np.float32], cell_of_point: NDArray[np.int64], cells: NDArray[np.int64], max_points: int
+) -> NDArray[np.float32]:
+    order = np.argsort(cell_of_point, kind="stable")
+    order = order[cell_of_point[order] >= 0]
+    voxel = np.searchsorted(cells, cell_of_point[order])
+    first = np.arange(len(order)) - np.searchsorted(voxel, voxel) < max_points
+    order, voxel = order[first], voxel[first]
+    counts = np.bincount(voxel, minlength=len(cells))
+    sums = [np.bincount(voxel, weights=points[order, c], minlength=len(cells)) for c in range(points.shape[1])]
+    return (np.stack(sums, axis=-1) / counts[:, None]).astype(np.float32)

@@ -1,0 +1,79 @@
+"""The sparse neck and head on the vehicle: one graph over active cells alone, tables in place of a pseudo-image."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.bundle import Bundle
+from asca_deploy.graph import Session, Tensor, check_interface
+from asca_deploy.pillar_backbone import HeadAnswer
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.tables.neck_tables import LEVELS, NeckTableBuilder, NeckTables, table_inputs
+
+FEATURES = "pillar_features"
+
+
+class PlacedPillars(NamedTuple):
+    """What the graph reads of one scan."""
+
+    features: NDArray[Any]
+    """(P, C)"""
+    tables: NeckTables[NDArray[np.int32]]
+
+
+class TableBackbone:
+    """backbone.onnx of a sparse neck, see `pillar_backbone.PillarBackbone`.
+
+    Tables are built in memory that is kept from scan to scan, as many builders as threads ever built at once; the
+    tables themselves belong to their scan.
+
+    Args:
+        path: of the graph, for messages.
+        session: that has opened it.
+        bundle: the manifest.
+
+    Raises:
+        BundleError: the graph's inputs and outputs are not those of this bundle.
+    """
+
+    stage = "tables"
+
+    def __init__(self, path: Path, session: Session, bundle: Bundle) -> None:
+        self._bundle, section = bundle, bundle.pillar
+        inputs = {FEATURES: Tensor(section.canvas.type, (None, section.channels))}
+        for number in range(LEVELS):
+            inputs |= {f"{kind}_{number}": Tensor("int32", (None, 9)) for kind in ("strided", "first", "same")}
+            inputs[f"places_{number}"] = Tensor("int32", (None,))
+        self._channels = [bundle.spec.anchors.shape[2] * channels for channels in (1, 7, 2)]
+        outputs = zip(HeadMaps._fields, self._channels, strict=True)
+        self._session = check_interface(
+            path, session, inputs, {name: Tensor("float32", (None, channels)) for name, channels in outputs}
+        )
+        self._free = [self._new_builder()]
+
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
+        """Pillar features (P, C) with the tables that their cells (P,) make."""
+        try:
+            builder = self._free.pop()  # atomic, as append is: two threads never get the same one
+        except IndexError:
+            builder = self._new_builder()
+        tables = builder.build(cells)
+        self._free.append(builder)
+        return PlacedPillars(pillar_features, tables)
+
+    def run(self, placed: PlacedPillars) -> HeadAnswer:
+        """Scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
+        tables = placed.tables
+        if not len(tables.head_cells):
+            nothing = HeadMaps(*(np.empty((0, channels), np.float32) for channels in self._channels))
+            return HeadAnswer(nothing, tables.head_cells)
+        given = {FEATURES: placed.features, **table_inputs(tables)}
+        inputs = {name: given[name] for name in self._session.inputs}  # a graph takes what its layers read
+        return HeadAnswer(HeadMaps(*self._session.run(HeadMaps._fields, inputs)), tables.head_cells)
+
+    def _new_builder(self) -> NeckTableBuilder:
+        grid, rule = self._bundle.spec.grid, self._bundle.pillar.active_cells
+        assert rule is not None
+        return NeckTableBuilder(grid.ny, grid.nx, rule)

@@ -1,0 +1,113 @@
+"""A backbone before and after its weights are rounded to 8 bits, and graphs in which any of its layers is rounded."""
+
+import copy
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils._pytree import tree_map_only
+
+from asca_deploy.bundle import CanvasFormat
+from asca_deploy.canvas_backbone import Canvas
+from asca_export import graphs, qdq
+from asca_export.fast_forms import CanvasSteps, FastBackbone
+from asca_export.quantize import STEPS, input_moments, layer_names, round_weights, scale_to_steps
+from asca_export.sparse_forms import SparseBackbone
+from asca_export.sparse_graphs import export_sparse_backbone
+from asca_export.sparse_quantize import SparseSample, read_moments, round_products, scale_rows_to_steps
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillars.pillarize import Pillars
+
+
+class Encoded(NamedTuple):
+    """A scan on its way to the backbone."""
+
+    features: NDArray[np.float32]
+    """(P, C)"""
+    pillars: Pillars
+
+    def in_steps(self, steps: CanvasSteps) -> NDArray[np.uint8]:
+        """(P, C) whole steps of the features."""
+        scale, empty = steps.scale.numpy(), steps.empty.numpy()
+        return np.clip(np.round(self.features / scale + empty), 0, STEPS).astype(np.uint8)
+
+
+class RoundedBackbone(Protocol):
+    """A backbone whose layers can each be rounded or not."""
+
+    @property
+    def layers(self) -> Sequence[str]:
+        """Names, in the order in which they compute."""
+
+    def write(self, path: Path, eight_bit: Sequence[str]) -> None:
+        """Write the graph with these layers in 8 bits, the others in floating point, and all rows in steps."""
+
+
+def round_backbone(
+    detector: PillarDetector, encoded: Sequence[Encoded], steps: CanvasSteps, work: Path
+) -> RoundedBackbone:
+    """Round the weights of a dense or of a sparse neck and its head.
+
+    Args:
+        detector: in evaluation mode; it stays as it is.
+        encoded: the calibration scans.
+        steps: of their pillar features.
+        work: folder for what is needed on the way.
+    """
+    if detector.preparation.active_cells is None:
+        return _RoundedDense(detector, encoded, steps, work)
+    return _RoundedSparse(detector, encoded, steps)
+
+
+class _RoundedDense:
+    def __init__(self, detector: PillarDetector, encoded: Sequence[Encoded], steps: CanvasSteps, work: Path) -> None:
+        form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
+
+        def canvases() -> Iterator[NDArray[np.uint8]]:
+            canvas = Canvas(len(steps.empty), detector.grid, form)
+            return (canvas.scatter(each.in_steps(steps), each.pillars.cells) for each in encoded)
+
+        self._rounded = FastBackbone(detector, steps).eval()
+        scale_to_steps(self._rounded, canvases(), steps)
+        moments = input_moments(self._rounded, canvases(), steps)
+        self._exact, self.layers = copy.deepcopy(self._rounded), layer_names(self._rounded)
+        round_weights(self._exact, [], moments)
+        round_weights(self._rounded, self.layers, moments)
+        self._template = work / "template.onnx"
+        graphs.export_backbone(self._exact, detector.grid, self._template)
+
+    def write(self, path: Path, eight_bit: Sequence[str]) -> None:
+        qdq.quantize_backbone(self._template, path, eight_bit, self._parameters(eight_bit))
+
+    def _parameters(self, eight_bit: Sequence[str]) -> dict[str, Tensor]:
+        """Parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
+        own = dict(self._rounded.named_parameters())
+        return {
+            name: own[name] if name.rpartition(".")[0] in eight_bit else parameter
+            for name, parameter in self._exact.named_parameters()
+        }
+
+
+class _RoundedSparse:
+    def __init__(self, detector: PillarDetector, encoded: Sequence[Encoded], steps: CanvasSteps) -> None:
+        samples = [_sample(detector, each).in_steps(steps) for each in encoded]
+        self._exact = SparseBackbone(detector, steps)
+        scale_rows_to_steps(self._exact, samples)
+        self._rounded, self.layers = copy.deepcopy(self._exact), list(self._exact.products)
+        round_products(self._rounded, self.layers, read_moments(self._exact, samples))
+
+    def write(self, path: Path, eight_bit: Sequence[str]) -> None:
+        mixed = copy.deepcopy(self._exact)
+        for name in eight_bit:
+            mixed.products[name] = self._rounded.products[name]
+        export_sparse_backbone(mixed, path, eight_bit, steps=True)
+
+
+def _sample(detector: PillarDetector, encoded: Encoded) -> SparseSample:
+    tables = detector.preparation.tables(encoded.pillars)
+    assert tables is not None
+    return SparseSample(torch.from_numpy(encoded.features), tree_map_only(np.ndarray, torch.from_numpy, tables))

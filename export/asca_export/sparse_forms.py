@@ -1,0 +1,133 @@
+"""The trained sparse neck and head as a chain of matrix products, the form that its graph has.
+
+A batch normalization is part of the weights before it. A convolution by table reads the rows of its taps side by side,
+so it is one product; an upsampling whose kernel equals its stride is one product for each active parent, whose
+outputs are then picked at head cells; the head's three convolutions are one product.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from asca_export.fast_forms import STEP_VALUE, CanvasSteps
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.pillar.neck import SparseRPNNeck
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.tables.neck_tables import NeckTables, table_inputs
+
+HEAD = "head"
+
+
+class TableLayer(NamedTuple):
+    """A convolution by table, followed by a ReLU."""
+
+    name: str
+    """Of its product in `SparseBackbone.products`."""
+    table: str
+    """The input of the graph that it gathers by."""
+
+
+class Level(NamedTuple):
+    """One block of the neck, and what brings its rows to the head cells."""
+
+    convolutions: tuple[TableLayer, ...]
+    upsample: str
+    places: str
+    """The input of the graph that picks the upsampling's rows."""
+    stride: int
+    """Of the upsampling."""
+
+
+class SparseBackbone(nn.Module):
+    """Sparse neck and head of a trained detector as matrix products by name.
+
+    Args:
+        detector: in evaluation mode, with a sparse neck; it stays as it is.
+        steps: of the pillar features, which then hold STEP_VALUE times the step; None for real values.
+    """
+
+    def __init__(self, detector: PillarDetector, steps: CanvasSteps | None = None) -> None:
+        super().__init__()
+        neck = detector.neck
+        assert isinstance(neck, SparseRPNNeck)
+        self.products = nn.ModuleDict()
+        self.levels: list[Level] = []
+        for number, (block, deblock) in enumerate(zip(neck.blocks, neck.deblocks, strict=True)):
+            grows = neck.rule == "fine" and number == 0
+            convolutions = []
+            for index, (convolution, norm) in enumerate(_pairs(block)):
+                assert isinstance(convolution, nn.Conv2d)
+                fused = fuse_conv_bn_eval(convolution, norm)
+                kind = ("strided", "first" if grows else "same", "same")[min(index, 2)]
+                layer = TableLayer(f"block{number}_{index}", f"{kind}_{number}")
+                self.products[layer.name] = _product(fused.weight.flatten(2).transpose(1, 2).flatten(1), fused.bias)
+                convolutions.append(layer)
+            ((transposed, norm),) = _pairs(deblock)
+            assert isinstance(transposed, nn.ConvTranspose2d)
+            fused_up = fuse_conv_bn_eval(transposed, norm, transpose=True)
+            assert fused_up.bias is not None
+            stride, upsample = fused_up.stride[0], f"upsample{number}"
+            weight = fused_up.weight.permute(2, 3, 1, 0).flatten(0, 2)  # (row, column, channel), inputs
+            self.products[upsample] = _product(weight, fused_up.bias.repeat(stride**2))
+            self.levels.append(Level(tuple(convolutions), upsample, f"places_{number}", stride))
+        parts = (detector.head.scores, detector.head.boxes, detector.head.directions)
+        biases = [part.bias for part in parts if part.bias is not None]
+        self.products[HEAD] = _product(torch.cat([part.weight[:, :, 0, 0] for part in parts]), torch.cat(biases))
+        self.head_channels = [part.out_channels for part in parts]
+        first = self.product(self.levels[0].convolutions[0].name)
+        self.channels = first.in_features // 9
+        self.empty = torch.zeros(self.channels) if steps is None else steps.empty
+        """(C,) what the first layer reads where there is no pillar; in steps if there are any."""
+        if steps is not None:
+            with torch.no_grad():
+                first.weight.view(-1, 9, self.channels).mul_(steps.scale / STEP_VALUE)
+                first.bias.sub_(first.weight @ (steps.empty * STEP_VALUE).repeat(9))
+
+    def product(self, name: str) -> nn.Linear:
+        """The product of this name: weight (outputs, taps * C) with the channels of a tap side by side."""
+        product = self.products[name]
+        assert isinstance(product, nn.Linear)
+        return product
+
+    def passes(self, features: Tensor, tables: NeckTables[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
+        """Name, what it reads and what it gives of each product in turn: features (P, C), or STEP_VALUE times steps."""
+        inputs, maps = table_inputs(tables), []
+        missing = self.empty * STEP_VALUE
+        for level in self.levels:
+            for layer in level.convolutions:
+                padded = torch.cat([features, missing[None]])
+                read = padded[inputs[layer.table].long()].flatten(1)
+                features = torch.relu(self.product(layer.name)(read))
+                missing = features.new_zeros(features.shape[1])
+                yield layer.name, read, features
+            upsampled = torch.relu(self.product(level.upsample)(features))
+            yield level.upsample, features, upsampled
+            channels = upsampled.shape[1] // level.stride**2
+            rows = torch.cat([upsampled.view(-1, channels), upsampled.new_zeros(1, channels)])
+            maps.append(rows[inputs[level.places].long()])
+        joined = torch.cat(maps, dim=1)
+        yield HEAD, joined, self.product(HEAD)(joined)
+
+    def forward(self, features: Tensor, tables: NeckTables[Tensor]) -> HeadMaps[Tensor]:
+        """Pillar features (P, C) -> scores (H, A), boxes (H, 7A), directions (H, 2A) at H head cells."""
+        for _, _, output in self.passes(features, tables):
+            last = output
+        return HeadMaps(*last.split(self.head_channels, dim=1))
+
+
+def _pairs(block: nn.Module) -> list[tuple[Any, Any]]:
+    """Each convolution, and the normalization that follows it."""
+    children = list(block.children())
+    return list(zip(children[0::3], children[1::3], strict=True))
+
+
+def _product(weight: Tensor, bias: Tensor | None) -> nn.Linear:
+    assert bias is not None
+    product = nn.Linear(weight.shape[1], weight.shape[0])
+    with torch.no_grad():
+        product.weight.copy_(weight)
+        product.bias.copy_(bias)
+    return product.requires_grad_(False)

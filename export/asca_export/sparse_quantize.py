@@ -1,0 +1,118 @@
+"""The sparse backbone in 8 bits, as `quantize` does it for the dense one; here no empty space has to be rounded.
+
+A channel's step is its largest value on the calibration scans / 255. Weights are rounded together (GPTQ), and the bias
+makes up for what rounding changes in the mean.
+"""
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from asca_export.fast_forms import STEP_VALUE, CanvasSteps
+from asca_export.quantize import PLACES, STEPS, round_together
+from asca_export.sparse_forms import HEAD, SparseBackbone
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.tables.neck_tables import NeckTables
+
+_TINY = 1e-6
+
+
+class SparseSample(NamedTuple):
+    """What the backbone reads of one scan."""
+
+    features: Tensor
+    """(P, C) pillar features."""
+    tables: NeckTables[Tensor]
+
+    def in_steps(self, steps: CanvasSteps) -> "SparseSample":
+        """With STEP_VALUE times the whole steps of its features."""
+        whole = (self.features / steps.scale + steps.empty).round().clamp(0, STEPS)
+        return self._replace(features=whole * STEP_VALUE)
+
+
+class InputMoments(NamedTuple):
+    """Of what a product reads: mean (n,), and mean product of the differences from it (n, n)."""
+
+    mean: Tensor
+    squares: Tensor
+
+
+def quantized_backbone(detector: PillarDetector, samples: Sequence[SparseSample], steps: CanvasSteps) -> SparseBackbone:
+    """The sparse backbone with every row in steps and every weight on the grid of 8-bit arithmetic.
+
+    Args:
+        detector: in evaluation mode, with a sparse neck.
+        samples: of the calibration scans, real values, none of them empty.
+        steps: of their pillar features, see `quantize.canvas_steps`.
+    """
+    backbone, counted = SparseBackbone(detector, steps), [sample.in_steps(steps) for sample in samples]
+    scale_rows_to_steps(backbone, counted)
+    round_products(backbone, list(backbone.products), read_moments(backbone, counted))
+    return backbone
+
+
+@torch.no_grad()
+def scale_rows_to_steps(backbone: SparseBackbone, samples: Iterable[SparseSample]) -> None:
+    """Change the weights so that rows count steps, 0 to 255 times STEP_VALUE; the results stay the same.
+
+    Args:
+        backbone: made with the steps of the samples; changed in place.
+        samples: of the calibration scans, in steps.
+    """
+    highest: dict[str, Tensor] = {}
+    for sample in samples:
+        for name, _, output in backbone.passes(*sample):
+            high = output.amax(dim=0) if len(output) else output.new_zeros(output.shape[1])
+            highest[name] = torch.maximum(highest[name], high) if name in highest else high
+    head, first_channel = backbone.product(HEAD), 0
+    names = [[layer.name for layer in level.convolutions] for level in backbone.levels]
+    for number, level in enumerate(backbone.levels):
+        following = [*names[number][1:], None]
+        for name, next_name in zip(names[number], following, strict=True):
+            step = highest[name].clamp_min(_TINY) / STEPS
+            _count(backbone, name, step)
+            readers = [next_name] if next_name else [level.upsample, *(block[0] for block in names[number + 1 :][:1])]
+            for reader in readers:
+                weight = backbone.product(reader).weight
+                weight.view(len(weight), -1, len(step)).mul_(step / STEP_VALUE)
+        channels = len(highest[level.upsample]) // level.stride**2  # the places of a channel end up in one column
+        step = highest[level.upsample].view(-1, channels).amax(dim=0).clamp_min(_TINY) / STEPS
+        _count(backbone, level.upsample, step.repeat(level.stride**2))
+        head.weight[:, first_channel : first_channel + channels] *= step / STEP_VALUE
+        first_channel += channels
+
+
+@torch.no_grad()
+def read_moments(backbone: SparseBackbone, samples: Sequence[SparseSample]) -> dict[str, InputMoments]:
+    """Moments of what every product reads on the calibration scans, at PLACES places of each at most."""
+    generator = torch.Generator().manual_seed(0)
+    sums: dict[str, tuple[Tensor, Tensor]] = {}
+    for sample in samples:
+        for name, read, _ in backbone.passes(*sample):
+            rows = read[torch.randperm(len(read), generator=generator)[:PLACES]].double()
+            mean, squares = rows.sum(dim=0) / max(len(rows), 1), rows.T @ rows / max(len(rows), 1)
+            before = sums.get(name, (torch.zeros_like(mean), torch.zeros_like(squares)))
+            sums[name] = before[0] + mean / len(samples), before[1] + squares / len(samples)
+    return {
+        name: InputMoments(mean.float(), (squares - torch.outer(mean, mean)).float())
+        for name, (mean, squares) in sums.items()
+    }
+
+
+@torch.no_grad()
+def round_products(backbone: SparseBackbone, layers: Collection[str], moments: dict[str, InputMoments]) -> None:
+    """Round the weights of `layers` to what 8-bit arithmetic will use, in place."""
+    for name in layers:
+        product = backbone.product(name)
+        rounded = round_together(product.weight, moments[name].squares)
+        product.bias.add_((product.weight - rounded) @ moments[name].mean)
+        product.weight.copy_(rounded)
+
+
+def _count(backbone: SparseBackbone, name: str, step: Tensor) -> None:
+    """Let the outputs count steps."""
+    product = backbone.product(name)
+    product.weight.mul_(STEP_VALUE / step[:, None])
+    product.bias.mul_(STEP_VALUE / step)

@@ -1,0 +1,121 @@
+"""A sparse neck from the checkpoint to boxes: bundles in float and in 8 bits, threads, streams, providers, reports."""
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from asca_deploy import Detections, Detector, load_bundle
+from asca_deploy.benchmark import benchmark
+from asca_deploy.bundle import CanvasFormat, PillarSection
+from asca_deploy.pillar_pipeline import open_backbone
+from asca_export.exporter import export_bundle
+from asca_pillars.errors import ConfigError, ProviderError
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.scan_detector import ScanDetector
+from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.scenes import SPEC, make_scene
+
+CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
+STAGES = ("pillarize", "encode", "tables", "neck+head", "decode")
+NOTHING = np.empty((0, 4), np.float32)
+ONE_POINT = np.array([[10.0, 0.5, -1.0, 0.3]], np.float32)
+
+
+def sparse_checkpoint(rule: str) -> Checkpoint:
+    spec = SPEC.with_score_threshold(0.02)  # random weights are never sure of anything
+    return tiny_checkpoint("channel", spec, neck="sparse", active_cells=rule)
+
+
+@pytest.fixture(scope="module", params=["sub", "fine"])
+def float_bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Checkpoint]:
+    folder, checkpoint = tmp_path_factory.mktemp("bundles") / "float", sparse_checkpoint(request.param)
+    export_bundle(checkpoint, folder, SCANS)
+    return folder, checkpoint
+
+
+@pytest.fixture(scope="module")
+def int8_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bundles") / "int8"
+    export_bundle(sparse_checkpoint("fine"), folder, SCANS, calibration=CALIBRATION)
+    return folder
+
+
+def same(ours: Detections, theirs: Detections) -> bool:
+    return all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in ("boxes", "scores", "labels"))
+
+
+def test_the_bundle_finds_what_pytorch_finds(float_bundle: tuple[Path, Checkpoint]) -> None:
+    folder, checkpoint = float_bundle
+    bundle, runtime = load_bundle(folder), Detector(folder)
+    network = checkpoint.config.model.network
+    assert (bundle.pillar.neck, bundle.pillar.active_cells) == ("sparse", network.active_cells)
+    assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.backbone_gmac > 0
+    torch_detector = ScanDetector(checkpoint.detector, bundle.spec)
+    everything = (
+        Detector(folder, score_threshold=0.0),
+        ScanDetector(checkpoint.detector, SPEC.with_score_threshold(0.0)),
+    )
+    pairs = [(runtime(points), torch_detector(points)) for points in SCANS[:3]]
+    for found, expected in (*pairs, tuple(detector(ONE_POINT) for detector in everything)):
+        assert len(found) == len(expected) > 0
+        np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-3)
+        np.testing.assert_allclose(found.scores, expected.scores, atol=1e-4)
+        np.testing.assert_array_equal(found.labels, expected.labels)
+    assert len(runtime(NOTHING)) == len(torch_detector(NOTHING)) == 0
+
+
+def test_eight_bits_report_how_near_they_are(int8_bundle: Path) -> None:
+    bundle = load_bundle(int8_bundle)
+    assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny_int8", "int8", "uint8")
+    report = bundle.quantization
+    assert report is not None and len(report.layers) == 6 + 3 + 1
+    assert 0 < report.logit_rms_error <= 0.08 and not any(layer.kept_float for layer in report.layers)
+    assert report.boxes > 20 and report.boxes_matched > 0.9 * report.boxes
+    detector = Detector(int8_bundle)
+    assert len(detector(NOTHING)) == 0
+    assert np.isfinite(detector(ONE_POINT).boxes).all()
+
+
+def test_eight_threads_and_a_stream_find_the_same_boxes(int8_bundle: Path) -> None:
+    detector, scans = Detector(int8_bundle), [*SCANS, NOTHING, ONE_POINT]
+    alone = [detector(points) for points in scans]
+    assert sum(map(len, alone)) > 20
+    with ThreadPoolExecutor(8) as threads:
+        together = list(threads.map(detector, scans * 6))
+    assert all(same(found, expected) for found, expected in zip(together, alone * 6, strict=True))
+    assert all(same(found, expected) for found, expected in zip(detector.stream(scans), alone, strict=True))
+
+
+def test_any_number_of_threads_gives_the_same_boxes(int8_bundle: Path) -> None:
+    one, three = Detector(int8_bundle, threads=1), Detector(int8_bundle, threads=3)
+    assert all(same(one(points), three(points)) for points in SCANS)
+
+
+def test_reports_name_the_stages_of_this_pipeline(int8_bundle: Path) -> None:
+    detector = Detector(int8_bundle)
+    assert tuple(detector(SCANS[0]).report.times_ms) == ("input", *STAGES)
+    assert tuple(benchmark(detector, SCANS[:2], rounds=2, warmup=1).stages_ms) == ("input", *STAGES)
+
+
+@pytest.mark.parametrize("provider", ["openvino", "tensorrt"])
+def test_a_provider_that_cannot_run_it_says_why(int8_bundle: Path, provider: Any) -> None:
+    bundle = load_bundle(int8_bundle)
+    with pytest.raises(ProviderError, match=f"{provider} cannot run the sparse neck of tiny_int8: .*provider cpu"):
+        open_backbone(int8_bundle / "backbone.onnx", bundle, provider, "float32", 1)
+
+
+def test_auto_leaves_out_what_cannot_run_it(int8_bundle: Path) -> None:
+    detector = Detector(int8_bundle, provider="auto")
+    assert detector.provider == "cpu"
+    assert all("fixed shapes" in str(each) for each in detector.candidates if each.provider == "openvino")
+
+
+def test_a_section_must_say_which_cells_are_active() -> None:
+    with pytest.raises(ConfigError, match="neck sparse does not go with active_cells None"):
+        PillarSection("none", 8, CanvasFormat(), "sparse")
+    with pytest.raises(ConfigError, match="neck dense does not go with active_cells fine"):
+        dataclasses.replace(PillarSection("none", 8, CanvasFormat()), active_cells="fine")

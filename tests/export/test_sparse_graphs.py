@@ -1,0 +1,142 @@
+"""The sparse backbone's graph against PyTorch, in float and in 8 bits, and its bits for any number of threads."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from torch.utils._pytree import tree_map_only
+
+from asca_deploy.ort_session import OrtSession
+from asca_deploy.table_backbone import FEATURES
+from asca_export.quantize import STEPS, canvas_steps
+from asca_export.sparse_forms import HEAD, SparseBackbone
+from asca_export.sparse_graphs import export_sparse_backbone
+from asca_export.sparse_quantize import SparseSample, quantized_backbone, scale_rows_to_steps
+from asca_pillars.config import PillarModel
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.pillar.neck import SparseRPNNeck
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
+from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.pillars.pillarize import Pillars
+from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables, table_inputs
+from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
+from tests.scenes import SPEC
+
+
+def sparse_detector(rule: str) -> PillarDetector:
+    """The weights of the tiny checkpoint in a sparse network."""
+    network = dataclasses.replace(NETWORK, block_convs=(2, 1, 0), neck="sparse", active_cells=rule)
+    detector = build_pillar_detector(PillarModel(spec=SPEC, network=network)).eval()
+    detector.load_state_dict(
+        {
+            name: tensor
+            for name, tensor in tiny_checkpoint("channel").detector.state_dict().items()
+            if name in detector.state_dict()
+        },
+        strict=False,
+    )
+    return detector
+
+
+def tables_of(pillars: Pillars, rule: str) -> NeckTables[np.ndarray]:
+    return NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule).build(pillars.cells)  # type: ignore[arg-type]
+
+
+def sample_of(detector: PillarDetector, pillars: Pillars) -> SparseSample:
+    assert isinstance(detector.neck, SparseRPNNeck)
+    batch = batch_pillars([pillars], [tables_of(pillars, detector.neck.rule)])
+    assert batch.neck is not None
+    with torch.inference_mode():
+        return SparseSample(detector.encode(batch.features, batch.pillar_index, batch.point_counts), batch.neck)
+
+
+class OpenGraph:
+    def __init__(self, path: Path, threads: int) -> None:
+        self.session = OrtSession(path, "cpu", "float32", threads)
+
+    def run(self, features: np.ndarray, tables: NeckTables[np.ndarray]) -> HeadMaps[np.ndarray]:
+        given = {FEATURES: features, **table_inputs(tables)}
+        return HeadMaps(*self.session.run(HeadMaps._fields, {name: given[name] for name in self.session.inputs}))
+
+
+def arrays(tables: NeckTables[torch.Tensor]) -> NeckTables[np.ndarray]:
+    return tree_map_only(torch.Tensor, lambda tensor: tensor.numpy(), tables)
+
+
+def assert_same_bits(runs: Sequence[HeadMaps[np.ndarray]]) -> None:
+    for other in runs[1:]:
+        for one, part in zip(runs[0], other, strict=True):
+            np.testing.assert_array_equal(one, part)
+
+
+@pytest.mark.parametrize("rule", ["sub", "fine"])
+def test_the_graph_is_the_network_and_the_same_for_any_number_of_threads(rule: str, tmp_path: Path) -> None:
+    detector = sparse_detector(rule)
+    export_sparse_backbone(SparseBackbone(detector), tmp_path / "backbone.onnx")
+    graphs = {threads: OpenGraph(tmp_path / "backbone.onnx", threads) for threads in (1, 2, 4)}
+    operators = {node.op_type for node in onnx.load(tmp_path / "backbone.onnx").graph.node}
+    assert operators == {"Concat", "Gather", "Reshape", "Gemm", "Relu", "Split"}  # nothing that scatters
+    for points in SCANS[:3]:
+        pillars = SPEC.pillarize(points)
+        sample = sample_of(detector, pillars)
+        with torch.inference_mode():
+            expected = detector.head.at_cells(detector.neck(*sample))
+        features, tables = sample.features.numpy(), arrays(sample.tables)
+        for want, found in zip(expected, graphs[1].run(features, tables), strict=True):
+            np.testing.assert_allclose(found, want.numpy(), atol=1e-4)
+        assert_same_bits([graph.run(features, tables) for graph in graphs.values() for _ in range(20)])
+
+
+def test_a_scan_with_a_single_pillar(tmp_path: Path) -> None:
+    detector = sparse_detector("fine")
+    export_sparse_backbone(SparseBackbone(detector), tmp_path / "backbone.onnx")
+    graph = OpenGraph(tmp_path / "backbone.onnx", 1)
+    tables = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, "fine").build(np.array([37]))
+    one = graph.run(np.ones((1, NETWORK.pillar_channels), np.float32), tables)
+    assert one.scores.shape == (len(tables.head_cells), 6) and np.isfinite(one.scores).all()
+
+
+def test_eight_bits_are_near_and_the_same_for_any_number_of_threads(tmp_path: Path) -> None:
+    detector = sparse_detector("fine")
+    samples = [sample_of(detector, SPEC.pillarize(points)) for points in SCANS]
+    steps = canvas_steps(sample.features.numpy() for sample in samples)
+    backbone = SparseBackbone(detector, steps)
+    counted = [sample.in_steps(steps) for sample in samples]
+    scale_rows_to_steps(backbone, counted)
+    with torch.inference_mode():  # scaled, it is still the same function
+        exact = SparseBackbone(detector)(*samples[0]).scores
+        assert float((backbone(*counted[0]).scores - exact).square().mean().sqrt()) < 0.05 * float(exact.std())
+    backbone = quantized_backbone(detector, samples, steps)
+    export_sparse_backbone(backbone, tmp_path / "int8.onnx", list(backbone.products), steps=True)
+    graphs = {threads: OpenGraph(tmp_path / "int8.onnx", threads) for threads in (1, 2, 4)}
+    for sample in samples[:2]:
+        whole = (sample.features / steps.scale + steps.empty).round().clamp(0, STEPS).numpy().astype(np.uint8)
+        runs = [graph.run(whole, arrays(sample.tables)) for graph in graphs.values() for _ in range(20)]
+        assert_same_bits(runs)
+        with torch.inference_mode():
+            expected = SparseBackbone(detector)(*sample)
+        for found, want in zip(runs[0], expected, strict=True):
+            error = float(np.sqrt(np.square(found - want.numpy()).mean()))
+            assert 0 < error < 0.1 * float(want.std()), (error, float(want.std()))
+
+
+def test_the_eight_bit_graph_runs_in_integers(tmp_path: Path) -> None:
+    import onnxruntime
+
+    detector = sparse_detector("fine")
+    samples = [sample_of(detector, SPEC.pillarize(points)) for points in SCANS[:2]]
+    steps = canvas_steps(sample.features.numpy() for sample in samples)
+    backbone = quantized_backbone(detector, samples, steps)
+    export_sparse_backbone(backbone, tmp_path / "int8.onnx", list(backbone.products), steps=True)
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "optimized.onnx")
+    options.log_severity_level = 3
+    onnxruntime.InferenceSession(str(tmp_path / "int8.onnx"), options, providers=["CPUExecutionProvider"])
+    operators = [node.op_type for node in onnx.load(tmp_path / "optimized.onnx").graph.node]
+    assert operators.count("QGemm") == len(backbone.products)
+    assert not {"Relu", "Gemm"} & set(operators)
+    assert backbone.product(HEAD).out_features == 60

@@ -1,0 +1,147 @@
+"""The sparse neck against dense convolutions with masks, in training and in evaluation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.config import LossConfig, NetworkConfig, PillarModel
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.targets import assign_targets
+from asca_pillars.models.pillar.loss import TargetBatch, detection_loss
+from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, PillarOutputs, build_pillar_detector
+from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, batch_pillars
+from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.tables.neck_tables import NeckTableBuilder
+from tests.scenes import SPEC, make_scene
+
+NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(2, 1, 1), upsample_channels=8)
+RULES = ("sub", "fine")
+UNSEEN_BY_SCORES = ("head.boxes.weight", "head.boxes.bias", "head.directions.weight", "head.directions.bias")
+
+
+def make_detector(rule: str | None) -> PillarDetector:
+    torch.manual_seed(0)
+    network = NETWORK if rule is None else dataclasses.replace(NETWORK, neck="sparse", active_cells=rule)
+    return build_pillar_detector(PillarModel(spec=SPEC, network=network))
+
+
+def make_batch(rule: str | None, seeds: tuple[int, ...] = (0, 1), *, training: bool = True) -> PillarBatch:
+    frames = [SPEC.pillarize(make_scene(seed)[0]) for seed in seeds]
+    if rule is None:
+        return batch_pillars(frames)
+    builder = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule, training=training)  # type: ignore[arg-type]
+    return batch_pillars(frames, [builder.build(frame.cells) for frame in frames])
+
+
+def dense_rows(detector: PillarDetector, batch: PillarBatch) -> torch.Tensor:
+    """The sparse neck's output, computed on whole maps."""
+    features = detector.encode(batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars)
+    canvas = detector.scatter(features, batch.cells, batch.frame_pillars)
+    assert isinstance(detector.neck, SparseRPNNeck) and batch.neck is not None
+    return detector.neck.forward_dense(canvas, batch.neck)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("training", [False, True])
+def test_tables_and_masks_are_the_same_function(rule: str, training: bool) -> None:
+    detector, batch = make_detector(rule).double().train(training), make_batch(rule)
+    batch = batch._replace(features=batch.features.double())
+    names, parameters = zip(*detector.named_parameters(), strict=True)
+    found = detector(batch).scores
+    expected = detector.head.at_cells(dense_rows(detector, batch)).scores
+    gradients, expected_gradients = (
+        torch.autograd.grad(scores.square().sum(), parameters, allow_unused=True) for scores in (found, expected)
+    )
+    assert len(found) > 100 and found.std() > 0.01
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+    for name, one, other in zip(names, gradients, expected_gradients, strict=True):
+        if name not in UNSEEN_BY_SCORES:
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8, msg=lambda text, name=name: name + text)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_single_precision_agrees_to_a_hundred_thousandth(rule: str) -> None:
+    detector, batch = make_detector(rule).eval(), make_batch(rule)
+    with torch.inference_mode():
+        expected = detector.head.at_cells(dense_rows(detector, batch))
+        for found, want in zip(detector(batch), expected, strict=True):
+            torch.testing.assert_close(found, want, rtol=0, atol=1e-5)
+
+
+def test_where_everything_is_active_it_is_the_dense_neck() -> None:
+    # One pillar in every cell; statistics over active cells are then those over the map.
+    dense, sparse = make_detector(None).train().double(), make_detector("fine").train().double()
+    sparse.load_state_dict(dense.state_dict())  # the same names and shapes
+    ny, nx = SPEC.grid.ny, SPEC.grid.nx
+    features = torch.randn(ny * nx, 8, dtype=torch.float64)
+    tables = NeckTableBuilder(ny, nx, "fine").build(np.arange(ny * nx))
+    (batch,) = [batch_pillars([SPEC.pillarize(make_scene(0)[0])], [tables])]
+    assert isinstance(sparse.neck, SparseRPNNeck) and isinstance(dense.neck, RPNNeck) and batch.neck is not None
+    with torch.no_grad():
+        expected = dense.neck(features.view(1, ny, nx, 8).permute(0, 3, 1, 2))
+        found = sparse.neck(features, batch.neck)
+    torch.testing.assert_close(found, expected[0].permute(1, 2, 0).flatten(0, 1))
+
+
+def test_frames_of_a_batch_do_not_touch() -> None:
+    detector, spec = make_detector("fine").eval(), SPEC.with_score_threshold(0.0)
+    with torch.inference_mode():
+        batch = make_batch("fine", (0, 1, 2))
+        together = detector.detect(PillarOutputs(detector(batch), batch.neck), spec)
+        for seed, found in enumerate(together):
+            alone = make_batch("fine", (seed,))
+            (own,) = detector.detect(PillarOutputs(detector(alone), alone.neck), spec)
+            assert len(found) == len(own) > 0
+            np.testing.assert_allclose(found.scores, own.scores, atol=1e-5)
+
+
+def test_the_loss_is_that_of_the_active_anchors() -> None:
+    frames = [make_scene(seed) for seed in (0, 1)]
+    batch, detector = make_batch("fine"), make_detector("fine").eval()
+    targets = [
+        assign_targets(SPEC.anchors, SPEC.classes, boxes, np.array([SPEC.class_names.index(name) for name in names]))
+        for _, boxes, names in frames
+    ]
+    size = targets[0].state.size
+    whole = TargetBatch(
+        torch.from_numpy(np.stack([each.state for each in targets])),
+        torch.from_numpy(np.concatenate([each.positives + i * size for i, each in enumerate(targets)])),
+        torch.from_numpy(np.concatenate([each.residuals for each in targets])),
+        torch.from_numpy(np.concatenate([each.directions for each in targets])),
+    )
+    assert batch.neck is not None
+    cells = batch.neck.head_cells.long()
+    with torch.inference_mode():
+        rows = detector(batch)
+    found = list(detector.loss(PillarOutputs(rows, batch.neck), LabeledPillars(batch, whole)).values())
+    # The same on whole maps, in which no other anchor takes part.
+    height, width = SPEC.grid.head_shape
+    maps = [torch.zeros(2 * height * width, part.shape[1]) for part in rows]
+    for part, row in zip(maps, rows, strict=True):
+        part[cells] = row
+    active = torch.zeros(2 * height * width, dtype=torch.bool)
+    active[cells] = True
+    anchors = whole.state.shape[-1]
+    kept = active[whole.positives // anchors]
+    assert 0 < kept.sum() <= len(kept)
+    state = torch.where(active.view(2, height, width, 1), whole.state, torch.tensor(-1, dtype=torch.int8))
+    masked = TargetBatch(state, whole.positives[kept], whole.residuals[kept], whole.directions[kept])
+    as_maps = type(rows)(*(part.view(2, height, width, -1).permute(0, 3, 1, 2) for part in maps))
+    for one, other in zip(found, detection_loss(as_maps, masked, LossConfig()), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_it_detects_and_an_empty_scan_finds_nothing() -> None:
+    detector = make_detector("fine").eval()
+    spec = SPEC.with_score_threshold(0.0)
+    assert len(ScanDetector(detector, spec)(make_scene(0)[0])) > 0
+    assert len(ScanDetector(detector, spec)(np.empty((0, 4), np.float32))) == 0
+
+
+def test_a_rule_that_cannot_grow_is_refused() -> None:
+    with pytest.raises(ConfigError, match="active_cells=sub"):
+        dataclasses.replace(NETWORK, neck="sparse", block_convs=(0, 1, 1))
+    dataclasses.replace(NETWORK, neck="sparse", block_convs=(0, 1, 1), active_cells="sub")
