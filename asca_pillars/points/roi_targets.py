@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
 from asca_pillars.points.refinement import encode_refinement
@@ -16,6 +17,7 @@ HARD_IOU = 0.1
 """Background from this overlap on is hard, below it easy."""
 _FOREGROUND_SHARE = 0.5
 _HARD_SHARE = 0.8  # of the background
+_BORDER_M = 0.1  # around a box, in which a keypoint is neither inside nor outside
 _CONFIDENCE_IOU = 0.25, 0.75  # where the confidence begins to rise from 0, and where it reaches 1
 
 
@@ -93,3 +95,15 @@ def roi_targets(
         residuals=encode_refinement(wanted, own),
         boxes=wanted,
     )
+
+
+def keypoint_states(
+    keypoints: NDArray[np.float32], boxes: NDArray[np.float32], labels: NDArray[np.int64]
+) -> NDArray[np.int8]:
+    """1 for keypoints in a labelled box, 0 outside of all, -1 without part: (K, 3), (N, 7), (N,) -> (K,).
+
+    No part take those within 0.1 m of a box's faces outside (PV-RCNN, section 3.3) and those in or at an IGNORED box.
+    """
+    inside, near = points_in_boxes(keypoints, boxes), points_in_boxes(keypoints, boxes, _BORDER_M)
+    in_object = (inside & (labels != IGNORED)).any(axis=1)
+    return np.where(in_object, 1, np.where(near.any(axis=1), -1, 0)).astype(np.int8)

@@ -12,6 +12,7 @@ from asca_pillars.points.roi_targets import (
     FOREGROUND_IOU,
     HARD_IOU,
     Overlaps,
+    keypoint_states,
     match_proposals,
     roi_targets,
     sample_rois,
@@ -91,3 +92,10 @@ def test_targets() -> None:
     np.testing.assert_allclose(back[targets.positive], np.stack([CAR] * 3), atol=1e-5)
     np.testing.assert_allclose(targets.residuals[~targets.positive], 0, atol=1e-6)
     assert (targets.boxes[[0, 1, 5]] == CAR).all()
+
+
+def test_keypoint_states() -> None:
+    boxes = np.stack([CAR, CAR + np.array([10, 0, 0, 0, 0, 0, 0], np.float32)])
+    x = np.array([10, 12.05, 12.2, 20, 22.05, 40], np.float32)
+    keypoints = np.stack([x, 0 * x, 0 * x - 1], axis=1)
+    assert keypoint_states(keypoints, boxes, np.array([0, IGNORED])).tolist() == [1, -1, 0, -1, -1, 0]
