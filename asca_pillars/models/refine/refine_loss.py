@@ -12,6 +12,9 @@ from asca_pillars.models.refine.pillar_refiner import Refinements
 
 _RESIDUAL_BETA, _CORNER_BETA = 1 / 9, 1.0
 _FOCAL_ALPHA, _FOCAL_GAMMA = 0.25, 2.0
+# Share of the keypoints that the focal loss is divided by at least. PV-RCNN divides by the positive ones whatever their
+# number; keypoints that stand near proposals alone can all be negative, and such a batch would outweigh all others.
+_LEAST_POSITIVE = 0.01
 
 
 class RefineTargets(NamedTuple):
@@ -50,12 +53,14 @@ def refine_loss(found: Refinements, targets: RefineTargets) -> RefineTerms:
     residuals, wanted = found.residuals.float()[positive], targets.residuals[positive]
     positives = max(len(wanted), 1)
     corners = corner_loss(residuals, wanted, targets.sizes[positive])
-    keypoints = focal_loss(found.keypoint_logits.float(), targets.keypoint_states, _FOCAL_ALPHA, _FOCAL_GAMMA)
+    states = targets.keypoint_states
+    keypoints = focal_loss(found.keypoint_logits.float(), states, _FOCAL_ALPHA, _FOCAL_GAMMA)
+    in_objects = max(int((states == 1).sum()), round(_LEAST_POSITIVE * len(states)), 1)
     return RefineTerms(
         confidence / max(len(positive), 1),
         F.smooth_l1_loss(residuals, wanted, beta=_RESIDUAL_BETA, reduction="sum") / positives,
         corners.sum() / positives,
-        keypoints / max(int((targets.keypoint_states == 1).sum()), 1),
+        keypoints / in_objects,
     )
 
 

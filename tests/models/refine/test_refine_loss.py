@@ -67,3 +67,13 @@ def test_nothing_positive_leaves_a_finite_loss_with_gradients() -> None:
     residuals = torch.zeros(2, 7, requires_grad=True)
     refine_loss(outputs([0.0, 0.0], residuals, [0.0]), targets([0, 0], [False, False], [0])).total.backward()
     assert torch.isfinite(residuals.grad).all()
+
+
+def test_a_batch_without_positive_keypoints_does_not_outweigh_others() -> None:
+    none, few = [0] * 1000, [1] * 10 + [0] * 990
+    logits = [-2.0] * 1000
+    losses = [
+        refine_loss(outputs([0.0], torch.zeros(1, 7), logits), targets([0], [False], states)).keypoints.item()
+        for states in (none, few)
+    ]
+    assert losses[0] < losses[1]
