@@ -4,26 +4,27 @@
     asca simulate data/check --frames 300 --seed 2026 --view camera
     python -m benchmarks.refine_gain data/sim data/check --minutes 10
 
-Without: the same proposals with the first stage's scores, through the same suppression.
+All rows are the same proposals through the same suppression.
 """
 
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import torch
 import typer
-from numpy.typing import NDArray
 from rich.console import Console
 
 from asca_export.bundle_first_stage import BundleFirstStage
-from asca_pillars.data.frames import read_frame, within_grid
+from asca_pillars.data.frames import read_frame, read_points, within_grid
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.files import atomic_path
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
@@ -35,7 +36,7 @@ from asca_pillars.second_stage.proposal_cache import ProposalCache
 from asca_pillars.second_stage.refine_geometry import RefineSettings
 from asca_pillars.second_stage.refine_sample import RefineSample, prepare_sample
 from asca_pillars.second_stage.refine_training import sample_batches, train_refiner
-from asca_pillars.second_stage.refined_detector import refine
+from asca_pillars.second_stage.refined_detector import judge
 from asca_pillars.system import cpu_model
 
 
@@ -52,6 +53,7 @@ def main(
     samples: Annotated[int, typer.Option(help="Points of a ball.")] = 16,
     learning_rate: Annotated[float, typer.Option()] = 3e-3,
     seed: Annotated[int, typer.Option()] = 0,
+    out: Annotated[Path | None, typer.Option(help="File for the weights.")] = None,
 ) -> None:
     """Train, evaluate and print."""
     console = Console(markup=False)
@@ -87,18 +89,32 @@ def main(
     parameters = sum(weight.numel() for weight in network.parameters())
     print(f"{cpu_model()}: {parameters} parameters, {steps} steps, {steps * batch_size} samples\n")
 
-    def without(points: NDArray[np.float32], frame_id: str) -> Detections:
-        proposals = caches[1].read(frame_id).proposals
-        return refined_detections(proposals, proposals.scores, np.zeros_like(proposals.boxes), stage.spec.post)
+    if out is not None:
+        with atomic_path(out) as temporary:
+            torch.save(network.state_dict(), temporary)
 
-    def refined(points: NDArray[np.float32], frame_id: str) -> Detections:
-        return refine(network, points, caches[1].read(frame_id), settings, stage.spec.post)
+    post, class_names = stage.spec.post, stage.spec.class_names
+    found = {}
+    for frame_id in checking.frame_ids:
+        proposed, points = caches[1].read(frame_id), read_points(checking, frame_id, camera_view=True)
+        found[frame_id] = proposed.proposals, judge(network, points, proposed, settings)
 
-    rows = [
-        (name, *(f"{ap:.1f}" for ap in moderate_ap(checking, stage.spec.class_names, form)))
-        for name, form in (("first stage", without), ("refined", refined))
-    ]
-    print(markdown_table(("3D AP, moderate, R40", *stage.spec.class_names), rows, left=1))
+    def detections(frame_id: str, new_scores: bool, new_boxes: bool) -> Detections:
+        proposals, (scores, residuals) = found[frame_id]
+        return refined_detections(
+            proposals, scores if new_scores else proposals.scores, residuals if new_boxes else 0 * residuals, post
+        )
+
+    rows = []
+    for name, scores, boxes in (
+        ("first stage", False, False),
+        ("its boxes, new scores", True, False),
+        ("its scores, new boxes", False, True),
+        ("refined", True, True),
+    ):
+        values = moderate_ap(checking, class_names, partial(detections, new_scores=scores, new_boxes=boxes))
+        rows.append((name, *(f"{value:.1f}" for value in values)))
+    print(markdown_table(("3D AP, moderate, R40", *class_names), rows, left=1))
 
 
 def build(bev_channels: int, classes: int, settings: RefineSettings, width: int) -> PillarRefiner:
@@ -110,13 +126,13 @@ def build(bev_channels: int, classes: int, settings: RefineSettings, width: int)
 
 
 def moderate_ap(
-    split: KittiSplit, class_names: tuple[str, ...], detect: Callable[[NDArray[np.float32], str], Detections]
+    split: KittiSplit, class_names: tuple[str, ...], detections: Callable[[str], Detections]
 ) -> list[float]:
     """3D AP of each class, moderate, R40, percent."""
     frame_ids = iter(split.frame_ids)
     truth = read_truth(split.folder / "label_2", split.frame_ids)
     with tempfile.TemporaryDirectory() as folder:
-        write_predictions(folder, split, lambda points: detect(points, next(frame_ids)))
+        write_predictions(folder, split, lambda _: detections(next(frame_ids)))
         frames = read_predictions(folder, truth, split.folder / "label_2")
     results = evaluate(frames.truth, frames.detections, class_names).overall
     curves = [results.curve(name, "3d", "moderate") for name in results.class_names]

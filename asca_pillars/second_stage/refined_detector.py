@@ -26,11 +26,16 @@ def refine(
         network: in evaluation mode, on the CPU.
         post: suppression among the refined boxes.
     """
-    proposals = proposed.proposals
-    if not len(proposals):
-        return proposals
-    inputs = collate_scans([refine_scan(points, proposed, proposals, settings)])
+    return refined_detections(proposed.proposals, *judge(network, points, proposed, settings), post)
+
+
+def judge(
+    network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Scores (R,) in [0, 1] and residuals (R, 7) of the proposals of one scan, see `refine`."""
+    if not len(proposed.proposals):
+        return np.empty(0, np.float32), np.empty((0, 7), np.float32)
+    inputs = collate_scans([refine_scan(points, proposed, proposed.proposals, settings)])
     with torch.inference_mode():
         found = network(inputs)
-    scores = torch.sigmoid(found.confidence).numpy()
-    return refined_detections(proposals, scores, found.residuals.numpy(), post)
+    return torch.sigmoid(found.confidence).numpy(), found.residuals.numpy()

@@ -64,6 +64,6 @@ class RoiHead(nn.Module):
             pool(keypoints, features, grid_points, index) for pool, index in zip(self.pools, indices, strict=True)
         ]
         grid = torch.cat(pooled, dim=1)  # (R * cells, C)
-        shared = self.shared(grid.reshape(len(roi_features), self.cells * grid.shape[1]))
+        shared = self.shared(grid.reshape(-1, self.cells * grid.shape[1]))
         joined = torch.cat([shared, roi_features], dim=1)
         return self.confidence(joined)[:, 0], self.residuals(joined)

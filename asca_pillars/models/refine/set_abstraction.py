@@ -41,7 +41,7 @@ class SetAbstraction(nn.Module):
         first: Tensor = self.layers[0].weight  # type: ignore[assignment]  # (widths[0], 3 + C)
         points = F.linear(torch.cat([positions, features], dim=1), first)  # (N, widths[0])
         points = F.pad(points, (0, 0, 0, 1))  # row N
-        found = (indices[:, :1] < len(positions)).to(points.dtype)
+        found = (indices[:, :1] < positions.shape[0]).to(points.dtype)
         centers = F.linear(queries, first[:, :3]) * found  # (Q, widths[0])
         grouped = points.index_select(0, indices.reshape(-1)).unflatten(0, indices.shape) - centers[:, None]
         return self._after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape).max(dim=1).values
@@ -50,7 +50,7 @@ class SetAbstraction(nn.Module):
         """`forward` as the equation is printed: the first layer once for each pair."""
         rows = F.pad(torch.cat([positions, features], dim=1), (0, 0, 0, 1))
         grouped = rows[indices]  # (Q, T, 3 + C)
-        found = (indices < len(positions)).to(rows.dtype)[..., None]
+        found = (indices < positions.shape[0]).to(rows.dtype)[..., None]
         relative = (grouped[..., :3] - queries[:, None]) * found
         pairs = torch.cat([relative, grouped[..., 3:]], dim=2).flatten(0, 1)
         return self._after_first(self.layers[0](pairs)).unflatten(0, indices.shape).max(dim=1).values
