@@ -82,6 +82,27 @@ def test_every_weight_learns() -> None:
     assert not still
 
 
+def test_gradients() -> None:
+    torch.manual_seed(0)
+    encode = KeypointEncoder(1, BEV_CHANNELS, radii=1, widths=(3,), out_channels=4)
+    network = PillarRefiner(encode, RoiHead(4, 2, 1, (3,), roi_channels=7, hidden=4, dropout=0.0)).double().eval()
+    settings = RefineSettings(ball_radii_m=(0.8,), ball_samples=3, grid_size=2, grid_radii_m=(1.6,), grid_samples=3)
+    frame, proposed = proposed_frame(0)
+    few = Proposed(proposed.proposals, proposed.keypoints[:12], proposed.bev[:12])
+    inputs = collate_scans([refine_scan(frame.points, few, few.proposals[:2], settings)])
+    inputs = inputs._replace(
+        **{
+            name: getattr(inputs, name).double()
+            for name in ("points", "keypoints", "bev", "grid_points", "roi_features")
+        }
+    )
+
+    def found(bev: torch.Tensor, roi_features: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(network(inputs._replace(bev=bev, roi_features=roi_features)))
+
+    assert torch.autograd.gradcheck(found, (inputs.bev.requires_grad_(), inputs.roi_features.requires_grad_()))
+
+
 def test_learns_one_frame_by_heart() -> None:
     network, frame_and_proposals = small_refiner(), proposed_frame(5)
     frame, proposed = frame_and_proposals
