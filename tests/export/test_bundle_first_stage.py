@@ -11,8 +11,8 @@ from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import export_bundle
 from asca_export.neck_output import add_neck_output
 from asca_pillars.errors import ExportError
-from asca_pillars.second_stage.checkpoint_first_stage import CheckpointFirstStage
 from asca_pillars.schema import to_dict
+from asca_pillars.second_stage.checkpoint_first_stage import CheckpointFirstStage
 from tests.export.tiny import SCANS, tiny_checkpoint
 
 
