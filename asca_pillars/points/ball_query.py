@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.points.columns import Columns, require_points, sort_into_columns
+from asca_pillars.points.columns import Columns, cells_of, require_points, sort_into_columns
 from asca_pillars.points.load_point_kernels import load_point_kernels
 
 # A column is a little narrower than a quarter of the radius: a ball has about 69 columns, and the first visited do not
@@ -83,10 +83,6 @@ def _visiting_order(radius: float) -> NDArray[np.int32]:
     return offsets
 
 
-def _column_of(values: NDArray[np.float32], low: np.float32, per_m: np.float32) -> NDArray[np.int64]:
-    return np.floor(np.clip((values - low) * per_m, np.float32(-1e6), np.float32(1e6))).astype(np.int64)
-
-
 def _ball_query(
     xyz: NDArray[np.float32],
     centers: NDArray[np.float32],
@@ -97,8 +93,7 @@ def _ball_query(
     share: int,
 ) -> NDArray[np.int32]:
     ny, nx = columns.shape
-    column = _column_of(centers[:, 0], columns.origin_m[0], columns.per_m)
-    row = _column_of(centers[:, 1], columns.origin_m[1], columns.per_m)
+    row, column = cells_of(centers, columns).T
     found = np.full((len(centers), samples), len(xyz), np.int32)
     counts = np.zeros(len(centers), np.int64)
     for first, (row_offset, column_offset) in itertools.product((True, False), offsets.tolist()):

@@ -56,6 +56,15 @@ def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
     return Columns(order, starts, low, per_m, (ny, nx))
 
 
+def cells_of(xyz: NDArray[np.float32], columns: Columns) -> NDArray[np.int64]:
+    """Row and column of each position (N, 3): (N, 2); beside the points below 0 or beyond `columns.shape`."""
+    along_x, along_y = (
+        np.clip((xyz[:, axis] - low) * columns.per_m, np.float32(-1e6), np.float32(1e6))
+        for axis, low in enumerate(columns.origin_m)
+    )
+    return np.floor(np.stack([along_y, along_x], axis=1)).astype(np.int64)
+
+
 def _sort(
     xyz: NDArray[np.float32], x_low: np.float32, y_low: np.float32, per_m: np.float32, ny: int, nx: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -8,7 +8,7 @@ import importlib, pkgutil, sys
 sys.modules["numba"] = None
 import asca_pillars.points
 for module in pkgutil.iter_modules(asca_pillars.points.__path__):
-    if module.name != "point_kernels":
+    if module.name not in ("ball_kernels", "sampling_kernels"):
         importlib.import_module(f"asca_pillars.points.{module.name}")
 import asca_pillars.second_stage.refine_geometry
 import numpy as np

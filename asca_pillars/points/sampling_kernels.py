@@ -1,4 +1,4 @@
-"""The loops over points, compiled; what they compute is said in `columns`, `farthest_points` and `ball_query`."""
+"""The loops of sorting and sampling, compiled; what they compute is said in `columns` and `farthest_points`."""
 
 import math
 from typing import Any
@@ -53,37 +53,13 @@ def near_circles(x: _Floats, y: _Floats, centers: _Floats, squared: _Floats) -> 
     return near
 
 
-def ball_query(
-    xyz: _Floats,
-    centers: _Floats,
-    columns: Columns,
-    offsets: _Integers,
-    squared_radius: np.float32,
-    samples: int,
-    share: int,
-) -> _Integers:
-    """`ball_query._ball_query`, query by query."""
-    found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
-    _ball_query(xyz, *_flat(columns), centers, offsets, squared_radius, share, sorted_xyz, found)
-    return found
-
-
-def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_Integers, _Floats]:
-    """`ball_query._three_nearest`, in rings of columns around each query."""
-    nearest = np.full((len(centers), 3), len(xyz), np.int32)
-    squared = np.full((len(centers), 3), np.inf, np.float32)
-    if len(xyz):
-        _three_nearest(xyz, *_flat(columns), centers, nearest, squared)
-    return nearest, squared
-
-
 def _flat(columns: Columns) -> tuple[Any, ...]:
     return columns.order, columns.starts, *columns.origin_m, columns.per_m, *columns.shape
 
 
 @inner
 def _column(value: Any, low: Any, per_m: Any) -> int:
-    """`ball_query._column_of` of one value."""
+    """`columns.cells_of` of one value."""
     return math.floor(min(max((value - low) * per_m, np.float32(-1e6)), np.float32(1e6)))
 
 
@@ -213,106 +189,3 @@ def _near_circles(x: _Floats, y: _Floats, centers: _Floats, squared: _Floats, ne
         for i in range(len(x)):
             dx, dy = x[i] - center_x, y[i] - center_y
             near[i] |= dx * dx + dy * dy < limit
-
-
-@compiled(
-    *(given(types.float32, 2), *_COLUMNS, given(types.float32, 2), given(types.int32, 2), types.float32),
-    *(types.int64, written(types.float32, 2), written(types.int32, 2)),
-)
-def _ball_query(
-    xyz: _Floats,
-    order: _Integers,
-    starts: _Integers,
-    x_low: float,
-    y_low: float,
-    per_m: float,
-    ny: int,
-    nx: int,
-    centers: _Floats,
-    offsets: _Integers,
-    squared_radius: float,
-    share: int,
-    sorted_xyz: _Floats,
-    found: _Integers,
-) -> None:
-    for k in range(len(order)):
-        for axis in range(3):
-            sorted_xyz[k, axis] = xyz[order[k], axis]
-    samples = found.shape[1]
-    for query in range(len(centers)):
-        x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
-        column, row = _column(x, x_low, per_m), _column(y, y_low, per_m)
-        count, begin, end, more = 0, 0, share, True
-        while more and count < samples:  # first the first `share` points of each column, then those after them
-            more = False
-            for visit in range(len(offsets)):
-                other_row, other_column = row + offsets[visit, 0], column + offsets[visit, 1]
-                if other_row < 0 or other_row >= ny or other_column < 0 or other_column >= nx:
-                    continue
-                cell, inside = other_row * nx + other_column, 0
-                for k in range(starts[cell], starts[cell + 1]):
-                    dx, dy, dz = sorted_xyz[k, 0] - x, sorted_xyz[k, 1] - y, sorted_xyz[k, 2] - z
-                    if dx * dx + dy * dy + dz * dz < squared_radius:
-                        inside += 1
-                        if inside > end:
-                            more = True
-                            break
-                        if inside > begin:
-                            found[query, count] = order[k]
-                            count += 1
-                            if count == samples:
-                                break
-                if count == samples:
-                    break
-            begin, end = share, len(order)
-        for rest in range(count, samples):
-            found[query, rest] = found[query, 0] if count else len(xyz)
-
-
-@compiled(
-    *(given(types.float32, 2), *_COLUMNS, given(types.float32, 2)),
-    *(written(types.int32, 2), written(types.float32, 2)),
-)
-def _three_nearest(
-    xyz: _Floats,
-    order: _Integers,
-    starts: _Integers,
-    x_low: float,
-    y_low: float,
-    per_m: float,
-    ny: int,
-    nx: int,
-    centers: _Floats,
-    nearest: _Integers,
-    squared: _Floats,
-) -> None:
-    for query in range(len(centers)):
-        x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
-        row = min(max(_column(y, y_low, per_m), 0), ny - 1)
-        column = min(max(_column(x, x_low, per_m), 0), nx - 1)
-        for ring in range(max(nx, ny)):
-            # What lies outside `ring - 1` rings is that many columns away, but for rounding.
-            clear = max(ring - np.float32(1.01), np.float32(0)) / per_m
-            if squared[query, 2] < clear * clear:
-                break
-            for other_row in range(max(row - ring, 0), min(row + ring, ny - 1) + 1):
-                step = 1 if abs(other_row - row) == ring else max(2 * ring, 1)
-                for other_column in range(column - ring, column + ring + 1, step):
-                    if other_column < 0 or other_column >= nx:
-                        continue
-                    cell = other_row * nx + other_column
-                    for k in range(starts[cell], starts[cell + 1]):
-                        i = order[k]
-                        dx, dy, dz = xyz[i, 0] - x, xyz[i, 1] - y, xyz[i, 2] - z
-                        distance = dx * dx + dy * dy + dz * dz
-                        place = 3
-                        while place and (
-                            distance < squared[query, place - 1]
-                            or (distance == squared[query, place - 1] and i < nearest[query, place - 1])
-                        ):
-                            if place < 3:
-                                squared[query, place] = squared[query, place - 1]
-                                nearest[query, place] = nearest[query, place - 1]
-                            place -= 1
-                        if place < 3:
-                            squared[query, place], nearest[query, place] = distance, i
