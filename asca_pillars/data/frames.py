@@ -52,10 +52,7 @@ def read_frame(
     Raises:
         DatasetError: a missing or damaged file, or an object of a class without a 3D box.
     """
-    calibration = split.calibration(frame_id)
-    points = read_scan(split.scan_path(frame_id)).points
-    if camera_view:
-        points = points[in_image(points, calibration, split.image_size_wh(frame_id))]
+    points = read_points(split, frame_id, camera_view=camera_view)
     known = {NEIGHBOR_TYPES[name]: IGNORED for name in class_names if name in NEIGHBOR_TYPES}
     known |= {name: index for index, name in enumerate(class_names)}
     objects = [item for item in split.objects(frame_id) if item.type in known]
@@ -64,10 +61,22 @@ def read_frame(
             f"{split.label_path(frame_id)}: a {flat[0]} has no 3D box, its sizes are not all positive; "
             "complete the line, or make it DontCare"
         )
-    boxes = boxes_from_objects(objects, calibration)
+    boxes = boxes_from_objects(objects, split.calibration(frame_id))
     labels = np.array([known[item.type] for item in objects], dtype=np.int64)
     labels[points_in_boxes(points, boxes).sum(axis=0) < min_points] = IGNORED
     return LabeledFrame(frame_id, points, boxes, labels)
+
+
+def read_points(split: KittiSplit, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
+    """Points (N, 4) of one frame, all of them or those that the camera sees.
+
+    Raises:
+        DatasetError, ScanError: a missing or damaged file.
+    """
+    points = read_scan(split.scan_path(frame_id)).points
+    if camera_view:
+        points = points[in_image(points, split.calibration(frame_id), split.image_size_wh(frame_id))]
+    return points
 
 
 def within_ranges(frame: LabeledFrame, ranges: Ranges) -> LabeledFrame:

@@ -115,9 +115,12 @@ def encode_boxes(
     ).astype(np.float32)
     # From the rounded residual, as the decoder will see it: a yaw within rounding of a bin's border must not
     # come back turned round.
-    yaw = residuals[..., 6].astype(np.float64) + anchor[..., 6]
-    direction = np.mod(yaw - _BIN_START_RAD, 2 * math.pi) >= math.pi
-    return residuals, direction.astype(np.int64)
+    return residuals, direction_bins(residuals[..., 6].astype(np.float64) + anchor[..., 6])
+
+
+def direction_bins(yaw_rad: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+    """Bin 0 or 1 of each yaw, any shape; the two directions of a heading are in different bins."""
+    return (np.mod(yaw_rad - _BIN_START_RAD, 2 * math.pi) >= math.pi).astype(np.int64)
 
 
 def decode_boxes(

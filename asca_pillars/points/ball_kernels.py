@@ -1,0 +1,147 @@
+"""The loops of `ball_query` and `three_nearest`, compiled; what they compute is said in `ball_query`, in NumPy."""
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.compiling import compiled, given, written
+from asca_pillars.points.columns import Columns, cells_of
+
+_Floats = NDArray[np.float32]
+_Integers = NDArray[np.int32]
+_Cells = NDArray[np.int64]
+
+_COLUMNS = given(types.int32), given(types.int32), types.int64, types.int64
+
+
+def ball_query(
+    xyz: _Floats,
+    centers: _Floats,
+    columns: Columns,
+    offsets: _Integers,
+    squared_radius: np.float32,
+    samples: int,
+    share: int,
+) -> _Integers:
+    """`ball_query._ball_query`, query by query."""
+    found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
+    at = centers, cells_of(centers, columns)
+    ball = offsets, squared_radius, share
+    _ball_query(xyz, columns.order, columns.starts, *columns.shape, *at, *ball, sorted_xyz, found)
+    return found
+
+
+def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_Integers, _Floats]:
+    """`ball_query._three_nearest`, in rings of columns around each query."""
+    nearest = np.full((len(centers), 3), len(xyz), np.int32)
+    squared = np.full((len(centers), 3), np.inf, np.float32)
+    if len(xyz):
+        at = centers, cells_of(centers, columns)
+        _three_nearest(xyz, columns.order, columns.starts, *columns.shape, *at, columns.per_m, nearest, squared)
+    return nearest, squared
+
+
+@compiled(
+    *(
+        given(types.float32, 2),
+        *_COLUMNS,
+        given(types.float32, 2),
+        given(types.int64, 2),
+        given(types.int32, 2),
+        types.float32,
+    ),
+    *(types.int64, written(types.float32, 2), written(types.int32, 2)),
+)
+def _ball_query(
+    xyz: _Floats,
+    order: _Integers,
+    starts: _Integers,
+    ny: int,
+    nx: int,
+    centers: _Floats,
+    cells: _Cells,
+    offsets: _Integers,
+    squared_radius: float,
+    share: int,
+    sorted_xyz: _Floats,
+    found: _Integers,
+) -> None:
+    for k in range(len(order)):
+        for axis in range(3):
+            sorted_xyz[k, axis] = xyz[order[k], axis]
+    samples = found.shape[1]
+    for query in range(len(centers)):
+        x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
+        row, column = cells[query, 0], cells[query, 1]
+        count, begin, end, more = 0, 0, share, True
+        while more and count < samples:  # first the first `share` points of each column, then those after them
+            more = False
+            for visit in range(len(offsets)):
+                other_row, other_column = row + offsets[visit, 0], column + offsets[visit, 1]
+                if other_row < 0 or other_row >= ny or other_column < 0 or other_column >= nx:
+                    continue
+                cell, inside = other_row * nx + other_column, 0
+                for k in range(starts[cell], starts[cell + 1]):
+                    dx, dy, dz = sorted_xyz[k, 0] - x, sorted_xyz[k, 1] - y, sorted_xyz[k, 2] - z
+                    if dx * dx + dy * dy + dz * dz < squared_radius:
+                        inside += 1
+                        if inside > end:
+                            more = True
+                            break
+                        if inside > begin:
+                            found[query, count] = order[k]
+                            count += 1
+                            if count == samples:
+                                break
+                if count == samples:
+                    break
+            begin, end = share, len(order)
+        for rest in range(count, samples):
+            found[query, rest] = found[query, 0] if count else len(xyz)
+
+
+@compiled(
+    *(given(types.float32, 2), *_COLUMNS, given(types.float32, 2), given(types.int64, 2), types.float32),
+    *(written(types.int32, 2), written(types.float32, 2)),
+)
+def _three_nearest(
+    xyz: _Floats,
+    order: _Integers,
+    starts: _Integers,
+    ny: int,
+    nx: int,
+    centers: _Floats,
+    cells: _Cells,
+    per_m: float,
+    nearest: _Integers,
+    squared: _Floats,
+) -> None:
+    for query in range(len(centers)):
+        x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
+        row, column = min(max(cells[query, 0], 0), ny - 1), min(max(cells[query, 1], 0), nx - 1)
+        for ring in range(max(nx, ny)):
+            # What lies outside `ring - 1` rings is that many columns away, but for rounding.
+            clear = max(ring - np.float32(1.01), np.float32(0)) / per_m
+            if squared[query, 2] < clear * clear:
+                break
+            for other_row in range(max(row - ring, 0), min(row + ring, ny - 1) + 1):
+                step = 1 if abs(other_row - row) == ring else max(2 * ring, 1)
+                for other_column in range(column - ring, column + ring + 1, step):
+                    if other_column < 0 or other_column >= nx:
+                        continue
+                    cell = other_row * nx + other_column
+                    for k in range(starts[cell], starts[cell + 1]):
+                        i = order[k]
+                        dx, dy, dz = xyz[i, 0] - x, xyz[i, 1] - y, xyz[i, 2] - z
+                        distance = dx * dx + dy * dy + dz * dz
+                        place = 3
+                        while place and (
+                            distance < squared[query, place - 1]
+                            or (distance == squared[query, place - 1] and i < nearest[query, place - 1])
+                        ):
+                            if place < 3:
+                                squared[query, place] = squared[query, place - 1]
+                                nearest[query, place] = nearest[query, place - 1]
+                            place -= 1
+                        if place < 3:
+                            squared[query, place], nearest[query, place] = distance, i

@@ -1,0 +1,67 @@
+"""Keypoints: farthest-point sampling (PointNet++, arXiv 1706.02413, section 3.2), exact."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.points.columns import require_points, sort_into_columns
+from asca_pillars.points.load_point_kernels import load_point_kernels
+
+_COLUMN_M = 1.5  # 1 to 3 m take about as long
+
+
+def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
+    """Indices of points that lie far from each other, in the order in which they are taken.
+
+    The first point, then again and again the one whose nearest taken point is farthest, by squared distance in
+    float32; of equally far ones the earlier. numba's form keeps the points in columns and looks only into those that
+    a new sample can change; it takes the same points.
+
+    Args:
+        points: (N, 3 or more) finite x, y, z in metres; N may be 0.
+        count: how many; fewer come out where there are fewer different positions.
+
+    Raises:
+        ValueError: another shape, or a coordinate that is not finite.
+    """
+    xyz = require_points(points)
+    if not len(xyz) or count < 1:
+        return np.empty(0, np.int32)
+    kernels = load_point_kernels()
+    if kernels is None:
+        return _farthest_points(xyz, count)
+    return np.asarray(kernels.farthest_points(xyz, count, sort_into_columns(xyz, _COLUMN_M)))
+
+
+def near_boxes(points: NDArray[Any], boxes: NDArray[np.floating[Any]], margin_m: float) -> NDArray[np.bool_]:
+    """Which points stand within `margin_m` of the circles around boxes seen from above: (N, >= 3), (R, 7) -> (N,).
+
+    Keypoints are worth more where proposals are (PV-RCNN++, arXiv 2102.00463, section 4.1).
+    """
+    x, y = (np.ascontiguousarray(points[:, axis], np.float32) for axis in range(2))
+    centers = boxes[:, :2].astype(np.float32)
+    reach = (np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + margin_m).astype(np.float32)
+    squared = reach * reach
+    kernels = load_point_kernels()
+    if kernels is not None:
+        return np.asarray(kernels.near_circles(x, y, centers, squared))
+    near = np.zeros(len(points), bool)
+    for (center_x, center_y), limit in zip(centers, squared, strict=True):
+        dx, dy = x - center_x, y - center_y
+        near |= dx * dx + dy * dy < limit
+    return near
+
+
+def _farthest_points(xyz: NDArray[np.float32], count: int) -> NDArray[np.int32]:
+    chosen = [0]
+    x, y, z = np.ascontiguousarray(xyz.T)
+    nearest = np.full(len(xyz), np.inf, np.float32)
+    while len(chosen) < count:
+        dx, dy, dz = x - x[chosen[-1]], y - y[chosen[-1]], z - z[chosen[-1]]
+        np.minimum(nearest, dx * dx + dy * dy + dz * dz, out=nearest)
+        farthest = int(nearest.argmax())
+        if nearest[farthest] == 0:
+            break
+        chosen.append(farthest)
+    return np.array(chosen, np.int32)

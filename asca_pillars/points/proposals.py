@@ -1,0 +1,67 @@
+"""Which boxes of the first stage the second looks at."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.detector_spec import DetectorSpec
+
+
+@dataclass(frozen=True)
+class ProposalSettings:
+    """How a first stage's head maps become proposals."""
+
+    score_threshold: float = 0.05
+    """Of every class: the second stage judges again, and cannot bring back what is not proposed."""
+    nms_iou: float = 0.7
+    """Boxes of a class that overlap less are both proposed."""
+    candidates: int = 300
+    """Best boxes of each class that enter the suppression."""
+    quotas: tuple[int, ...] = (20, 20, 10)
+    """Proposals of each class at most, so that classes with low scores are not crowded out."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
+    def __post_init__(self) -> None:
+        for name, value in (("score_threshold", self.score_threshold), ("nms_iou", self.nms_iou)):
+            if not 0 <= value <= 1:
+                raise ConfigError(f"{name} {value:g} of the proposals must lie between 0 and 1")
+        for name, values in (("candidates", (self.candidates,)), ("quotas", self.quotas)):
+            if min(values, default=0) < 1:
+                raise ConfigError(f"{name} {list(values)} of the proposals must be at least 1")
+
+
+def propose(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, settings: ProposalSettings) -> Detections:
+    """Proposals of one scan, best first.
+
+    Args:
+        maps: of the detector that `spec` describes; its thresholds and suppression give way to those of `settings`.
+
+    Raises:
+        ValueError: not one quota for each class.
+    """
+    classes = tuple(replace(item, score_threshold=settings.score_threshold) for item in spec.classes)
+    # Room for every candidate: the quotas choose, not a common limit.
+    post = PostProcess(settings.nms_iou, settings.candidates, settings.candidates * len(classes))
+    return best_of_each_class(decode(maps, spec.anchors, classes, post), settings.quotas)
+
+
+def best_of_each_class(detections: Detections, quotas: Sequence[int]) -> Detections:
+    """The best `quotas[label]` detections of each class, in the order in which they come.
+
+    Raises:
+        ValueError: not one quota for each class.
+    """
+    if len(quotas) != len(detections.class_names):
+        raise ValueError(f"{len(quotas)} quotas for the {len(detections.class_names)} classes {detections.class_names}")
+    kept: list[NDArray[np.int64]] = []
+    for label, quota in enumerate(quotas):
+        own = np.flatnonzero(detections.labels == label)
+        kept.append(own[np.argsort(-detections.scores[own], kind="stable")[:quota]])
+    return detections[np.sort(np.concatenate(kept))]

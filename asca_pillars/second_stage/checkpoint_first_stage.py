@@ -1,0 +1,45 @@
+"""A checkpoint as the first stage of two."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from asca_pillars.errors import TrainingError
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.second_stage.first_stage import FirstPass
+
+
+class CheckpointFirstStage:
+    """A trained pillar detector in PyTorch, on the CPU; see `second_stage.first_stage.FirstStage`.
+
+    Args:
+        path: checkpoint of `asca train`.
+
+    Raises:
+        TrainingError: not a checkpoint of a pillar detector, damaged, or made by an incompatible version.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        checkpoint = load_checkpoint(path)
+        if not isinstance(checkpoint.detector, PillarDetector):
+            raise TrainingError(f"{path}: model.kind {checkpoint.config.model.kind}; a first stage is of kind pillar")
+        self._network = checkpoint.detector
+        self.spec = checkpoint.config.model.spec
+        with Path(path).open("rb") as file:
+            self.identity = hashlib.file_digest(file, "sha256").hexdigest()
+
+    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+        """See `FirstStage`."""
+        network, batch = self._network, batch_pillars([self.spec.pillarize(points)])
+        with torch.inference_mode():
+            pillars = network.encode(batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars)
+            neck = network.neck(network.scatter(pillars, batch.cells, batch.frame_pillars))
+            maps = network.head(neck)
+        channels_last = np.ascontiguousarray(neck[0].permute(1, 2, 0).numpy())
+        return FirstPass(HeadMaps(*(part[0].float().numpy() for part in maps)), channels_last)

@@ -1,0 +1,86 @@
+"""Proposals of a first stage for every frame of a split, computed once: the first stage is frozen meanwhile."""
+
+import hashlib
+import json
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from asca_pillars.data.frames import read_points
+from asca_pillars.data.insertion.prepared import require_writable, writing
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.schema import to_dict
+from asca_pillars.second_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
+
+_FORMAT = 1  # of the files; another number lets old ones lie
+
+
+class ProposalCache:
+    """Files below `prepared`/proposals-KEY, one for each frame; KEY names the first stage and the settings.
+
+    Args:
+        prepared: folder of what is computed once per dataset, see `data.insertion.prepared`.
+        camera_view: whether the first stage sees only the points in the image.
+    """
+
+    def __init__(
+        self, prepared: Path, stage: FirstStage, settings: FirstStageSettings, *, camera_view: bool = True
+    ) -> None:
+        self.stage, self.settings, self.camera_view = stage, settings, camera_view
+        about = {"format": _FORMAT, "stage": stage.identity, "camera_view": camera_view, **to_dict(settings)}
+        key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
+        self.folder = prepared / f"proposals-{key}"
+
+    def fill(self, split: KittiSplit, *, console: Console | None = None) -> None:
+        """Compute what is missing. Each file appears when it is complete, so that a killed run is simply gone on with.
+
+        Raises:
+            DatasetError, ScanError: a frame cannot be read, or a file not written.
+        """
+        missing = [frame_id for frame_id in split.frame_ids if not self.path(frame_id).is_file()]
+        if missing:
+            require_writable(self.folder)
+        for frame_id in track(missing, "Proposing", console=console, disable=console is None):
+            found = propose_on(self.stage, read_points(split, frame_id, camera_view=self.camera_view), self.settings)
+            with writing(self.path(frame_id)) as temporary, temporary.open("wb") as file:
+                np.savez(file, allow_pickle=False, **_arrays(found))
+
+    def read(self, frame_id: str) -> Proposed:
+        """What `fill` computed of a frame.
+
+        Raises:
+            DatasetError: its file is missing or damaged.
+        """
+        path = self.path(frame_id)
+        try:
+            # Opened here: NumPy leaves a file that it cannot read open.
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                detections = Detections(
+                    arrays["boxes"], arrays["scores"], arrays["labels"], self.stage.spec.class_names
+                )
+                return Proposed(detections, arrays["keypoints"], arrays["bev"].astype(np.float32))
+        except FileNotFoundError:
+            raise DatasetError(f"{path}: no proposals of this frame; compute them first") from None
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise DatasetError(f"{path}: damaged ({error}); delete it, it will be computed again") from None
+
+    def path(self, frame_id: str) -> Path:
+        """The frame's file."""
+        return self.folder / f"{frame_id}.npz"
+
+
+def _arrays(found: Proposed) -> dict[str, NDArray[np.generic]]:
+    proposals = found.proposals
+    return {
+        "boxes": proposals.boxes,
+        "scores": proposals.scores,
+        "labels": proposals.labels,
+        "keypoints": found.keypoints,
+        "bev": found.bev.astype(np.float16),  # the bulk of the file, and more digits than a feature is worth
+    }

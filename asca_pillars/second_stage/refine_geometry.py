@@ -1,0 +1,95 @@
+"""What the host computes for the second stage of one scan: neighbours of keypoints and of the grids of proposals."""
+
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.points.ball_query import ball_query
+from asca_pillars.points.farthest_points import near_boxes
+from asca_pillars.points.roi_grid import roi_grid_points
+from asca_pillars.second_stage.first_stage import Proposed
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """Balls and grids of the second stage."""
+
+    ball_radii_m: tuple[float, ...] = (0.4, 0.8)
+    """Around keypoints, in which raw points are aggregated."""
+    ball_samples: int = 16
+    grid_size: int = 4
+    """Grid points along each axis of a proposal."""
+    grid_radii_m: tuple[float, ...] = (0.8, 1.6)
+    """Around grid points, in which keypoints are aggregated."""
+    grid_samples: int = 16
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if min(value if isinstance(value, tuple) else (value,), default=0) <= 0:
+                raise ConfigError(f"{field.name} {value} of the second stage must be positive")
+
+
+@dataclass(frozen=True)
+class RefineScan:
+    """One scan as the second stage takes it; `models.refine.pillar_refiner.RefineInputs` says what each array is."""
+
+    points: NDArray[np.float32]
+    keypoints: NDArray[np.float32]
+    bev: NDArray[np.float32]
+    ball_indices: tuple[NDArray[np.int32], ...]
+    grid_points: NDArray[np.float32]
+    grid_indices: tuple[NDArray[np.int32], ...]
+    roi_features: NDArray[np.float32]
+
+
+def refine_scan(
+    points: NDArray[np.float32], proposed: Proposed, proposals: Detections, settings: RefineSettings
+) -> RefineScan:
+    """Neighbours for some proposals of a scan, in their order.
+
+    Args:
+        points: (N, 4) of the scan.
+        proposed: what the first stage says of it.
+        proposals: those of them to be refined.
+    """
+    keypoints = proposed.keypoints
+    # Points that no ball around a keypoint can reach are not worth sorting.
+    all_boxes = proposed.proposals.boxes
+    margin_m = max(settings.ball_radii_m) + _keypoint_margin_m(keypoints, all_boxes)
+    near = np.ascontiguousarray(points[near_boxes(points, all_boxes, margin_m)])
+    grid_points = roi_grid_points(proposals.boxes, settings.grid_size).reshape(-1, 3)
+    return RefineScan(
+        points=near,
+        keypoints=keypoints,
+        bev=proposed.bev,
+        ball_indices=tuple(ball_query(near, keypoints, r, settings.ball_samples) for r in settings.ball_radii_m),
+        grid_points=grid_points,
+        grid_indices=tuple(ball_query(keypoints, grid_points, r, settings.grid_samples) for r in settings.grid_radii_m),
+        roi_features=roi_features(proposals),
+    )
+
+
+def roi_features(proposals: Detections) -> NDArray[np.float32]:
+    """What pooling does not tell of a proposal: class (one of them 1), logit of its score, length, width, height.
+
+    (R, classes + 4). One head serves all classes, which differ in what a good box looks like.
+    """
+    classes = np.eye(len(proposals.class_names), dtype=np.float32)[proposals.labels]
+    score = np.clip(proposals.scores, 1e-4, 1 - 1e-4)[:, None]
+    return np.concatenate([classes, np.log(score / (1 - score)), proposals.boxes[:, 3:6]], axis=1, dtype=np.float32)
+
+
+def _keypoint_margin_m(keypoints: NDArray[np.float32], boxes: NDArray[np.float32]) -> float:
+    """How far a keypoint stands from the circle around the nearest box, at most."""
+    if not len(keypoints) or not len(boxes):
+        return 0.0
+    reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
+    away = np.hypot(*(keypoints[:, None, axis] - boxes[None, :, axis] for axis in range(2))) - reach
+    return max(float(away.min(axis=1).max()), 0.0)

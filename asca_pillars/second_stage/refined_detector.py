@@ -1,0 +1,41 @@
+"""The second stage at work on single scans in PyTorch."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.decode import PostProcess
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.models.refine.pillar_refiner import PillarRefiner
+from asca_pillars.points.refined_detections import refined_detections
+from asca_pillars.second_stage.first_stage import Proposed
+from asca_pillars.second_stage.refine_geometry import RefineSettings, refine_scan
+from asca_pillars.second_stage.refine_sample import collate_scans
+
+
+def refine(
+    network: PillarRefiner,
+    points: NDArray[np.float32],
+    proposed: Proposed,
+    settings: RefineSettings,
+    post: PostProcess,
+) -> Detections:
+    """Refine the proposals of one scan (N, 4); a scan without any has no detections.
+
+    Args:
+        network: in evaluation mode, on the CPU.
+        post: suppression among the refined boxes.
+    """
+    return refined_detections(proposed.proposals, *judge(network, points, proposed, settings), post)
+
+
+def judge(
+    network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Scores (R,) in [0, 1] and residuals (R, 7) of the proposals of one scan, see `refine`."""
+    if not len(proposed.proposals):
+        return np.empty(0, np.float32), np.empty((0, 7), np.float32)
+    inputs = collate_scans([refine_scan(points, proposed, proposed.proposals, settings)])
+    with torch.inference_mode():
+        found = network(inputs)
+    return torch.sigmoid(found.confidence).numpy(), found.residuals.numpy()

@@ -1,0 +1,54 @@
+"""A bundle as the first stage of two."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from asca_deploy import providers
+from asca_deploy.bundle import BACKBONE, find_bundle
+from asca_deploy.manifest import load_bundle
+from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_export.neck_output import NECK, add_neck_output
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.second_stage.first_stage import FirstPass
+
+
+class BundleFirstStage:
+    """A float32 bundle in onnxruntime, see `second_stage.first_stage.FirstStage`.
+
+    Args:
+        bundle: folder, or name of one that ships.
+        threads: of onnxruntime.
+
+    Raises:
+        BundleError: the bundle is missing or damaged.
+        ExportError: it is not in float32.
+    """
+
+    def __init__(self, bundle: str | Path, *, threads: int = 1) -> None:
+        folder = find_bundle(bundle)
+        manifest = load_bundle(folder)
+        self._pipeline = PillarPipeline(folder, manifest, threads=threads)
+        self._canvas = self._pipeline.new_canvas()
+        model = add_neck_output(onnx.load(folder / manifest.graphs[BACKBONE].file))
+        with tempfile.TemporaryDirectory() as temporary:
+            path = Path(temporary) / manifest.graphs[BACKBONE].file
+            onnx.save(model, path)
+            self._backbone = providers.open_session(path, "cpu", "float32", threads)
+        self.identity = " ".join(graph.sha256 for graph in manifest.graphs.values())
+
+    @property
+    def spec(self) -> DetectorSpec:
+        """Of the bundle."""
+        return self._pipeline.spec
+
+    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+        """See `FirstStage`."""
+        pillars = self._pipeline.pillarize(points)
+        image = self._canvas.scatter(self._pipeline.encode(pillars), pillars.cells)
+        *maps, neck = self._backbone.run((*HeadMaps._fields, NECK), {"canvas": image})
+        return FirstPass(HeadMaps(*(np.moveaxis(values[0], -1, 0) for values in maps)), neck[0])

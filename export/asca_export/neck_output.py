@@ -1,0 +1,28 @@
+"""The neck's map as one more output of a backbone's graph: what a second stage reads of the first."""
+
+import onnx
+from onnx import TensorProto, helper
+
+from asca_pillars.errors import ExportError
+
+NECK = "neck"
+
+
+def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
+    """A copy of a float backbone that also returns its head's input (1, H, W, C), named NECK; the rest stays as it is.
+
+    Raises:
+        ExportError: the graph has no such tensor in floating point.
+    """
+    model = onnx.ModelProto()
+    model.CopyFrom(backbone)
+    joined = [node for node in model.graph.node if node.op_type == "Concat"]
+    types = {value.name: value.type.tensor_type for value in onnx.shape_inference.infer_shapes(model).graph.value_info}
+    kind = types.get(joined[-1].output[0]) if joined else None
+    if kind is None or kind.elem_type != TensorProto.FLOAT or len(kind.shape.dim) != 4:
+        raise ExportError("the backbone's graph joins no maps in floating point; give a bundle in float32")
+    shape = [size.dim_value for size in kind.shape.dim]
+    model.graph.node.append(helper.make_node("Identity", [joined[-1].output[0]], [NECK]))
+    model.graph.output.append(helper.make_tensor_value_info(NECK, TensorProto.FLOAT, shape))
+    onnx.checker.check_model(model)
+    return model

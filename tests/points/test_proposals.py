@@ -1,0 +1,27 @@
+"""Quotas of proposals."""
+
+import numpy as np
+import pytest
+
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.points.proposals import best_of_each_class
+
+
+def found(labels: list[int], scores: list[float]) -> Detections:
+    boxes = np.arange(len(labels), dtype=np.float32)[:, None] * np.ones(7, np.float32)
+    return Detections(boxes, np.array(scores, np.float32), np.array(labels, np.int64), ("Car", "Cyclist"))
+
+
+def test_each_class_has_its_own_quota() -> None:
+    kept = best_of_each_class(found([0, 0, 1, 0, 1, 1], [0.9, 0.8, 0.7, 0.6, 0.1, 0.2]), (2, 2))
+    assert kept.boxes[:, 0].tolist() == [0, 1, 2, 5]
+
+
+def test_nothing_and_less_than_the_quota() -> None:
+    assert len(best_of_each_class(Detections.empty(("Car", "Cyclist")), (5, 5))) == 0
+    assert len(best_of_each_class(found([1], [0.1]), (5, 5))) == 1
+
+
+def test_one_quota_for_each_class() -> None:
+    with pytest.raises(ValueError, match="1 quotas for the 2 classes"):
+        best_of_each_class(found([1], [0.1]), (5,))

@@ -1,0 +1,45 @@
+"""From proposals, scores and residuals to detections."""
+
+import numpy as np
+
+from asca_pillars.geometry.decode import PostProcess
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.points.refined_detections import refined_detections
+from asca_pillars.points.refinement import encode_refinement
+
+NAMES = ("Car", "Cyclist")
+POST = PostProcess(nms_iou=0.1, max_detections=3)
+
+
+def at(*x_m: float) -> np.ndarray:
+    return np.array([[x, 0, -1, 4, 2, 1.5, 0.1] for x in x_m], np.float32)
+
+
+def refined(boxes: np.ndarray, to: np.ndarray, labels: list[int], scores: list[float]) -> Detections:
+    proposals = Detections(boxes, np.full(len(boxes), 0.5, np.float32), np.array(labels, np.int64), NAMES)
+    return refined_detections(proposals, np.array(scores, np.float32), encode_refinement(to, boxes), POST)
+
+
+def test_boxes_move_and_new_scores_order_them() -> None:
+    found = refined(at(10, 30, 50), at(11, 31, 51), [0, 0, 1], [0.2, 0.9, 0.6])
+    np.testing.assert_allclose(found.boxes, at(31, 51, 11), atol=1e-5)
+    np.testing.assert_allclose(found.scores, [0.9, 0.6, 0.2])
+    assert found.names == ["Car", "Cyclist", "Car"]
+
+
+def test_what_comes_to_the_same_place_is_found_once_in_each_class() -> None:
+    found = refined(at(10, 12, 10, 40, 60), at(11, 11, 11, 40, 60), [0, 0, 1, 0, 0], [0.3, 0.8, 0.7, 0.2, 0.1])
+    np.testing.assert_allclose(found.boxes, at(11, 11, 40), atol=1e-5)
+    assert found.labels.tolist() == [0, 1, 0], "three at most"
+
+
+def test_what_is_not_finite_is_left_out() -> None:
+    residuals = np.zeros((3, 7), np.float32)
+    residuals[0, 0] = np.nan
+    proposals = Detections(at(10, 30, 50), np.full(3, 0.5, np.float32), np.zeros(3, np.int64), NAMES)
+    found = refined_detections(proposals, np.array([0.9, np.nan, 0.5], np.float32), residuals, POST)
+    np.testing.assert_allclose(found.boxes, at(50), atol=1e-5)
+
+
+def test_no_proposals() -> None:
+    assert len(refined_detections(Detections.empty(NAMES), np.empty(0, np.float32), np.empty((0, 7)), POST)) == 0
