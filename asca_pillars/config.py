@@ -171,11 +171,11 @@ class AugmentConfig(Strict):
 
 @dataclass(frozen=True)
 class DataConfig(Strict):
-    """What is read from the KITTI-layout folder.
+    """What is read from a dataset.
 
     Attributes:
         train_set, val_set: names of lists in ImageSets/.
-        camera_view: keep only points that the camera sees; KITTI labels nothing else.
+        camera_view: keep only points that the camera sees, where the dataset has a camera; KITTI labels nothing else.
         min_points: an object with fewer points inside its box is neither a positive nor a negative.
         workers: processes that load and augment.
         prepared: folder for what is computed once per dataset; if not given, prepared/ in the dataset's folder.

@@ -19,7 +19,7 @@ import typer
 from rich.console import Console
 
 from asca_export.bundle_first_stage import BundleFirstStage
-from asca_pillars.data.frames import read_frame, read_points, within_ranges
+from asca_pillars.data.frames import read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
@@ -96,7 +96,7 @@ def main(
     post, class_names = stage.spec.post, stage.spec.class_names
     found = {}
     for frame_id in checking.frame_ids:
-        proposed, points = caches[1].read(frame_id), read_points(checking, frame_id, camera_view=True)
+        proposed, points = caches[1].read(frame_id), checking.points(frame_id, camera_view=True)
         found[frame_id] = proposed.proposals, judge(network, points, proposed, settings)
 
     def detections(frame_id: str, new_scores: bool, new_boxes: bool) -> Detections:

@@ -1,4 +1,4 @@
-"""`asca eval`: a model or finished predictions against labels, as KITTI or Waymo score them."""
+"""`asca eval`: a model or finished predictions against labels, by one of four protocols."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,7 +15,10 @@ def evaluate(
     ] = None,
     *,
     data: Annotated[
-        Path | None, typer.Option("--data", "-d", help="KITTI-layout folder whose labels count; a model is run on it.")
+        Path | None,
+        typer.Option(
+            "--data", "-d", help="Dataset whose labels count (KITTI's layout or a dataset.yaml); a model is run on it."
+        ),
     ] = None,
     split: Annotated[
         str, typer.Option("--split", help="A list of ImageSets/, or training for every frame; with --data.")
@@ -24,7 +27,8 @@ def evaluate(
         Path | None,
         typer.Option(
             "--predictions",
-            help="Folder of KITTI text with scores, instead of a model; a file per frame, empty if nothing was found.",
+            help="Instead of a model: a folder of KITTI text with scores, a file per frame, empty if nothing was "
+            "found; for iou and distance the detections.jsonl of asca detect, or such a .csv.",
         ),
     ] = None,
     labels: Annotated[
@@ -54,12 +58,14 @@ def evaluate(
         ),
     ] = 0.05,
     protocol: Annotated[
-        Literal["kitti", "waymo"],
+        Literal["kitti", "waymo", "iou", "distance"] | None,
         typer.Option(
             "--protocol",
-            help="kitti: AP and AOS of Car, Pedestrian and Cyclist. waymo: AP and APH of any class by level and range.",
+            help="kitti: AP and AOS of Car, Pedestrian and Cyclist. waymo: AP and APH of any class by level and range. "
+            "iou: AP of any class, 3D and BEV. distance: nuScenes' and Argoverse 2's metrics. "
+            "Default: kitti; iou for a dataset without a camera.",
         ),
-    ] = "kitti",
+    ] = None,
     provider: ProviderOption = "cpu",
     precision: PrecisionOption = None,
     threads: ThreadsOption = None,
@@ -67,6 +73,7 @@ def evaluate(
     """Score a model, or finished predictions, by KITTI's protocol: AP and AOS, by distance, recall and precision.
 
     With --protocol waymo by Waymo's metric: AP and APH at LEVEL_1 and LEVEL_2, everywhere and by range.
+    With --protocol iou or distance any class by its boxes in the LiDAR frame, all around; no camera is needed.
     Frames without a prediction file are left out, as by KITTI's own tool, and named in every form of the report.
 
     Example: asca eval runs/small/checkpoints/last.ckpt --data data/sim
@@ -79,8 +86,18 @@ def evaluate(
     from asca_pillars.evaluation.predictions import read_predictions, read_truth
 
     console = Console(markup=False)
+    if protocol is None:
+        protocol = steps.default_protocol(data)
+    if protocol in ("iou", "distance"):
+        from asca_pillars.commands import eval_boxes
+
+        box_task = eval_boxes.BoxTask(protocol, data, split, out, json, score, min_score)
+        options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
+        eval_boxes.check_arguments(box_task, model, predictions, labels, gallery)
+        eval_boxes.evaluate_boxes(box_task, options, predictions, console)
+        return
     steps.check_arguments(model, data, predictions, labels, gallery, score)
-    steps.check_protocol(protocol, gallery, score)
+    steps.check_protocol(protocol, data, gallery, score)
     steps.claim(out)
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:

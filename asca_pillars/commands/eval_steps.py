@@ -11,6 +11,7 @@ from rich.console import Console
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
@@ -61,7 +62,8 @@ def claim(out: Path) -> None:
     Raises:
         OutputError: there is; names it.
     """
-    require_own(out, COMMAND, "report.json", "waymo.json", f"predictions/{MADE_BY}", text='"')
+    reports = "report.json", "waymo.json", "iou.json", "distance.json"
+    require_own(out, COMMAND, *reports, f"predictions/{MADE_BY}", text='"')
     for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
         require_replaceable(out / folder, COMMAND, marker)
 
@@ -95,9 +97,16 @@ def check_arguments(
         raise ConfigError(f"--score {score} must be a number")
 
 
-def check_protocol(protocol: str, gallery_frames: int | None, score: float | None) -> None:
+def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
+    """KITTI's, unless the dataset has no camera."""
+    return "kitti" if data is None or open_split(data).has_camera else "iou"
+
+
+def check_protocol(protocol: str, data: Path | None, gallery_frames: int | None, score: float | None) -> None:
     if protocol not in get_args(Protocol):
-        raise ConfigError(f"--protocol {protocol}: choose {' or '.join(get_args(Protocol))}")
+        raise ConfigError(f"--protocol {protocol}: choose {', '.join(get_args(Protocol))}, iou or distance")
+    if data is not None and not open_split(data).has_camera:
+        raise ConfigError(f"--protocol {protocol}: {data} has no camera, which it needs; choose iou or distance")
     if protocol == "waymo" and (gallery_frames or score is not None):
         option = f"--gallery {gallery_frames}" if gallery_frames else f"--score {score:g}"
         raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")

@@ -9,7 +9,9 @@ from asca_pillars.commands.options import JsonOption
 
 
 def inspect(
-    data: Annotated[Path, typer.Argument(help="KITTI-layout folder with training/ and ImageSets/.")],
+    data: Annotated[
+        Path, typer.Argument(help="Folder of a dataset: KITTI's layout, or with a dataset.yaml (docs/DATA.md).")
+    ],
     *,
     config: Annotated[Path, typer.Option("--config", "-c", help="YAML to train with, or the name of one that ships.")],
     split: Annotated[
@@ -33,14 +35,15 @@ def inspect(
     from asca_pillars.config import load_config
     from asca_pillars.data.inspection.findings import findings
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
-    from asca_pillars.data.kitti import KittiSplit
+    from asca_pillars.data.open_split import open_split
     from asca_pillars.errors import DatasetError
     from asca_pillars.files import write_json
 
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
-    spec, min_points, view = settings.model.spec, settings.data.min_points, settings.data.camera_view
-    frames_of = KittiSplit(data, settings.data.train_set if split is None else split)
+    spec, min_points = settings.model.spec, settings.data.min_points
+    frames_of = open_split(data, settings.data.train_set if split is None else split)
+    view = settings.data.camera_view and frames_of.has_camera
     inspection = inspect_dataset(frames_of, spec, settings.data, frames=frames, progress=True)
     found = findings(inspection, spec, min_points)
     if json is not None:

@@ -35,7 +35,10 @@ PrecisionOption = Annotated[
 ThreadsOption = Annotated[
     int | None, typer.Option("--threads", help="CPU threads. Default: the physical cores granted to the process.")
 ]
-DataOption = Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with training/ and ImageSets/.")]
+DataOption = Annotated[
+    Path,
+    typer.Option("--data", "-d", help="Folder of a dataset: KITTI's layout, or with a dataset.yaml (docs/DATA.md)."),
+]
 ConfigArgument = Annotated[
     Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")
 ]

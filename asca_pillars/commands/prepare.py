@@ -30,13 +30,14 @@ def prepare(
     require("train")
     from asca_pillars.data.insertion.free_maps import prepare_free_spaces
     from asca_pillars.data.insertion.insert_objects import prepare_inserter
-    from asca_pillars.data.kitti import KittiSplit
+    from asca_pillars.data.open_split import open_split
 
     # A config that is not decided yet gets what either method needs.
     insert = settings.augment.insert
     insert = insert if insert.method != "none" else replace(insert, method="rs_aug")
-    spec, view = settings.model.spec, settings.data.camera_view
-    split = KittiSplit(data, settings.data.train_set)
+    spec = settings.model.spec
+    split = open_split(data, settings.data.train_set)
+    view = settings.data.camera_view and split.has_camera
     inserter = prepare_inserter(split, spec, settings.data, insert)
     if insert.method == "rs_aug":
         prepare_free_spaces(split, inserter.prepared, camera_view=view, workers=workers)

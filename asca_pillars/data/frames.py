@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import DatasetError
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.ranges import Ranges
@@ -35,7 +33,7 @@ class LabeledFrame:
 
 
 def read_frame(
-    split: KittiSplit, frame_id: str, class_names: Sequence[str], *, camera_view: bool = True, min_points: int = 1
+    split: LabeledSplit, frame_id: str, class_names: Sequence[str], *, camera_view: bool = True, min_points: int = 1
 ) -> LabeledFrame:
     """Points and labelled boxes of one frame.
 
@@ -52,31 +50,13 @@ def read_frame(
     Raises:
         DatasetError: a missing or damaged file, or an object of a class without a 3D box.
     """
-    points = read_points(split, frame_id, camera_view=camera_view)
+    points = split.points(frame_id, camera_view=camera_view)
     known = {NEIGHBOR_TYPES[name]: IGNORED for name in class_names if name in NEIGHBOR_TYPES}
     known |= {name: index for index, name in enumerate(class_names)}
-    objects = [item for item in split.objects(frame_id) if item.type in known]
-    if flat := [item.type for item in objects if not item.has_box_3d]:
-        raise DatasetError(
-            f"{split.label_path(frame_id)}: a {flat[0]} has no 3D box, its sizes are not all positive; "
-            "complete the line, or make it DontCare"
-        )
-    boxes = boxes_from_objects(objects, split.calibration(frame_id))
-    labels = np.array([known[item.type] for item in objects], dtype=np.int64)
+    boxes, types = split.labeled_boxes(frame_id, known)
+    labels = np.array([known[kind] for kind in types], dtype=np.int64)
     labels[points_in_boxes(points, boxes).sum(axis=0) < min_points] = IGNORED
     return LabeledFrame(frame_id, points, boxes, labels)
-
-
-def read_points(split: KittiSplit, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
-    """Points (N, 4) of one frame, all of them or those that the camera sees.
-
-    Raises:
-        DatasetError, ScanError: a missing or damaged file.
-    """
-    points = read_scan(split.scan_path(frame_id)).points
-    if camera_view:
-        points = points[in_image(points, split.calibration(frame_id), split.image_size_wh(frame_id))]
-    return points
 
 
 def within_ranges(frame: LabeledFrame, ranges: Ranges) -> LabeledFrame:

@@ -43,14 +43,7 @@ class ScoredFrames:
     @property
     def shortage(self) -> str | None:
         """One sentence that belongs beside every number if not all frames were evaluated; None if all were."""
-        if not self.without_predictions:
-            return None
-        first, *others = self.without_predictions
-        more = f" and {len(others)} {'other' if len(others) == 1 else 'others'}" if others else ""
-        return (
-            f"evaluated on {len(self)} of {self.asked} frames: no prediction file for {first}{more}; "
-            "a frame without detections needs an empty file"
-        )
+        return shortage(len(self), self.without_predictions, "no prediction file", "needs an empty file")
 
     @property
     def foreign_types(self) -> dict[str, tuple[int, int]]:
@@ -66,6 +59,21 @@ class ScoredFrames:
             for key, name in sorted(names.items())
             if key not in FOLDED_KITTI_TYPES
         }
+
+
+def shortage(evaluated: int, without: Sequence[str], missing: str, remedy: str) -> str | None:
+    """That frames without predictions were left out, what they lack, and what one without detections would have.
+
+    None if there is no such frame.
+    """
+    if not without:
+        return None
+    first, *others = without
+    more = f" and {len(others)} {'other' if len(others) == 1 else 'others'}" if others else ""
+    return (
+        f"evaluated on {evaluated} of {evaluated + len(without)} frames: {missing} for {first}{more}; "
+        f"a frame without detections {remedy}"
+    )
 
 
 def read_truth(folder: str | Path, frame_ids: Sequence[str] | None = None) -> list[FrameObjects]:

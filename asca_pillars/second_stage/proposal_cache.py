@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from asca_pillars.data.frames import read_points
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError
@@ -47,7 +46,7 @@ class ProposalCache:
         if missing:
             require_writable(self.folder)
         for frame_id in track(missing, "Proposing", console=console, disable=console is None):
-            found = propose_on(self.stage, read_points(split, frame_id, camera_view=self.camera_view), self.settings)
+            found = propose_on(self.stage, split.points(frame_id, camera_view=self.camera_view), self.settings)
             with writing(self.path(frame_id)) as temporary, temporary.open("wb") as file:
                 np.savez(file, allow_pickle=False, **_arrays(found))
 

@@ -12,7 +12,8 @@ from asca_pillars.config import AugmentConfig, Config
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
-from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import AscaError
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.models.build import build_preparation
@@ -74,7 +75,7 @@ class Collate:
         )
 
 
-class KittiDataset(Dataset[Sample | AscaError]):
+class LabeledDataset(Dataset[Sample | AscaError]):
     """Frames of one ImageSets list, augmented where `augmentation` is given.
 
     What a sample holds depends on the seed, the epoch and the frame alone, not on the number of workers or on what
@@ -94,7 +95,7 @@ class KittiDataset(Dataset[Sample | AscaError]):
 
     def __init__(
         self,
-        split: KittiSplit,
+        split: LabeledSplit,
         spec: DetectorSpec,
         preparation: Preparation,
         *,
@@ -142,18 +143,18 @@ class KittiDataset(Dataset[Sample | AscaError]):
         return Sample(frame, self.preparation.prepare(frame, rng))
 
 
-def open_dataset(root: str | Path, config: Config, *, training: bool) -> KittiDataset:
+def open_dataset(root: str | Path, config: Config, *, training: bool) -> LabeledDataset:
     """The training or the validation frames that `config` asks for; the object database is built if it is missing.
 
     Raises:
         DatasetError: a missing list, scan, label or calibration file; a class to insert that no frame has.
     """
     data, spec, insert = config.data, config.model.spec, config.augment.insert
-    split = KittiSplit(root, data.train_set if training else data.val_set)
+    split = open_split(root, data.train_set if training else data.val_set)
     inserter = None
     if training and insert.method != "none":
         inserter = prepare_inserter(split, spec, data, insert)
-    return KittiDataset(
+    return LabeledDataset(
         split,
         spec,
         build_preparation(config.model),

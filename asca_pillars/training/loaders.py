@@ -9,7 +9,7 @@ import lightning as L  # noqa: N812  (Lightning's own convention)
 from torch.utils.data import DataLoader
 
 from asca_pillars.config import Config
-from asca_pillars.training.dataset import Collate, KittiDataset, open_dataset
+from asca_pillars.training.dataset import Collate, LabeledDataset, open_dataset
 from asca_pillars.training.sampler import EpochSampler
 
 
@@ -30,7 +30,7 @@ class DetectionData(L.LightningDataModule):
         """All validation frames in order."""
         return self._loader(self.validation_set, None)
 
-    def _loader(self, frames: KittiDataset, step: Callable[[], int] | None) -> DataLoader[Any]:
+    def _loader(self, frames: LabeledDataset, step: Callable[[], int] | None) -> DataLoader[Any]:
         trainer = self.trainer
         sampler = EpochSampler(
             len(frames),

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from rich.console import Console
 
 from asca_pillars.config import Config, TrainConfig
+from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
@@ -42,14 +44,14 @@ def train(
     num_nodes: int = 1,
     init: str | Path | None = None,
 ) -> Path:
-    """Train `config` on a KITTI-layout folder, or go on where an interrupted run in `out` stopped.
+    """Train `config` on a dataset, or go on where an interrupted run in `out` stopped.
 
     `out` receives config.yaml (resolved), environment.json, expected_input.yaml, TensorBoard logs and
     checkpoints/{last,previous,best,weights}.ckpt.
 
     Args:
         config: what to train.
-        data_root: folder with training/ and ImageSets/.
+        data_root: a dataset's folder, see `data.open_split`.
         out: folder of this run; one run with the same config in it is resumed exactly. With the `step` schedule it
             may be made longer by more `train.epochs`, and is then what the longer run would have been.
         devices: number of devices on this machine, or `auto`.
@@ -67,6 +69,9 @@ def train(
     """
     out = Path(out)
     checkpoints = out / "checkpoints"
+    # What the run records of itself must hold for its checkpoint: without a camera it has seen whole scans.
+    view = config.data.camera_view and open_split(data_root).has_camera
+    config = replace(config, data=replace(config.data, camera_view=view))
     data = DetectionData(config, data_root)
     claim(out, config)
     remove_leftovers(checkpoints)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.data.frames import read_points
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.second_stage.first_stage import FirstStageSettings, propose_on
@@ -24,7 +23,7 @@ def test_reads_what_was_computed(split: KittiSplit, tmp_path: Path) -> None:
     cache = ProposalCache(tmp_path, stage, SETTINGS)
     cache.fill(split)
     for frame_id in split.frame_ids:
-        wanted = propose_on(RandomStage(), read_points(split, frame_id, camera_view=True), SETTINGS)
+        wanted = propose_on(RandomStage(), split.points(frame_id, camera_view=True), SETTINGS)
         found = cache.read(frame_id)
         for name in ("boxes", "scores", "labels"):
             np.testing.assert_array_equal(getattr(found.proposals, name), getattr(wanted.proposals, name))

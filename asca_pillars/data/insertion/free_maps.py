@@ -12,13 +12,12 @@ from rich.progress import track
 from asca_pillars.data.insertion.free_space import CELLS_PER_NODE, FreeSpace, find_free_space
 from asca_pillars.data.insertion.ground_fit import Ground
 from asca_pillars.data.insertion.prepared import require_writable, writing
-from asca_pillars.data.kitti import KittiSplit, in_image
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.data.labeled_split import LabeledSplit
 
 VERSION = 1  # of what is computed; files of another version are computed again
 
 
-def prepare_free_spaces(split: KittiSplit, prepared: Path, *, camera_view: bool, workers: int) -> None:
+def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: bool, workers: int) -> None:
     """Make the files of all frames of a list that are missing or outdated.
 
     Raises:
@@ -31,30 +30,25 @@ def prepare_free_spaces(split: KittiSplit, prepared: Path, *, camera_view: bool,
             pass
 
 
-def load_free_space(split: KittiSplit, frame_id: str, prepared: Path, *, camera_view: bool) -> FreeSpace:
+def load_free_space(split: LabeledSplit, frame_id: str, prepared: Path, *, camera_view: bool) -> FreeSpace:
     """The free space of a frame from its file below `prepared`; computed and kept there if missing or outdated.
 
     Raises:
         DatasetError: the calibration cannot be read, or the folder cannot be written.
         ScanError: the scan cannot be read.
     """
-    path = prepared / "free_space" / split.folder.name / ("camera" if camera_view else "full") / f"{frame_id}.npz"
+    path = prepared / "free_space" / split.pool / ("camera" if camera_view else "full") / f"{frame_id}.npz"
     stamp = _stamp(split, frame_id)
     if (space := _read(path, stamp)) is not None:
         return space
-    points = read_scan(split.scan_path(frame_id)).points
-    if camera_view:
-        points = points[in_image(points, split.calibration(frame_id), split.image_size_wh(frame_id))]
-    space = find_free_space(points)
+    space = find_free_space(split.points(frame_id, camera_view=camera_view))
     _write(path, stamp, space)
     return space
 
 
-def _stamp(split: KittiSplit, frame_id: str) -> NDArray[np.int64]:
+def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
     """What tells that the files which the map was made from are still the same."""
-    states = [path.stat() for path in (split.scan_path(frame_id), split.calib_path(frame_id))]
-    numbers = [number for state in states for number in (state.st_size, state.st_mtime_ns)]
-    return np.array([VERSION, *split.image_size_wh(frame_id), *numbers])
+    return np.array([VERSION, *split.points_state(frame_id)])
 
 
 def _read(path: Path, stamp: NDArray[np.int64]) -> FreeSpace | None:
@@ -86,5 +80,5 @@ def _write(path: Path, stamp: NDArray[np.int64], space: FreeSpace) -> None:
         )
 
 
-def _prepare(split: KittiSplit, prepared: Path, camera_view: bool, frame_id: str) -> None:
+def _prepare(split: LabeledSplit, prepared: Path, camera_view: bool, frame_id: str) -> None:
     load_free_space(split, frame_id, prepared, camera_view=camera_view)

@@ -24,7 +24,7 @@ from rich.progress import track
 
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.insertion.prepared import require_writable, writing
-from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.boxes import points_in_boxes
 
 VERSION = 1
@@ -90,7 +90,7 @@ class ObjectDatabase:
 
 
 def prepare_database(
-    split: KittiSplit, class_names: Sequence[str], prepared: Path, *, camera_view: bool
+    split: LabeledSplit, class_names: Sequence[str], prepared: Path, *, camera_view: bool
 ) -> ObjectDatabase:
     """The database of a list's frames: the one on disk if nothing has changed since, else a new one.
 
@@ -121,10 +121,10 @@ def prepare_database(
     return ObjectDatabase(path)
 
 
-def _key(split: KittiSplit, built_from: dict[str, Any]) -> str:
+def _key(split: LabeledSplit, built_from: dict[str, Any]) -> str:
     digest = hashlib.sha256(json.dumps(built_from).encode())
     for frame_id in split.frame_ids:
-        for path in (split.scan_path(frame_id), split.label_path(frame_id), split.calib_path(frame_id)):
+        for path in split.input_paths(frame_id):
             # A file that is missing is reported, in words, by whoever reads it.
             state = path.stat() if path.exists() else None
             digest.update(f"{path.name} {state and (state.st_size, state.st_mtime_ns)}\n".encode())

@@ -27,7 +27,7 @@ from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_
 from asca_pillars.data.insertion.free_space import FreeSpace
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
 from asca_pillars.data.insertion.prepared import prepared_folder
-from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.geometry.ranges import Ranges
@@ -50,7 +50,7 @@ class Inserter:
         shares: probability of each class.
     """
 
-    split: KittiSplit
+    split: LabeledSplit
     settings: InsertConfig
     ranges: Ranges
     camera_view: bool
@@ -70,7 +70,7 @@ class Inserter:
         return load_free_space(self.split, frame_id, self.prepared, camera_view=self.camera_view)
 
 
-def prepare_inserter(split: KittiSplit, spec: DetectorSpec, data: DataConfig, insert: InsertConfig) -> Inserter:
+def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, insert: InsertConfig) -> Inserter:
     """Build or find the object database, and work out how often each class is to be drawn.
 
     Raises:
@@ -144,6 +144,6 @@ def insert_objects(frame: LabeledFrame, inserter: Inserter, rng: np.random.Gener
     return scene.frame_with_inserted(inserter.min_points)
 
 
-def _labeled_boxes(split: KittiSplit, frame_id: str) -> NDArray[np.float32]:
+def _labeled_boxes(split: LabeledSplit, frame_id: str) -> NDArray[np.float32]:
     """Every labelled object's box (K, 7), whatever its type: nothing may be put into a lorry either."""
-    return boxes_from_objects(objects_3d(split.objects(frame_id)), split.calibration(frame_id))
+    return split.labeled_boxes(frame_id).boxes

@@ -1,4 +1,4 @@
-"""What a detector is going to be trained on: a KITTI-layout dataset measured against a configuration.
+"""What a detector is going to be trained on: a dataset measured against a configuration.
 
 `measurements` measures a frame, this module a dataset, and `findings` says what is wrong with it.
 """
@@ -14,7 +14,7 @@ from rich.progress import track
 
 from asca_pillars.config import DataConfig
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
-from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError, ScanError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.geometry.overlap import aligned_bev_iou
@@ -131,12 +131,12 @@ class Inspection:
 
 
 def inspect_dataset(
-    split: KittiSplit, spec: PillarSpec, data: DataConfig, *, frames: int = 500, progress: bool = False
+    split: LabeledSplit, spec: PillarSpec, data: DataConfig, *, frames: int = 500, progress: bool = False
 ) -> Inspection:
     """Measure `frames` evenly spaced frames of a split, or all of them if there are fewer.
 
     Args:
-        split: a list of a KITTI-layout folder.
+        split: a list of a dataset.
         spec: grid, limits and classes that are to be trained on it.
         data: how its frames are to be read.
         frames: how many are looked at.
@@ -146,7 +146,7 @@ def inspect_dataset(
         DatasetError: a list, scan, calibration or label file is missing, anywhere in the split.
         DatasetError, ScanError: no frame can be read.
     """
-    _require_files(split)
+    split.require_files()
     in_split = len(split.frame_ids)
     wanted = min(frames, in_split)
     measured: list[FrameMeasure] = []
@@ -170,16 +170,6 @@ def inspect_dataset(
         scans=_scan_facts([frame.scan for frame in measured], spec),
         damaged=tuple(map(str, damaged)),
     )
-
-
-def _require_files(split: KittiSplit) -> None:
-    """Of every frame, not of the inspected ones only: training would stop at the first that lacks one."""
-    paths = [path(frame_id) for path in (split.calib_path, split.label_path) for frame_id in split.frame_ids]
-    if missing := [path for path in paths if not path.exists()]:
-        raise DatasetError(
-            f"{missing[0]}: not there ({len(missing)} of {len(paths)} calibration and label files of '{split.name}' "
-            "are missing); every frame needs both, a label file may be empty"
-        )
 
 
 def _class_facts(frames: Sequence[FrameMeasure], index: int, detector: PillarSpec, min_points: int) -> ClassFacts:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from asca_pillars.config import DataConfig
 from asca_pillars.data.expected_input import ground_z_m
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
-from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.scans.scan_reader import stored_points
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
@@ -70,7 +69,7 @@ class FrameMeasure(NamedTuple):
     scan: ScanMeasure
 
 
-def measure_frame(split: KittiSplit, frame_id: str, spec: PillarSpec, data: DataConfig) -> FrameMeasure:
+def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: DataConfig) -> FrameMeasure:
     """Read a frame without random changes, match it with the anchors, and count.
 
     Raises:
@@ -83,13 +82,13 @@ def measure_frame(split: KittiSplit, frame_id: str, spec: PillarSpec, data: Data
     outcomes, positives = match(to_find, spec)
     own = frame.labels != IGNORED
     return FrameMeasure(
-        types=Counter(item.type for item in split.objects(frame_id)),
+        types=Counter(split.label_types(frame_id)),
         boxes=frame.boxes[own],
         labels=frame.labels[own],
         points=points[own],
         outcomes=outcomes[own],
         positives=positives,
-        scan=measure_scan(stored_points(split.scan_path(frame_id)), frame.points, spec),
+        scan=measure_scan(split.stored_points(frame_id), frame.points, spec),
     )
 
 

@@ -8,13 +8,18 @@ root/training/velodyne/000000.bin   root/testing/velodyne/...
 """
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, read_calibration
-from asca_pillars.data.kitti.kitti_labels import KittiObject, read_labels
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, in_image, read_calibration
+from asca_pillars.data.kitti.kitti_labels import KittiObject, boxes_from_objects, objects_3d, read_labels
+from asca_pillars.data.labeled_split import LabeledBoxes
+from asca_pillars.data.scans.scan_reader import read_scan, stored_points
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 
@@ -31,6 +36,13 @@ class KittiSplit:
 
     root: str | Path
     name: str = "training"
+
+    has_camera = True
+
+    @property
+    def pool(self) -> str:
+        """training or testing."""
+        return self.folder.name
 
     @property
     def folder(self) -> Path:
@@ -52,7 +64,7 @@ class KittiSplit:
             )
         if self.name in ("training", "testing"):
             return tuple(sorted(scans))
-        wanted = _read_image_set(Path(self.root), self.name)
+        wanted = read_image_set(Path(self.root), self.name)
         if missing := sorted(wanted - scans):
             raise DatasetError(
                 f"{self.scan_path(missing[0])}: listed in ImageSets/{self.name}.txt but not there "
@@ -104,6 +116,56 @@ class KittiSplit:
             )
         return size[0], size[1]
 
+    def input_paths(self, frame_id: str) -> tuple[Path, ...]:
+        """Scan, labels and calibration."""
+        return self.scan_path(frame_id), self.label_path(frame_id), self.calib_path(frame_id)
+
+    def require_files(self) -> None:
+        """Raise DatasetError unless every frame has a calibration and labels."""
+        paths = [path(frame_id) for path in (self.calib_path, self.label_path) for frame_id in self.frame_ids]
+        if missing := [path for path in paths if not path.exists()]:
+            raise DatasetError(
+                f"{missing[0]}: not there ({len(missing)} of {len(paths)} calibration and label files of '{self.name}' "
+                "are missing); every frame needs both, a label file may be empty"
+            )
+
+    def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
+        """(N, 4) of the scan, LiDAR frame; with `camera_view` those that the camera sees."""
+        points = read_scan(self.scan_path(frame_id)).points
+        if camera_view:
+            points = points[in_image(points, self.calibration(frame_id), self.image_size_wh(frame_id))]
+        return points
+
+    def stored_points(self, frame_id: str) -> NDArray[np.float32]:
+        """(N, 4) as the file has them."""
+        return stored_points(self.scan_path(frame_id))
+
+    def points_state(self, frame_id: str) -> tuple[int, ...]:
+        """Size of the image; size and time of scan and calibration."""
+        states = [path.stat() for path in (self.scan_path(frame_id), self.calib_path(frame_id))]
+        numbers = [number for state in states for number in (state.st_size, state.st_mtime_ns)]
+        return (*self.image_size_wh(frame_id), *numbers)
+
+    def label_types(self, frame_id: str) -> list[str]:
+        """The type of every label, DontCare included."""
+        return [item.type for item in self.objects(frame_id)]
+
+    def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
+        """The frame's boxes in the LiDAR frame: those of `types`, or all that have a 3D box.
+
+        Raises:
+            DatasetError: missing or damaged labels or calibration; an object of `types` without a 3D box.
+        """
+        calibration = self.calibration(frame_id)
+        objects = self.objects(frame_id)
+        chosen = objects_3d(objects) if types is None else [item for item in objects if item.type in types]
+        if flat := [item.type for item in chosen if not item.has_box_3d]:
+            raise DatasetError(
+                f"{self.label_path(frame_id)}: a {flat[0]} has no 3D box, its sizes are not all positive; "
+                "complete the line, or make it DontCare"
+            )
+        return LabeledBoxes(boxes_from_objects(chosen, calibration), tuple(item.type for item in chosen))
+
 
 def write_image_set(root: str | Path, name: str, frame_ids: Iterable[str]) -> None:
     """Write ImageSets/<name>.txt, one frame id per line."""
@@ -111,10 +173,15 @@ def write_image_set(root: str | Path, name: str, frame_ids: Iterable[str]) -> No
         temporary.write_text("".join(f"{frame_id}\n" for frame_id in frame_ids), encoding="utf-8")
 
 
-def _read_image_set(root: Path, name: str) -> set[str]:
+def read_image_set(root: Path, name: str) -> set[str]:
+    """The frame ids in ImageSets/<name>.txt.
+
+    Raises:
+        DatasetError: there is no such list, or it is empty or no text.
+    """
     path = root / "ImageSets" / f"{name}.txt"
     try:
-        frame_ids = set(path.read_text(encoding="utf-8").split())
+        frame_ids = {line.strip() for line in path.read_text(encoding="utf-8").splitlines()} - {""}
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not UTF-8 text; write one frame id per line") from None
     except OSError as error:

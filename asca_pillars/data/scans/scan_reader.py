@@ -90,15 +90,19 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
     return common_scale([(one.reflectance, one.dtype) for one in stored if one.reflectance is not None])
 
 
-def stored_points(path: Path) -> NDArray[np.float32]:
-    """The numbers of a `.bin` scan as they are stored, (N, 4): of any reflectance scale, perhaps not finite.
+def stored_points(path: Path, *, columns: int | None = 4) -> NDArray[np.float32]:
+    """The numbers of a scan as they are stored, (N, 4): of any reflectance scale, perhaps not finite.
+
+    Args:
+        path: the file.
+        columns: float32 values per point of a `.bin`, as in `read_scan`.
 
     Raises:
-        ScanError: they are no whole number of points.
+        ScanError: as `read_scan`.
     """
-    stored = read_raw_floats(path, 4)
-    assert stored.reflectance is not None, "of four columns"
-    return np.column_stack([stored.xyz, stored.reflectance.astype(np.float32)])
+    stored = _read_stored(path, columns)
+    reflectance = np.zeros(len(stored.xyz)) if stored.reflectance is None else stored.reflectance
+    return np.column_stack([stored.xyz, reflectance.astype(np.float32)]).astype(np.float32, copy=False)
 
 
 def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:

@@ -1,0 +1,110 @@
+"""The steps of `asca eval --protocol iou` and `distance`: any class, boxes in the LiDAR frame, no camera."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from asca_pillars.commands.eval_steps import COMMAND, MADE_BY, TEXT_SCORE, claim
+from asca_pillars.commands.models import Model, open_model
+from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.open_split import open_split
+from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.evaluation.boxes.box_predictions import BoxFrames, read_box_predictions, write_box_predictions
+from asca_pillars.evaluation.boxes.box_report import BoxProtocol, box_json, box_notes, box_report, box_tables
+from asca_pillars.evaluation.boxes.fixed_scores import fixed_scores
+from asca_pillars.evaluation.report import markdown_page, print_tables
+from asca_pillars.files import atomic_directory, atomic_path, write_json
+from asca_pillars.system import describe_environment
+
+PREDICTIONS = "detections.jsonl"
+
+
+@dataclass(frozen=True)
+class BoxTask:
+    """What is evaluated, how, and where the report goes; the options of `asca eval` by the same names."""
+
+    protocol: BoxProtocol
+    data: Path | None
+    split: str
+    out: Path
+    json: Path | None
+    score: float | None
+    min_score: float
+
+
+def check_arguments(
+    task: BoxTask, model: Path | None, predictions: Path | None, labels: Path | None, gallery: int | None
+) -> None:
+    option = f"--protocol {task.protocol}"
+    if task.data is None:
+        raise ConfigError(f"{option} needs the labels: give --data ROOT")
+    if predictions is not None and model is not None:
+        raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
+    if labels is not None:
+        raise ConfigError(f"--labels {labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
+    if gallery:
+        raise ConfigError(f"--gallery {gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes")
+    if task.score is not None and not math.isfinite(task.score):
+        raise ConfigError(f"--score {task.score} must be a number")
+
+
+def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | None, console: Console) -> None:
+    """Evaluate by IoU or by distance; print and write the tables, the JSON, and the model's predictions."""
+    assert task.data is not None, "checked with the arguments"
+    claim(task.out)
+    split = open_split(task.data, task.split)
+    about: dict[str, Any] = {"data": str(task.data), "split": task.split}
+    if predictions is None:
+        model = open_model(options, task.min_score)
+        frames = _run(model, split, task, console)
+        class_names = model.spec.class_names
+        scores = {one.name: one.score_threshold if task.score is None else task.score for one in model.spec.classes}
+        subject, about = f"{model.name} on {task.data}, {task.split}", about | {"model": model.about}
+    else:
+        frames = read_box_predictions(predictions, split, console=console)
+        class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.found_types}))
+        scores = dict.fromkeys(class_names, TEXT_SCORE if task.score is None else task.score)
+        subject, about = f"{predictions} against {task.data}", about | {"predictions": str(predictions)}
+    _require_common_class(frames, class_names, task.data)
+    about["environment"] = json.loads(describe_environment())
+    at_score = fixed_scores(frames.frames, class_names, scores)
+    report = box_report(subject, task.protocol, frames, class_names, at_score, about)
+    tables, notes = box_tables(report), box_notes(report)
+    print_tables(report.title, tables, notes, console)
+    content = box_json(report)
+    for path in (task.json, task.out / f"{task.protocol}.json"):
+        if path is not None:
+            write_json(path, content)
+    with atomic_path(task.out / f"{task.protocol}.md") as temporary:
+        temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
+    console.print(f"Written to {task.out}/", highlight=False)
+
+
+def _run(model: Model, split: LabeledSplit, task: BoxTask, console: Console) -> BoxFrames:
+    """Run the model and write what it finds: what is scored is read from there, so that it can be scored again."""
+    with atomic_directory(task.out / "predictions", COMMAND, MADE_BY) as folder:
+        write_box_predictions(folder / PREDICTIONS, split, model.detect, console=console)
+        about = {"model": model.about, "data": str(split.root), "split": split.name, "files": [PREDICTIONS]}
+        write_json(folder / MADE_BY, about)
+    if model.unlike:
+        console.print(
+            f"{len(model.unlike)} of {len(split.frame_ids)} scans are unlike those that {model.name} was trained on; "
+            f"the first: {model.unlike[0]}",
+            style="yellow",
+            soft_wrap=True,
+        )
+    return read_box_predictions(task.out / "predictions" / PREDICTIONS, split, console=console)
+
+
+def _require_common_class(frames: BoxFrames, class_names: tuple[str, ...], data: Path) -> None:
+    labelled = sorted({kind for frame in frames.frames for kind in frame.object_types})
+    if not set(labelled) & set(class_names):
+        raise DatasetError(
+            f"{data}: labels are of {', '.join(labelled) or 'nothing'}, predictions of "
+            f"{', '.join(class_names) or 'nothing'}: no class in common; name them alike"
+        )

@@ -1,0 +1,210 @@
+"""Boxes as JSON and CSV records: what `asca detect` writes, labels of one's own, and predictions from elsewhere.
+
+A record has a class and seven numbers, in the LiDAR frame (x forward, y left, z up):
+
+    class, x_m, y_m, z_m (of the box's center), length_m, width_m, height_m, yaw_rad (counter-clockwise from x)
+
+and may have a `score` and a `track_id`; other keys are left alone. A name may go without its unit (`x`, `yaw`). Three
+kinds of files hold records:
+
+    *.jsonl  a line for each frame: {"scan": "scans/000000.bin", "boxes": [record, ...], ...}
+    *.json   one frame: {"boxes": [record, ...], ...}
+    *.csv    a record in each row below a line of names; a column `scan` if it holds more than one frame
+"""
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.boxes import wrap_angle
+
+FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
+_SHORT = {name.rpartition("_")[0]: name for name in FIELDS}
+_TOO_LARGE = 1e6  # of any number; a box is never a thousand kilometres away
+
+
+class BoxRecords(NamedTuple):
+    """The N records of one frame.
+
+    `boxes` (N, 7) float32, LiDAR frame; `types` class of each; `scores` (N,) float32, NaN where a record has none;
+    `track_ids` None where a record has none.
+    """
+
+    boxes: NDArray[np.float32]
+    types: tuple[str, ...]
+    scores: NDArray[np.float32]
+    track_ids: tuple[str | None, ...]
+
+
+class NamedRecords(NamedTuple):
+    """Records of a frame, the scan that they are said to belong to, and where they stand: FILE:LINE."""
+
+    scan: str
+    records: BoxRecords
+    place: str
+
+
+def read_frames(path: Path) -> Iterator[NamedRecords]:
+    """The frames of a *.jsonl or *.csv file, in the order in which they first appear.
+
+    Raises:
+        DatasetError: the file cannot be read, or a record is wrong; names file, line, value and remedy.
+    """
+    if path.suffix.lower() == ".jsonl":
+        yield from _json_lines(path)
+    elif path.suffix.lower() == ".csv":
+        rows: dict[str, list[tuple[str, Mapping[str, Any]]]] = {}
+        for place, row in _csv_rows(path):
+            if not row.get("scan"):
+                raise DatasetError(
+                    f"{place}: no `scan`; a file for several frames says in each row which scan it is of"
+                )
+            rows.setdefault(row["scan"], []).append((place, row))
+        for scan, own in rows.items():
+            yield NamedRecords(scan, _records(own), own[0][0])
+    else:
+        raise DatasetError(f"{path}: labels of several frames are .jsonl or .csv; rename or convert the file")
+
+
+def read_frame_file(path: Path) -> BoxRecords:
+    """The records of a *.json or *.csv file that belongs to one frame; an empty .csv is a frame without objects.
+
+    Raises:
+        DatasetError: as `read_frames`.
+    """
+    if path.suffix.lower() == ".csv":
+        return _records(_csv_rows(path))
+    content = _parsed(_text(path), str(path))
+    return _json_records(content, str(path))
+
+
+def records_from(
+    boxes: NDArray[np.floating],
+    types: Sequence[str],
+    scores: Sequence[float] | NDArray[np.floating] | None = None,
+    track_ids: Sequence[str | None] | None = None,
+) -> BoxRecords:
+    """Records of boxes (N, 7) that are arrays already."""
+    count = len(types)
+    return BoxRecords(
+        np.asarray(boxes, np.float32).reshape(count, 7),
+        tuple(types),
+        np.full(count, np.nan, np.float32) if scores is None else np.asarray(scores, np.float32),
+        (None,) * count if track_ids is None else tuple(track_ids),
+    )
+
+
+def json_line(scan: str, records: BoxRecords) -> str:
+    """One line of a *.jsonl file, with its line break."""
+    boxes = []
+    for box, kind, score, track_id in zip(*records, strict=True):
+        record: dict[str, Any] = {"class": kind}
+        record |= {name: round(float(value), 4) for name, value in zip(FIELDS, box, strict=True)}
+        if not math.isnan(score):
+            record["score"] = round(float(score), 4)
+        if track_id is not None:
+            record["track_id"] = track_id
+        boxes.append(record)
+    return json.dumps({"scan": scan, "boxes": boxes}) + "\n"
+
+
+def _json_lines(path: Path) -> Iterator[NamedRecords]:
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        if not line.strip():
+            continue
+        place = f"{path}:{number}"
+        content = _parsed(line, place)
+        scan = content.get("scan") if isinstance(content, dict) else None
+        if not isinstance(scan, str) or not scan:
+            raise DatasetError(f'{place}: no "scan"; a line is {{"scan": "NAME.bin", "boxes": [...]}}')
+        yield NamedRecords(scan, _json_records(content, place), place)
+
+
+def _json_records(content: Any, place: str) -> BoxRecords:
+    boxes = content.get("boxes") if isinstance(content, dict) else None
+    if not isinstance(boxes, list):
+        raise DatasetError(f'{place}: no list "boxes"; a frame without objects has "boxes": []')
+    return _records((f"{place}, box {number}", box) for number, box in enumerate(boxes, start=1))
+
+
+def _csv_rows(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    text = _text(path)
+    if not text.strip():
+        return
+    reader = csv.reader(text.splitlines(), skipinitialspace=True)
+    names = [name.strip() for name in next(reader)]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise DatasetError(f"{path}:1: the column `{twice[0]}` is there twice; remove one")
+    for cells in reader:
+        if not any(cell.strip() for cell in cells):
+            continue
+        if len(cells) != len(names):
+            raise DatasetError(
+                f"{path}:{reader.line_num}: {len(cells)} values for {len(names)} columns; correct the row"
+            )
+        values = {name: cell.strip() for name, cell in zip(names, cells, strict=True)}
+        yield f"{path}:{reader.line_num}", {name: value for name, value in values.items() if value}
+
+
+def _records(placed: Iterable[tuple[str, Any]]) -> BoxRecords:
+    boxes, types, scores, track_ids = [], [], [], []
+    for place, record in placed:
+        if not isinstance(record, Mapping):
+            raise DatasetError(
+                f"{place}: {str(record)[:40]} is no record; write an object with `class` and {_listed()}"
+            )
+        kind = record.get("class")
+        if not isinstance(kind, str) or not kind.strip():
+            raise DatasetError(f"{place}: no `class`; name what is in the box")
+        full = {_SHORT.get(name, name): value for name, value in record.items()}
+        if missing := [name for name in FIELDS if name not in full]:
+            raise DatasetError(f"{place}: no `{missing[0]}`; a box has `class`, {_listed()}")
+        box = [_number(full[name], name, place) for name in FIELDS]
+        for name, size in zip(FIELDS[3:6], box[3:6], strict=True):
+            if size <= 0:
+                raise DatasetError(f"{place}: {name} is {size:g}; a box has a positive size: correct or remove it")
+        boxes.append(box)
+        types.append(kind.strip())
+        scores.append(_number(full["score"], "score", place) if full.get("score") is not None else math.nan)
+        track_id = full.get("track_id")
+        track_ids.append(None if track_id is None else str(track_id))
+    array = np.array(boxes, np.float64).reshape(-1, 7)
+    array[:, 6] = wrap_angle(array[:, 6])
+    return records_from(array, types, scores, track_ids)
+
+
+def _listed() -> str:
+    return ", ".join(FIELDS)
+
+
+def _number(value: Any, name: str, place: str) -> float:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not abs(number) < _TOO_LARGE:
+        raise DatasetError(f"{place}: {name} is {str(value)[:40]!r}, no usable number; correct or remove the box")
+    return number
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")  # spreadsheets put a mark before the first name
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path}: not UTF-8 text; save it as UTF-8") from None
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None
+
+
+def _parsed(text: str, place: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{place}: not valid JSON ({str(error)[:80]}); correct it") from None

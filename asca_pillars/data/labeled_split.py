@@ -1,0 +1,74 @@
+"""What a dataset is to training, inspection, insertion and evaluation, whatever its files look like.
+
+`data.kitti.KittiSplit` reads KITTI's layout, `data.boxes.BoxSplit` the layout with boxes in the LiDAR frame
+(docs/DATA.md); `data.open_split` tells them apart.
+"""
+
+from collections.abc import Container
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class LabeledBoxes(NamedTuple):
+    """The M labelled boxes of a frame, (M, 7) float32, LiDAR frame, and the type of each."""
+
+    boxes: NDArray[np.float32]
+    types: tuple[str, ...]
+
+
+class LabeledSplit(Protocol):
+    """Frames with labelled boxes: one list of a dataset."""
+
+    @property
+    def root(self) -> str | Path:
+        """Folder of the dataset."""
+
+    @property
+    def name(self) -> str:
+        """Of the list; "training" is every frame."""
+
+    @property
+    def pool(self) -> str:
+        """What frame ids are unique in: lists of one pool share what is computed per frame."""
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether labels stand only where a camera sees."""
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Sorted; DatasetError if the list is missing or wrong."""
+
+    def scan_path(self, frame_id: str) -> Path:
+        """The frame's scan, to be named to the user; `points` reads it."""
+
+    def input_paths(self, frame_id: str) -> tuple[Path, ...]:
+        """The files that the frame is read from: when one changes, what was computed from it is outdated."""
+
+    def require_files(self) -> None:
+        """Raise DatasetError unless every frame has its files: training would stop at the first that lacks one."""
+
+    def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
+        """(N, 4) x, y, z in m, LiDAR frame, and reflectance 0..1; only those in the camera's view if that is asked.
+
+        Without a camera there is nothing to cut.
+        """
+
+    def stored_points(self, frame_id: str) -> NDArray[np.float32]:
+        """(N, 4) all of the file, perhaps not finite or with a reflectance beyond 0..1."""
+
+    def points_state(self, frame_id: str) -> tuple[int, ...]:
+        """Numbers that change when `points` may."""
+
+    def label_types(self, frame_id: str) -> list[str]:
+        """The type of every label, also of those without a 3D box."""
+
+    def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
+        """The frame's boxes: those of `types`, or all that have a 3D box.
+
+        Raises:
+            DatasetError: missing or damaged labels; an object of `types` without a 3D box.
+        """

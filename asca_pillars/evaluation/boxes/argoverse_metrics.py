@@ -1,0 +1,107 @@
+"""Argoverse 2's detection metrics: AP by center distance, errors of true positives, and the composite score CDS.
+
+Definition: B. Wilson et al., "Argoverse 2: Next Generation Datasets for Self-Driving Perception and Forecasting",
+NeurIPS Datasets and Benchmarks 2021, and its API (`av2.evaluation.detection`) where that is brief:
+
+- Distance is that of the centers in 3D. In each frame a detection belongs to its nearest object, taken or not; of the
+  detections of an object the one with the highest score is a true positive if it is nearer than 0.5, 1, 2 and 4 m.
+- Up to 100 detections of a class in a frame count, by score, and what is less than 150 m away.
+- Precision at a recall is the best at that recall or beyond, taken at the recalls 0, 0.01, ... 1, in between linearly,
+  0 beyond the highest. AP is their mean, and the class' AP the mean over the distances.
+- Errors are means over the true positives below 2 m: ATE in m, ASE 1 - IoU of the sizes laid over each other, AOE
+  in rad. Without one they are 2 m, 1 and pi.
+- CDS = AP * mean(1 - ATE / 2 m, 1 - ASE, 1 - AOE / pi).
+
+The API restricts both sides to the map's region of interest; without a map everything counts here.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.evaluation.boxes.box_pairs import UNMATCHED, BoxPairs, Doubles, EvaluatedFrame, pair_class
+from asca_pillars.evaluation.boxes.nuscenes_metrics import DISTANCES_M, ERROR_DISTANCE_M, RECALLS, size_error
+from asca_pillars.geometry.boxes import wrap_angle
+
+MAX_DETECTIONS = 100
+MAX_RANGE_M = 150.0
+_WORST = np.array([ERROR_DISTANCE_M, 1.0, pi])
+_TINY = 1e-10  # what the API adds to the number of detections
+
+
+@dataclass(frozen=True)
+class ArgoverseScore:
+    """Of one class: AP and CDS in percent, and errors; None where there is no object."""
+
+    class_name: str
+    objects: int
+    ap: float | None
+    ate_m: float | None
+    ase: float | None
+    aoe_rad: float | None
+    cds: float | None
+
+
+def argoverse_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]) -> list[ArgoverseScore]:
+    """A score for every class."""
+    within = [_in_range(frame) for frame in frames]
+    return [_score(pair_class(within, name, _closeness), name) for name in class_names]
+
+
+def _closeness(found: Doubles, objects: Doubles) -> Doubles:
+    return -np.linalg.norm(found[:, None, :3] - objects[None, :, :3], axis=2)
+
+
+def _in_range(frame: EvaluatedFrame) -> EvaluatedFrame:
+    near = np.linalg.norm(frame.found[:, :3], axis=1) < MAX_RANGE_M
+    visible = frame.visible & (np.linalg.norm(frame.objects[:, :3], axis=1) < MAX_RANGE_M)
+    types = [kind for kind, kept in zip(frame.found_types, near, strict=True) if kept]
+    found, scores = frame.found[near], frame.scores[near]
+    return EvaluatedFrame(frame.frame_id, frame.objects, frame.object_types, visible, found, types, scores)
+
+
+def _score(pairs: BoxPairs, name: str) -> ArgoverseScore:
+    objects = len(pairs.objects)
+    if not objects:
+        return ArgoverseScore(name, 0, None, None, None, None, None)
+    kept, owner, distance_m = _first_of_each(pairs)
+    ap = float(np.mean([_average_precision((distance_m < limit_m)[kept], objects) for limit_m in DISTANCES_M]))
+    true = kept & (distance_m < ERROR_DISTANCE_M)
+    errors = _WORST
+    if true.any():
+        found, own = pairs.found[true], pairs.objects[owner[true]]
+        turned = np.abs(wrap_angle(found[:, 6] - own[:, 6]))
+        errors = np.array([distance_m[true].mean(), size_error(found, own).mean(), turned.mean()])
+    cds = ap * float(np.mean(1 - errors / _WORST))
+    ate_m, ase, aoe_rad = errors.tolist()
+    return ArgoverseScore(name, objects, 100 * ap, ate_m, ase, aoe_rad, 100 * cds)
+
+
+def _first_of_each(pairs: BoxPairs) -> tuple[NDArray[np.bool_], NDArray[np.int64], Doubles]:
+    """Which detections (N,) count; the object that each is the first one of, and its distance, inf if of none."""
+    count = len(pairs.scores)
+    kept, owner, distance_m = np.ones(count, dtype=bool), np.full(count, UNMATCHED), np.full(count, np.inf)
+    taken, in_frame = np.zeros(len(pairs.objects), dtype=bool), dict.fromkeys(pairs.frames.tolist(), 0)
+    for row, (number, first, close) in enumerate(
+        zip(pairs.frames.tolist(), pairs.first.tolist(), pairs.closeness, strict=True)
+    ):
+        in_frame[number] += 1
+        kept[row] = in_frame[number] <= MAX_DETECTIONS
+        if not kept[row] or not len(close):
+            continue
+        nearest = first + int(close.argmax())
+        if not taken[nearest]:
+            taken[nearest] = True
+            owner[row], distance_m[row] = nearest, -close.max()
+    return kept, owner, distance_m
+
+
+def _average_precision(hits: NDArray[np.bool_], objects: int) -> float:
+    if not len(hits):
+        return 0.0
+    precision = np.cumsum(hits) / (np.arange(1, len(hits) + 1) + _TINY)
+    best = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(np.interp(RECALLS, np.cumsum(hits) / objects, best, right=0).mean())

@@ -1,0 +1,116 @@
+"""Detections of one class beside the objects of it, best score first, and the greedy matching of both.
+
+Each detection, from the highest score down, takes the closest object of its frame that no better one has taken, if that
+is close enough. Detections of equal score keep their order. What decides depends on higher scores alone, so that one
+matching serves every score threshold and every band of distance or direction.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.frames import NEIGHBOR_TYPES
+
+UNMATCHED = -1
+
+Doubles = NDArray[np.float64]
+Closeness = Callable[[Doubles, Doubles], Doubles]
+"""(N, 7), (M, 7) -> (N, M), larger is closer."""
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedFrame:
+    """Labels and detections of one frame, LiDAR frame.
+
+    Attributes:
+        frame_id: its name.
+        objects: (M, 7) labelled boxes.
+        object_types: class of each.
+        visible: (M,) whether an object holds a point; one without cannot be found, and is neither missed nor false.
+        found: (N, 7) detected boxes.
+        found_types: class of each.
+        scores: (N,).
+    """
+
+    frame_id: str
+    objects: NDArray[np.floating]
+    object_types: Sequence[str]
+    visible: NDArray[np.bool_]
+    found: NDArray[np.floating]
+    found_types: Sequence[str]
+    scores: NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class BoxPairs:
+    """N detections of a class by descending score, and its K objects that count.
+
+    Attributes:
+        scores: (N,).
+        found: (N, 7).
+        frames: (N,) number of each detection's frame.
+        objects: (K, 7).
+        first: (N,) the first object of the detection's frame, and
+        closeness: how close each object of the frame is, from the first one on.
+        excuse: (N,) closeness of the closest object that does not count; -inf without one.
+    """
+
+    scores: Doubles
+    found: Doubles
+    frames: NDArray[np.int64]
+    objects: Doubles
+    first: NDArray[np.int64]
+    closeness: tuple[Doubles, ...]
+    excuse: Doubles
+
+    def match(self, close_enough: Callable[[float], bool]) -> NDArray[np.int64]:
+        """(N,) the object that each detection takes, or UNMATCHED."""
+        matched = np.full(len(self.scores), UNMATCHED)
+        taken = np.zeros(len(self.objects), dtype=bool)
+        for row, (first, close) in enumerate(zip(self.first.tolist(), self.closeness, strict=True)):
+            if not len(close):
+                continue
+            free = np.where(taken[first : first + len(close)], -np.inf, close)
+            best = int(free.argmax())
+            if close_enough(float(free[best])):
+                matched[row] = first + best
+                taken[first + best] = True
+        return matched
+
+
+def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Closeness) -> BoxPairs:
+    """The detections and objects of one class over all frames.
+
+    Objects without a point, and those of a neighboring type (KITTI's Van for Car), do not count.
+    """
+    found, scores, numbers, objects, first, rows, excuse = [], [], [], [], [], [], []
+    start = 0
+    for number, frame in enumerate(frames):
+        types = np.array(frame.object_types, dtype=object)
+        own = types == class_name
+        counted = own & frame.visible
+        spare = (own & ~frame.visible) | (types == NEIGHBOR_TYPES.get(class_name, ""))
+        detected = np.array(frame.found_types, dtype=object) == class_name
+        boxes = np.asarray(frame.found, np.float64)[detected]
+        truth = np.asarray(frame.objects, np.float64)
+        found.append(boxes)
+        scores.append(np.asarray(frame.scores, np.float64)[detected])
+        numbers.append(np.full(len(boxes), number))
+        objects.append(truth[counted])
+        first.append(np.full(len(boxes), start))
+        rows += list(closeness(boxes, truth[counted]))
+        excuse.append(closeness(boxes, truth[spare]).max(axis=1, initial=-np.inf))
+        start += len(objects[-1])
+    score = np.concatenate([*scores, np.zeros(0)])
+    order = np.argsort(-score, kind="stable")
+    return BoxPairs(
+        score[order],
+        np.concatenate([*found, np.zeros((0, 7))])[order],
+        np.concatenate([*numbers, np.zeros(0, np.int64)])[order],
+        np.concatenate([*objects, np.zeros((0, 7))]),
+        np.concatenate([*first, np.zeros(0, np.int64)])[order],
+        tuple(rows[row] for row in order),
+        np.concatenate([*excuse, np.zeros(0)])[order],
+    )

@@ -1,0 +1,107 @@
+"""What is evaluated without a camera: a dataset's labelled boxes, and predictions as `asca detect` writes them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from asca_pillars.data.boxes.box_records import BoxRecords, json_line, read_frames, records_from
+from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.errors import DatasetError
+from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
+from asca_pillars.evaluation.predictions import shortage
+from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.detections import Detections
+
+
+@dataclass(frozen=True)
+class BoxFrames:
+    """Frames with labels and predictions, and those that have no predictions."""
+
+    frames: tuple[EvaluatedFrame, ...]
+    without_predictions: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def shortage(self) -> str | None:
+        """One sentence that belongs beside every number if not all frames were evaluated; None if all were."""
+        return shortage(len(self), self.without_predictions, "no predictions", 'needs a line with "boxes": []')
+
+
+def write_box_predictions(
+    path: Path,
+    split: LabeledSplit,
+    detect: Callable[[NDArray[np.float32]], Detections],
+    *,
+    console: Console | None = None,
+) -> None:
+    """Run a detector over a split and write a line for each frame (`data.boxes.box_records`).
+
+    Where labels stand only in a camera's view the detector gets no other points.
+
+    Raises:
+        DatasetError, ScanError: a frame cannot be read.
+    """
+    with path.open("w", encoding="utf-8") as file:
+        for frame_id in track(split.frame_ids, "Detecting", console=console, disable=console is None):
+            found = detect(split.points(frame_id, camera_view=split.has_camera))
+            records = records_from(found.boxes, found.names, found.scores)
+            file.write(json_line(f"{frame_id}{split.scan_path(frame_id).suffix}", records))
+
+
+def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | None = None) -> BoxFrames:
+    """Pair the labels of a split with the predictions of a *.jsonl or *.csv file.
+
+    A line belongs to the frame whose id is the longest end of its scan's path; lines of other frames are left out.
+
+    Args:
+        path: the file, or a folder that `asca detect` wrote.
+        split: the labels.
+        console: shows the progress.
+
+    Raises:
+        DatasetError: a file cannot be read; a prediction without a score; none is of a frame of the split.
+    """
+    path = path / "detections.jsonl" if path.is_dir() else path
+    predictions, known = _by_frame(path, set(split.frame_ids))
+    frames = []
+    for frame_id in track(known, "Points in boxes", console=console, disable=console is None):
+        objects, types = split.labeled_boxes(frame_id)
+        points = split.points(frame_id, camera_view=False)
+        visible = np.asarray(points_in_boxes(points, objects).any(axis=0))
+        records = predictions[frame_id]
+        frames.append(EvaluatedFrame(frame_id, objects, types, visible, records.boxes, records.types, records.scores))
+    missing = tuple(frame_id for frame_id in split.frame_ids if frame_id not in predictions)
+    return BoxFrames(tuple(frames), missing)
+
+
+def _by_frame(path: Path, frame_ids: set[str]) -> tuple[dict[str, BoxRecords], Sequence[str]]:
+    predictions: dict[str, BoxRecords] = {}
+    places: dict[str, str] = {}
+    for scan, records, place in read_frames(path):
+        if np.isnan(records.scores).any():
+            number = int(np.isnan(records.scores).argmax()) + 1
+            raise DatasetError(f"{place}, box {number}: no `score`; every prediction needs one")
+        frame_id = _frame_id(scan, frame_ids)
+        if frame_id in places:
+            raise DatasetError(f"{place}: {scan} has predictions in {places[frame_id]} already; join them")
+        if frame_id is not None:
+            predictions[frame_id], places[frame_id] = records, place
+    if not predictions:
+        raise DatasetError(
+            f"{path}: none of its scans is a frame to be evaluated, such as {min(frame_ids)}; "
+            "give the predictions of this dataset's scans"
+        )
+    return predictions, sorted(predictions)
+
+
+def _frame_id(scan: str, frame_ids: set[str]) -> str | None:
+    parts = PurePosixPath(scan.replace("\\", "/")).with_suffix("").parts
+    ends = ("/".join(parts[first:]) for first in range(len(parts)))
+    return next((end for end in ends if end in frame_ids), None)

@@ -1,0 +1,118 @@
+"""`asca eval` on a dataset without a camera: what is written, that it scores the same again, and what is refused."""
+
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from asca_pillars.cli import app
+from asca_pillars.data.boxes.box_records import json_line, read_frames
+from asca_pillars.errors import AscaError
+from tests.data.boxes.box_scenes import write_box_dataset
+from tests.scenes import write_dataset
+
+
+@pytest.fixture(autouse=True)
+def log_level() -> Iterator[None]:
+    """The command silences the runtime's log for the rest of its process."""
+    log = logging.getLogger("asca_deploy")
+    before = log.level
+    yield
+    log.setLevel(before)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_box_dataset(tmp_path / "own", 3, val_frames=2)
+
+
+@pytest.fixture
+def perfect(root: Path) -> Path:
+    """The labels of all frames as predictions, written as elsewhere."""
+    path = root.parent / "found.jsonl"
+    frames = read_frames(root / "labels.jsonl")
+    path.write_text(
+        "".join(
+            json_line(f"/data/{f.scan}", f.records._replace(scores=f.records.scores * 0 + 0.9)) for f in frames
+        ).replace(', "yaw', ', "score": 0.9, "yaw')
+    )
+    return path
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["eval", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0
+    return result.output
+
+
+def test_labels_as_predictions_are_perfect_by_iou_and_distance(root: Path, perfect: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    output = run("--data", root, "--predictions", perfect, "--out", out)  # iou: there is no camera
+    assert "AP by IoU" in output and "2 frames" in output
+    report = json.loads((out / "iou.json").read_text())
+    assert {score["class_name"] for score in report["iou"]} == {"Car", "Forklift"}
+    assert {score["ap"] for score in report["iou"] if score["band"] == "all"} == {100.0}
+    run("--data", root, "--predictions", perfect, "--out", out, "--protocol", "distance", "--json", tmp_path / "d.json")
+    report = json.loads((tmp_path / "d.json").read_text())
+    assert report == json.loads((out / "distance.json").read_text())
+    assert [round(score["cds"]) for score in report["argoverse2"]] == [100, 100]
+    assert "| Forklift |" in (out / "distance.md").read_text()
+
+
+def test_a_model_is_run_and_scores_the_same_again(root: Path, tmp_path: Path) -> None:
+    first = tmp_path / "first"
+    output = run("--data", root, "--out", first, "--min-score", 0.001)  # it knows no made-up scenes
+    assert "Labelled, but no class that is evaluated: Forklift (2)" in output
+    report = json.loads((first / "iou.json").read_text())
+    assert [score["objects"] for score in report["at_score"] if score["band"] == "all"] == [2, 0, 0]
+    run("--data", root, "--predictions", first / "predictions", "--out", tmp_path / "second")
+    again = json.loads((tmp_path / "second" / "iou.json").read_text())
+    of_car = [[score for score in one["iou"] if score["class_name"] == "Car"] for one in (report, again)]
+    assert of_car[0] == of_car[1] and len(of_car[0]) > 0
+    run("--data", root, "--out", first)  # replaces its own
+
+
+def test_kitti_data_is_scored_too(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "kitti", 2)
+    run("--data", root, "--out", tmp_path / "out", "--protocol", "distance")
+    report = json.loads((tmp_path / "out" / "distance.json").read_text())
+    assert {score["class_name"]: score["objects"] for score in report["argoverse2"]} == {
+        "Car": 2,
+        "Pedestrian": 1,
+        "Cyclist": 1,
+    }
+
+
+def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_path: Path) -> None:
+    perfect.write_text("".join(line for line in perfect.read_text().splitlines(keepends=True) if "000001" in line))
+    assert "evaluated on 1 of 2 frames: no predictions for 000002" in " ".join(
+        run("--data", root, "--predictions", perfect, "--out", tmp_path / "out").split()
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--protocol", "iou"], "needs the labels: give --data"),
+        (["--protocol", "kitti", "--data", "{root}"], "has no camera, which it needs; choose iou or distance"),
+        (["--data", "{root}", "--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),
+        (["--data", "{root}", "--labels", "x"], "--labels x belongs to"),
+        (["--data", "{root}", "--score", "nan"], "--score nan must be a number"),
+        (["--data", "{root}", "--predictions", "{root}/labels.jsonl"], "labels.jsonl:1, box 1: no `score`"),
+        (["--data", "{root}", "--predictions", "{root}/none.jsonl"], "none.jsonl: cannot be read"),
+    ],
+)
+def test_what_cannot_be_is_refused(root: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
+    (root / "none.jsonl").unlink(missing_ok=True)
+    with pytest.raises(AscaError) as caught:
+        run(*(text.format(root=root) for text in arguments), "--out", tmp_path / "out")
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_classes_must_have_something_in_common(root: Path, perfect: Path, tmp_path: Path) -> None:
+    perfect.write_text(perfect.read_text().replace("Car", "auto").replace("Forklift", "truck"))
+    with pytest.raises(AscaError, match="labels are of Car, Forklift, predictions of auto, truck: no class in common"):
+        run("--data", root, "--predictions", perfect, "--out", tmp_path / "out")

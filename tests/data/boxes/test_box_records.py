@@ -1,0 +1,90 @@
+"""Records of boxes in JSON and CSV: every form gives the same boxes, and what is wrong is named by file and line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asca_pillars.data.boxes.box_records import json_line, read_frame_file, read_frames, records_from
+from asca_pillars.errors import DatasetError
+
+BOX = {"class": "Forklift", "x_m": 10, "y_m": -2.5, "z_m": -0.7, "length_m": 2.5, "width_m": 1.2, "height_m": 2.1}
+BOX |= {"yaw_rad": 0.3}
+ARRAY = np.array([[10, -2.5, -0.7, 2.5, 1.2, 2.1, 0.3]], np.float32)
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_all_forms_give_the_same_boxes(tmp_path: Path) -> None:
+    line = json.dumps({"scan": "a.bin", "boxes": [BOX], "frame": "other keys stay out of the way"})
+    header, row = "scan,class,x,y,z,length,width,height,yaw", "a.bin,Forklift,10,-2.5,-0.7,2.5,1.2,2.1,0.3"
+    found = [
+        next(read_frames(write(tmp_path / "labels.jsonl", line + "\n\n"))).records,
+        next(read_frames(write(tmp_path / "labels.csv", f"\ufeff{header}\n{row}\n"))).records,
+        read_frame_file(write(tmp_path / "a.json", json.dumps({"boxes": [BOX]}))),
+        read_frame_file(write(tmp_path / "a.csv", f"{header[5:]}\n{row[6:]}\n")),
+    ]
+    for records in found:
+        assert np.array_equal(records.boxes, ARRAY) and records.types == ("Forklift",)
+        assert np.isnan(records.scores).all() and records.track_ids == (None,)
+
+
+def test_scores_and_tracks_are_kept(tmp_path: Path) -> None:
+    records = records_from(ARRAY, ["Car"], [0.25], ["7"])
+    path = write(tmp_path / "d.jsonl", json_line("b/c.pcd", records))
+    frame = next(read_frames(path))
+    assert frame.scan == "b/c.pcd" and frame.records.track_ids == ("7",) and frame.records.scores.tolist() == [0.25]
+
+
+@given(st.lists(st.floats(-500, 500), min_size=7, max_size=7))
+def test_what_is_written_is_read_again(tmp_path_factory: pytest.TempPathFactory, numbers: list[float]) -> None:
+    box = np.array([[*numbers[:3], *(abs(number) + 0.1 for number in numbers[3:6]), numbers[6] % 3]], np.float32)
+    path = tmp_path_factory.mktemp("records") / "labels.jsonl"
+    path.write_text(json_line("a.bin", records_from(box, ["Car"])))
+    assert np.abs(next(read_frames(path)).records.boxes - box).max() < 1e-4
+
+
+def test_csv_rows_are_gathered_by_scan(tmp_path: Path) -> None:
+    rows = [f"{scan},Car,{x},0,0,4,2,1.5,0" for x, scan in enumerate("abab")]
+    path = write(tmp_path / "labels.csv", "\n".join(["scan,class,x,y,z,length,width,height,yaw", *rows]))
+    assert {frame.scan: frame.records.boxes[:, 0].tolist() for frame in read_frames(path)} == {"a": [0, 2], "b": [1, 3]}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("l.jsonl", '{"scan": "a", "boxes": []}\n{"scan"', r"l\.jsonl:2: not valid JSON"),
+        ("l.jsonl", '{"boxes": []}', r'l\.jsonl:1: no "scan"'),
+        ("l.jsonl", "[1]", r'l\.jsonl:1: no "scan"'),
+        ("l.jsonl", '{"scan": "a"}', r'l\.jsonl:1: no list "boxes"'),
+        ("l.jsonl", '{"scan": "a", "boxes": [7]}', r"l\.jsonl:1, box 1: 7 is no record"),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [BOX, {**BOX, "x_m": "far"}]}), r"1, box 2: x_m is 'far'"),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "x_m": 1e9}]}), r"box 1: x_m is '1000000000.0'"),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "x_m": True}]}), r"box 1: x_m is 'True'"),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "width_m": 0}]}), r"box 1: width_m is 0"),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "class": " "}]}), r"box 1: no `class`"),
+        ("l.jsonl", '{"scan": "a", "boxes": [{"class": "Car", "x": 1}]}', r"box 1: no `y_m`"),
+        ("l.csv", "scan,class,x\na,Car,1\n", r"l\.csv:2: no `y_m`"),
+        ("l.csv", "class,x\nCar,1\n", r"l\.csv:2: no `scan`"),
+        ("l.csv", "scan,class\na,Car,1\n", r"l\.csv:2: 3 values for 2 columns"),
+        ("l.csv", "scan,class,class\na,Car,1\n", r"l\.csv:1: the column `class` is there twice"),
+        ("l.txt", "", r"l\.txt: labels of several frames are \.jsonl or \.csv"),
+    ],
+)
+def test_a_mistake_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        list(read_frames(write(tmp_path / name, text)))
+
+
+def test_a_file_that_is_no_text_or_not_there_is_named(tmp_path: Path) -> None:
+    (tmp_path / "l.jsonl").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DatasetError, match=r"l\.jsonl: not UTF-8"):
+        list(read_frames(tmp_path / "l.jsonl"))
+    with pytest.raises(DatasetError, match=r"m\.csv: cannot be read"):
+        read_frame_file(tmp_path / "m.csv")

@@ -1,0 +1,142 @@
+"""The layout of boxes: what frames there are, what is in them, and that everything that trains reads it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asca_pillars.config import Config, DataConfig, InsertConfig, PillarModel
+from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.frames import read_frame
+from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
+from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.geometry.anchors import ClassSpec
+from tests.data.boxes.box_scenes import write_box_dataset
+from tests.scenes import SPEC, make_scene, write_dataset
+
+CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
+CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_box_dataset(tmp_path / "own", 4)
+
+
+def test_the_layout_tells_the_reader(root: Path, tmp_path: Path) -> None:
+    assert isinstance(open_split(root), BoxSplit)
+    assert isinstance(open_split(write_dataset(tmp_path / "kitti", 1)), KittiSplit)
+
+
+def test_a_frame_holds_its_points_and_boxes(root: Path) -> None:
+    split = open_split(root, "train")
+    assert split.frame_ids == ("000000", "000001", "000002")
+    points, boxes, _ = make_scene(1, ("Car", "Pedestrian"))
+    frame = read_frame(split, "000001", ("Forklift",))  # camera_view is on: without a camera there is nothing to cut
+    assert np.array_equal(frame.points, points)
+    assert frame.labels.tolist() == [0] and np.abs(frame.boxes - boxes[1:]).max() < 1e-4
+    assert split.label_types("000001") == ["Car", "Forklift"]
+
+
+def test_a_file_for_each_frame_gives_the_same(root: Path) -> None:
+    lines = (root / "labels.jsonl").read_text().splitlines()
+    (root / "labels").mkdir()
+    for number, line in enumerate(lines):
+        (root / "labels" / f"{number:06d}.json").write_text(line)
+    (root / "dataset.yaml").write_text("labels: labels\n")
+    split = BoxSplit(root)
+    assert split.frame_ids == tuple(f"{number:06d}" for number in range(4))
+    (root / "dataset.yaml").write_text("labels: labels.jsonl\n")
+    for frame_id in split.frame_ids:
+        assert np.array_equal(split.labeled_boxes(frame_id).boxes, BoxSplit(root).labeled_boxes(frame_id).boxes)
+
+
+def test_with_a_csv_scans_without_a_row_are_frames_without_objects(root: Path) -> None:
+    (root / "labels.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n000002.bin,Car,10,0,-1,4,2,1.5,0\n")
+    (root / "dataset.yaml").write_text("labels: labels.csv\n")
+    split = BoxSplit(root, "train")
+    assert [len(split.labeled_boxes(frame_id).boxes) for frame_id in split.frame_ids] == [0, 0, 1]
+
+
+def test_a_line_may_name_its_scan_from_elsewhere(root: Path) -> None:
+    labels = root / "labels.jsonl"
+    labels.write_text(labels.read_text().replace('"scan": "', f'"scan": "{root}/scans/'))
+    assert len(BoxSplit(root).frame_ids) == 4
+
+
+def test_scans_may_lie_anywhere_and_in_folders(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "drive" / "a").mkdir(parents=True)
+    for path in (root / "scans").iterdir():
+        path.rename(tmp_path / "drive" / "a" / path.name)
+    labels = root / "labels.jsonl"
+    labels.write_text(labels.read_text().replace('"scan": "', '"scan": "a/'))
+    (root / "dataset.yaml").write_text(f"scans: {tmp_path / 'drive'}\n")
+    split = BoxSplit(root)
+    assert split.frame_ids[0] == "a/000000" and len(split.points("a/000000")) > 1000
+
+
+def test_points_are_turned_and_scaled_as_the_dataset_says(root: Path) -> None:
+    plain = read_scan(root / "scans" / "000000.bin").points
+    columns = np.column_stack([-plain[:, 1], plain[:, 0], plain[:, 2], plain[:, 3] * 100, np.zeros(len(plain))])
+    columns.astype("<f4").tofile(root / "scans" / "000000.bin")
+    (root / "dataset.yaml").write_text("{axes: y-forward, columns: 5, reflectance_scale: 100}\n")
+    split = BoxSplit(root)
+    np.testing.assert_allclose(split.points("000000"), plain, atol=1e-6)
+    np.testing.assert_allclose(split.stored_points("000000"), plain, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"scan": "9.bin", "boxes": []}', r"labels\.jsonl:1: no scan 9\.bin below .*correct the name"),
+        ('{"scan": "../000000.bin", "boxes": []}', r"labels\.jsonl:1: no scan"),
+        ('{"scan": "000000.bin", "boxes": []}\n' * 2, r"labels\.jsonl:2: 000000\.bin has labels in .*jsonl:1 already"),
+        ("", r"labels\.jsonl: no frame in it"),
+        ('{"scan": "000000.bin", "boxes": []}', r"000001: listed in ImageSets/train\.txt, but .* has no such frame"),
+    ],
+)
+def test_wrong_labels_are_named(root: Path, text: str, message: str) -> None:
+    (root / "labels.jsonl").write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        BoxSplit(root, "train").frame_ids  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scan: x", "scans"),
+        ("columns: 3", "columns 3"),
+        ("reflectance_scale: 0", "must be positive"),
+        ("axes: up", "axes"),
+    ],
+)
+def test_wrong_settings_are_named(root: Path, text: str, message: str) -> None:
+    (root / "dataset.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        BoxSplit(root).frame_ids  # noqa: B018
+
+
+def test_per_frame_labels_need_their_scan(root: Path) -> None:
+    (root / "labels").mkdir()
+    (root / "labels" / "9.json").write_text('{"boxes": []}')
+    (root / "dataset.yaml").write_text("labels: labels\n")
+    with pytest.raises(DatasetError, match=r"9\.json: belongs to one scan .* there is none"):
+        BoxSplit(root).frame_ids  # noqa: B018
+
+
+def test_inspection_and_insertion_read_it(root: Path) -> None:
+    split, spec = open_split(root, "train"), CONFIG.model.spec
+    inspection = inspect_dataset(split, spec, CONFIG.data)
+    assert inspection.types == {"Car": 3, "Forklift": 3} and [facts.boxes for facts in inspection.classes] == [3, 3]
+    assert not [finding for finding in findings(inspection, spec, 1) if finding.level == "error"]
+    inserter = prepare_inserter(split, spec, CONFIG.data, InsertConfig("gt_aug", objects=4))
+    frame = read_frame(split, "000000", spec.class_names)
+    grown = insert_objects(frame, inserter, np.random.default_rng(0))
+    assert len(grown.boxes) > len(frame.boxes)
+    assert inserter.free_space("000000").free.any()
