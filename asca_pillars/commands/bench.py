@@ -6,12 +6,19 @@ from typing import Annotated
 import typer
 
 from asca_pillars.commands.options import (
+    AroundOption,
+    AxesOption,
     BundleOption,
+    ColumnsOption,
     JsonOption,
+    PoseOption,
     PrecisionOption,
     ProviderOption,
+    ReflectanceScaleOption,
     RuntimeOptions,
+    ScanOptions,
     ScansArgument,
+    SensorHeightOption,
     ThreadsOption,
 )
 
@@ -51,6 +58,12 @@ def bench(
         bool,
         typer.Option("--cold", help="New processes: seconds to the first boxes, and the peak memory of asca detect."),
     ] = False,
+    around: AroundOption = False,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
     json: JsonOption = None,
 ) -> None:
     """Time every stage from points to boxes: p50, p95, FPS, cold start, memory, and the machine it ran on.
@@ -69,23 +82,32 @@ def bench(
     from asca_deploy import load_bundle, sample_scan_path
     from asca_pillars.commands.bench_parts import Parts, measure_parts, named_bundles
     from asca_pillars.commands.models import open_detector
+    from asca_pillars.commands.scan_input import ScanInput
     from asca_pillars.data.scans.find_scans import name_scans
-    from asca_pillars.data.scans.scan_reader import read_scan
-    from asca_pillars.errors import ScanError
+    from asca_pillars.errors import ConfigError, ScanError
     from asca_pillars.files import write_json
 
     # A pipe has no width, and the tables are wider than the 80 columns that rich takes then.
     piped = not sys.stdout.isatty() and "COLUMNS" not in os.environ
     console = Console(markup=False, highlight=False, width=120 if piped else None)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # `asca detect` warns of odd scans; here they are timed
-    points = [read_scan(scan.path).points for scan in name_scans(scans or [sample_scan_path()])]
+    if around and (matrix or cold):
+        raise ConfigError("--matrix and --cold time single passes: leave --around out, or them")
+    reading = ScanOptions(
+        sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
+    )
+    paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
+    scan_input = ScanInput(reading, paths)
+    for line in scan_input.said:
+        console.print(line, style="yellow", soft_wrap=True)
+    points = [scan_input.read(path).points for path in paths]
     if scaling and not len(points[0]):
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
     bundles = named_bundles([bundle, *(compare or ())])
     for folder in bundles.values():
         load_bundle(folder)  # a damaged one is named now and not after minutes
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
-    detector = open_detector(options)
+    detector = open_detector(options, mounting=scan_input.mounting, around=around)
     parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold)
     result = measure_parts(detector, points, rounds, parts, bundles, console)
     if json is not None:

@@ -73,7 +73,7 @@ def measure_parts(
         result["compare"] = asdict(compared)
         console.print(show.comparison_table(compared))
     if parts.matrix:
-        ways = measure_matrix(bundles, scans, rounds, bar)
+        ways = measure_matrix(bundles, scans, rounds, bar, mounting=detector.mounting)
         result["matrix"] = [asdict(row) | {"way": row.way._asdict()} for row in ways]
         console.print(show.matrix_table(ways))
         for line in show.matrix_reasons(ways):
@@ -87,7 +87,14 @@ def measure_parts(
 
 def _like(detector: Detector, folder: Path) -> Detector:
     """Another bundle, run the same way."""
-    return Detector(folder, provider=detector.provider, precision=detector.precision, threads=detector.threads)
+    return Detector(
+        folder,
+        provider=detector.provider,
+        precision=detector.precision,
+        threads=detector.threads,
+        mounting=detector.mounting,
+        view=detector.view,
+    )
 
 
 def named_bundles(bundles: Sequence[Path | None]) -> dict[str, Path]:

@@ -21,6 +21,8 @@ def stages_table(report: BenchmarkReport) -> Table:
     """p50, p95 and min of every stage."""
     points = f"{min(report.points)}" if len(set(report.points)) == 1 else f"{min(report.points)}-{max(report.points)}"
     title = f"{report.bundle}: {report.frames} warm frames, {report.scans} scan(s) of {points} points"
+    if report.passes > 1:
+        title += f", {report.passes} passes each"
     table = _table(title, "stage", "p50 ms", "p95 ms", "min ms")
     for name, times in [*report.stages_ms.items(), ("total", report.total_ms)]:
         table.add_row(name, f"{times.p50:.2f}", f"{times.p95:.2f}", f"{times.min:.2f}")

@@ -6,11 +6,18 @@ from typing import Annotated
 import typer
 
 from asca_pillars.commands.options import (
+    AroundOption,
+    AxesOption,
     BundleOption,
+    ColumnsOption,
+    PoseOption,
     PrecisionOption,
     ProviderOption,
+    ReflectanceScaleOption,
     RuntimeOptions,
+    ScanOptions,
     ScansArgument,
+    SensorHeightOption,
     ThreadsOption,
 )
 from asca_pillars.errors import ScanError
@@ -33,15 +40,25 @@ def detect(
     provider: ProviderOption = "cpu",
     precision: PrecisionOption = None,
     threads: ThreadsOption = None,
+    around: AroundOption = False,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
 
-    OUT/NAME.json holds the boxes of one scan in the LiDAR's frame, OUT/detections.jsonl those of the whole run, one
+    OUT/NAME.json holds the boxes of one scan in the scan's own frame, OUT/detections.jsonl those of the whole run, one
     line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image.
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
 
-    Example: asca detect drive1/ drive2/ --out results --no-pictures
+    Examples:
+
+    asca detect drive1/ drive2/ --out results --no-pictures
+
+    asca detect sweeps/ --around --axes y-forward --sensor-height auto
     """
     import logging
     import sys
@@ -54,22 +71,26 @@ def detect(
     from asca_pillars.commands import detect_tables as show
     from asca_pillars.commands.detect_files import ResultWriter
     from asca_pillars.commands.models import open_detector
+    from asca_pillars.commands.scan_input import ScanInput
     from asca_pillars.data.scans.find_scans import name_scans
-    from asca_pillars.data.scans.scan_reader import read_scan
 
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     named = name_scans(scans or [sample_scan_path()])
+    reading = ScanOptions(
+        sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
+    )
+    scan_input = ScanInput(reading, [path for path, _ in named])
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
-    detector = open_detector(options, score)
+    detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     results: list[show.Result] = []
     unreadable = 0
-    with ResultWriter(out, detector.spec.ranges, pictures=pictures) as write:
+    with ResultWriter(out, pictures=pictures) as write:
         for path, name in track(named, "Detecting", console=console, disable=len(named) == 1):
             try:
-                scan = read_scan(path)
+                scan = scan_input.read(path)
                 detections = detector(scan.points)
             except (ScanError, OSError) as error:
                 if len(named) == 1:
@@ -82,7 +103,7 @@ def detect(
     if not results:
         raise ScanError(f"none of the {len(named)} scans can be read")
     console.print(show.boxes(path, detections) if len(named) == 1 else show.scans(results, detector.spec.class_names))
-    for line in (*show.notes(results), *write.remarks[:1]):
+    for line in (*scan_input.said, *show.notes(results), *write.remarks[:1]):
         console.print(line, style="yellow", soft_wrap=True)
     reports = [result.report for result in results]
     while len(reports) < TIMED_FRAMES:

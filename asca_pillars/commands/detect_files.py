@@ -13,8 +13,7 @@ from asca_deploy import Detections
 from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.scans.scan_reader import Scan
 from asca_pillars.files import atomic_path, require_own, write_json
-from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
+from asca_pillars.pictures.visualize import draw_on_image, write_png
 
 RUN_FILE = "detections.jsonl"
 
@@ -24,15 +23,14 @@ class ResultWriter:
 
     Args:
         out: the folder: absent, empty, or that of an earlier run. Results of other scans in it stay.
-        ranges: what the bird's-eye pictures show.
         pictures: False writes no picture.
 
     Raises:
         OutputError: when the block is entered, if `out` holds files of something else.
     """
 
-    def __init__(self, out: Path, ranges: Ranges, *, pictures: bool) -> None:
-        self._out, self._ranges, self._pictures = out, ranges, pictures
+    def __init__(self, out: Path, *, pictures: bool) -> None:
+        self._out, self._pictures = out, pictures
         self._stack = ExitStack()
         self._lines: IO[str] | None = None
         self.remarks: list[str] = []
@@ -55,7 +53,7 @@ class ResultWriter:
         write_json(self._named(name, ".json"), content)
         self._lines.write(json.dumps(content) + "\n")
         if self._pictures:
-            write_png(self._named(name, "_bev.png"), draw_bev(scan.points, detections, self._ranges))
+            write_png(self._named(name, "_bev.png"), detections.plot(scan.points))
         calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
         if path.parent.name != "velodyne" or not calib_path.exists():
             return
@@ -92,9 +90,10 @@ def _content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
     report, notes = detections.report, scan.notes
     return {
         "scan": str(path),
-        "frame": "lidar: x forward, y left, z up; box centers; yaw counter-clockwise from x",
+        "frame": "that of the scan; box centers; yaw about z, from x towards y",
         "boxes": detections.to_dicts(),
         **asdict(report.counts),
+        "passes": report.passes,
         "points_not_finite": report.non_finite_points + notes.dropped_points,
         "reflectance_scale": notes.reflectance_scale,
         "reflectances_clipped": report.clipped_reflectances + notes.clipped_reflectances,

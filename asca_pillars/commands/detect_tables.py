@@ -29,18 +29,26 @@ class Result(NamedTuple):
 def boxes(path: Path, detections: Detections) -> Table:
     """The boxes of one scan, the nearest first."""
     table = Table(title=f"{path.name}: {len(detections)} objects")
-    for column in ("class", "score", "distance", "size l x w x h", "heading"):
+    for column in ("class", "score", "distance", "direction", "size l x w x h", "heading"):
         table.add_column(column, justify="left" if column == "class" else "right")
+    bearings_deg = np.rad2deg(detections.bearings_rad)
     for index in np.argsort(detections.distances_m):
         length, width, height, yaw = detections.boxes[index, 3:]
         table.add_row(
             detections.names[index],
             f"{detections.scores[index]:.2f}",
             f"{detections.distances_m[index]:.1f} m",
+            _direction(bearings_deg[index]),
             f"{length:.1f} x {width:.1f} x {height:.1f} m",
             f"{np.rad2deg(yaw):+.0f}°",
         )
     return table
+
+
+def _direction(bearing_deg: float) -> str:
+    """Such as "12° left" or "170° right", from straight ahead."""
+    angle = round(abs(bearing_deg))
+    return "ahead" if angle == 0 else f"{angle}° {'left' if bearing_deg > 0 else 'right'}"
 
 
 def scans(results: Sequence[Result], class_names: Sequence[str]) -> Table:
@@ -50,7 +58,9 @@ def scans(results: Sequence[Result], class_names: Sequence[str]) -> Table:
         table.add_column(column, justify="left" if column == "scan" else "right")
     for path, _, labels, report in results:
         counts = np.bincount(labels, minlength=len(class_names))
-        table.add_row(path.name, str(report.counts.points), *map(str, counts), f"{report.total_ms:.0f} ms")
+        table.add_row(
+            path.name, str(report.counts.points // report.passes), *map(str, counts), f"{report.total_ms:.0f} ms"
+        )
     return table
 
 
@@ -74,7 +84,8 @@ def timing(reports: Sequence[FrameReport], detector: Detector) -> str:
     medians = {stage: statistics.median(one.times_ms[stage] for one in reports) for stage in reports[0].times_ms}
     total_ms = statistics.median(report.total_ms for report in reports)
     stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
+    passes = f" in {detector.passes} passes" if detector.passes > 1 else ""
     return (
-        f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan (median of {len(reports)} warm frames, "
+        f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan{passes} (median of {len(reports)} warm frames, "
         f"{detector.runs_on}, {detector.threads} threads): {stages} ms"
     )

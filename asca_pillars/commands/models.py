@@ -13,6 +13,7 @@ from asca_deploy import Detections, Detector
 from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.system import check_threads
@@ -39,7 +40,9 @@ class Model:
     unlike: list[str] = field(default_factory=list)
 
 
-def open_detector(options: RuntimeOptions, score: float | None = None) -> Detector:
+def open_detector(
+    options: RuntimeOptions, score: float | None = None, mounting: Mounting | None = None, *, around: bool = False
+) -> Detector:
     """The detector of a bundle that is run as `options` say, from `score` on; None for the bundle's own thresholds.
 
     Raises:
@@ -51,6 +54,8 @@ def open_detector(options: RuntimeOptions, score: float | None = None) -> Detect
         precision=cast("Precision | None", options.precision),
         threads=options.threads,
         score_threshold=score,
+        mounting=mounting,
+        view="around" if around else "ahead",
     )
 
 

@@ -49,6 +49,58 @@ OverridesOption = Annotated[
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write everything measured to this file.")]
 
 
+SensorHeightOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensor-height",
+        help="Metres of the scans' origin above the ground (0 where z = 0 is the ground), or auto: estimated from the "
+        "scans. Default: as in training.",
+    ),
+]
+AxesOption = Annotated[
+    str,
+    typer.Option(
+        "--axes",
+        help="x-forward, y-forward (x to the right), or where forward, left and up are found in the scan, such as "
+        "-y,x,z or, with z down, x,-y,-z.",
+    ),
+]
+PoseOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--pose",
+        help="Text file with a 4x4 matrix, 16 numbers row by row, from the scan to a level frame, x forward, y left, "
+        "z up, in metres; instead of --axes.",
+    ),
+]
+ReflectanceScaleOption = Annotated[
+    str,
+    typer.Option(
+        "--reflectance-scale",
+        help="Stored value that is a reflectance of 1: 1, 100, 255, 65535. Default: by the files, once for a folder.",
+    ),
+]
+ColumnsOption = Annotated[
+    int | None,
+    typer.Option("--columns", help="Values of a point in a .bin file. Default: 4, or 5 where the fifth counts rings."),
+]
+AroundOption = Annotated[
+    bool,
+    typer.Option("--around", help="Look in every direction: turned passes, merged. Costs a pass for each of them."),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanOptions:
+    """How scan files are to be read and where their sensor sat, as typed."""
+
+    sensor_height: str | None = None
+    axes: str = "x-forward"
+    pose: Path | None = None
+    reflectance_scale: str = "auto"
+    columns: int | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class RuntimeOptions:
     """Which model runs, and how. The arguments of `asca_deploy.Detector` by the same names."""

@@ -38,6 +38,11 @@ class ExpectedInput(Strict):
     camera_view: bool
     """Whether the scans were cropped to the points in the camera's image."""
 
+    @property
+    def sensor_height_m(self) -> float | None:
+        """Height of the sensor above the ground in the middle of those scans; None where no scan showed it."""
+        return None if self.ground_z_m is None else -sum(self.ground_z_m) / 2
+
 
 class InputWarning(NamedTuple):
     """One way in which a scan is far from the training scans; `about` names the way, `text` is for people."""

@@ -5,12 +5,13 @@ import html
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.frame_report import FrameReport
 from asca_pillars.geometry.ranges import Ranges
 
@@ -70,7 +71,9 @@ class Detections:
     _source: Callable[[], NDArray[Any] | None] | None = field(default=None)
     """Weak reference to the points that they were found in."""
     _ranges: Ranges | None = None
-    """Where the detector looked."""
+    """Where the detector looked, level frame."""
+    _level: FrameChange | None = None
+    """From the frame of the boxes to a level one, x forward, y left, z up; None: it is such a one."""
 
     def __post_init__(self) -> None:
         count = len(self.scores) if self.scores.ndim else -1
@@ -112,7 +115,9 @@ class Detections:
             name = self.class_names[self.labels[index]]
             return Detection(name, float(self.scores[index]), *self.boxes[index].tolist())
         part = self.boxes[index], self.scores[index], self.labels[index]
-        return Detections(*part, self.class_names, self.non_finite, self._report, self._source, self._ranges)
+        return Detections(
+            *part, self.class_names, self.non_finite, self._report, self._source, self._ranges, self._level
+        )
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{count} {name}" for name, count in Counter(self.names).items())
@@ -120,7 +125,7 @@ class Detections:
 
     def __reduce__(self) -> tuple[Any, ...]:  # the reference to the points stays behind
         kept = (self.boxes, self.scores, self.labels, self.class_names, self.non_finite, self._report, None)
-        return Detections, (*kept, self._ranges)
+        return Detections, (*kept, self._ranges, self._level)
 
     @property
     def names(self) -> list[str]:
@@ -131,6 +136,12 @@ class Detections:
     def distances_m(self) -> NDArray[np.float32]:
         """(N,) horizontal distance from the LiDAR to each box's center."""
         return np.hypot(self.boxes[:, 0], self.boxes[:, 1])
+
+    @property
+    def bearings_rad(self) -> NDArray[np.float32]:
+        """(N,) direction of each box's center from straight ahead, positive to the left, in [-pi, pi]."""
+        level = self._level_boxes()
+        return np.arctan2(level[:, 1], level[:, 0])
 
     def to_dicts(self) -> list[dict[str, str | float]]:
         """For each detection `class`, `score` and the fields of `Detection` from `x_m` on, with four decimals."""
@@ -158,7 +169,7 @@ class Detections:
         return labels_text([item for item in objects if item.bbox[2] > item.bbox[0]])
 
     def plot(self, points: NDArray[Any] | None = None, *, width_px: int = 1000) -> NDArray[np.uint8]:
-        """The scan and the boxes from above: an image (H, width_px, 3), blue, green, red as in OpenCV.
+        """The scan and the boxes from above: an image (H, width_px, 3), blue, green, red as in OpenCV; ahead is up.
 
         Args:
             points: (N, >=3) x, y, z in metres, LiDAR frame. None for those that a `Detector` found these boxes in:
@@ -171,12 +182,18 @@ class Detections:
             points = self._source() if self._source is not None else None
         if points is None:
             points = np.empty((0, 4), np.float32)
+        found = replace(self, boxes=self._level_boxes())
+        if self._level is not None:
+            points = self._level.points(points)
         ranges = self._ranges
         if ranges is None:
-            around = np.concatenate([points[:, :2], self.boxes[:, :2], [[0.0, 0.0]]])
+            around = np.concatenate([points[:, :2], found.boxes[:, :2], [[0.0, 0.0]]])
             low, high = around.min(axis=0) - 5.0, around.max(axis=0) + 5.0
             ranges = Ranges((low[0], high[0]), (low[1], high[1]), (-np.inf, np.inf))
-        return draw_bev(points, self, ranges, width_px=width_px)
+        return draw_bev(points, found, ranges, width_px=width_px)
+
+    def _level_boxes(self) -> NDArray[np.float32]:
+        return self.boxes if self._level is None else self._level.boxes(self.boxes)
 
     def _repr_html_(self) -> str:
         """A notebook's view: the picture if the points are still there, and the boxes as a table."""

@@ -1,6 +1,7 @@
 """What is known of one scan besides its boxes: times, counters, warnings."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,14 @@ class ScanCounts:
     """Points inside that the limits dropped."""
 
 
+def summed(counts: Sequence[ScanCounts]) -> ScanCounts:
+    """The counts of a scan's passes, all of one family, added up."""
+    first = counts[0]
+    if len(counts) == 1:
+        return first
+    return type(first)(**{name.name: sum(getattr(one, name.name) for one in counts) for name in fields(first)})
+
+
 @dataclass(frozen=True)
 class FrameReport:
     """What happened to one scan on its way to the boxes."""
@@ -24,7 +33,8 @@ class FrameReport:
     waiting_ms: float
     """In a stream: the time between the stages, when the scan waited for those before it. Otherwise 0."""
     counts: ScanCounts
-    """What the ranges and the limits made of the usable points; a pillar detector's are `PillarCounts`."""
+    """What the ranges and the limits made of the usable points; a pillar detector's are `PillarCounts`. Added up over
+    the passes, each of which looks at every point."""
     non_finite_points: int
     """Points dropped because a value was NaN or infinite."""
     clipped_reflectances: int
@@ -33,6 +43,8 @@ class FrameReport:
     """Anchors left out because the network's answer for them was NaN or infinite."""
     warnings: tuple[str, ...]
     """How the scan differs from those the model was trained on, and what was repaired; empty if nothing."""
+    passes: int = 1
+    """How often the network ran, each time on the scan turned otherwise. Times are those of all passes together."""
 
     @property
     def total_ms(self) -> float:

@@ -6,12 +6,13 @@ from collections.abc import Generator, Iterable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
+from asca_deploy.around import merge, ranges_around, turns_around
 from asca_deploy.bundle import Bundle, find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
 from asca_deploy.ort_session import check_onnxruntime
@@ -19,16 +20,19 @@ from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.pipeline import Laps
 from asca_deploy.stream import overlapped
 from asca_pillars.data.expected_input import InputWarning, check_input
+from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ScanError
+from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.frame_report import FrameReport
+from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.geometry.frame_report import FrameReport, ScanCounts, summed
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.system import check_threads
 
 _log = logging.getLogger("asca_deploy")
 
 
+View: TypeAlias = Literal["ahead", "around"]
 _WAITING = "waiting"  # beside the names of stages
 _GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
 
@@ -43,15 +47,23 @@ class _Usable(NamedTuple):
     non_finite: int
     clipped: int
 
+    def moved(self, change: FrameChange) -> "_Usable":
+        """The same in another frame."""
+        points = change.points(self.points)
+        if self.unclipped is self.points:
+            return self._replace(points=points, unclipped=points)
+        return self._replace(points=points, unclipped=np.column_stack([points[:, :3], self.unclipped[:, 3]]))
+
 
 class _Frame(NamedTuple):
     """A scan between its points and its boxes."""
 
     start: float
     laps: Laps
-    prepared: Any
-    """The pipeline's own, see `pipeline.Prepared`."""
     usable: _Usable
+    """In the model's frame."""
+    counts: list[ScanCounts]
+    """Of each pass so far."""
     warnings: list[InputWarning]
     source: Any
     """What the caller gave."""
@@ -74,11 +86,15 @@ class Detector:
             (`asca_deploy.providers`); None for float32, with "auto" for either.
         threads: of the CPU; None for the physical cores granted to the process.
         score_threshold: overrides that of every class; None keeps the bundle's.
+        mounting: how the scans' frame lies to the model's. Points come and boxes go in the scans' own frame. None: the
+            scans are as those of the training.
+        view: "ahead", or "around" for every direction: as many turned passes as the model's field of view needs
+            (`self.passes`), merged. Each costs what a scan ahead costs.
 
     Raises:
         BundleError: the bundle is missing, damaged or made for another version.
         ProviderError: the provider is not installed, does not start or lacks the precision; onnxruntime is too old.
-        ConfigError: `threads` or `score_threshold` is out of range.
+        ConfigError: `threads`, `score_threshold` or `view` is out of range.
     """
 
     def __init__(
@@ -89,6 +105,8 @@ class Detector:
         precision: providers.Precision | None = None,
         threads: int | None = None,
         score_threshold: float | None = None,
+        mounting: Mounting | None = None,
+        view: View = "ahead",
     ) -> None:
         start = perf_counter()
         load_kernels()  # here rather than in the first scan
@@ -103,7 +121,15 @@ class Detector:
         self.pipeline.spec = self.spec
         if self.candidates:
             _log.info(auto.summary(self.runs_on, self.candidates))
-        self._ranges = self.spec.ranges
+        if view not in get_args(View):
+            raise ConfigError(f"view {view}: give {' or '.join(get_args(View))}")
+        expected = self.bundle.expected_input
+        self.view, self.mounting = view, mounting or Mounting()
+        self._to_model = self.mounting.to_model(expected.sensor_height_m)
+        self._level = None if self.mounting.level.is_identity else self.mounting.level
+        turns = turns_around(self.spec.ranges, camera_view=expected.camera_view)
+        self._turns = turns if view == "around" else turns[:1]
+        self._ranges = ranges_around(self.spec.ranges, self.passes)
         self._warned: set[str] = set()
         self.load_s = perf_counter() - start
         """Seconds that it took to open the bundle."""
@@ -113,11 +139,16 @@ class Detector:
         """Provider and arithmetic of the slowest network in words, such as "cpu int8"."""
         return f"{self.provider} {providers.arithmetic(self.bundle.precision, self.precision)}"
 
+    @property
+    def passes(self) -> int:
+        """How often the network runs for a scan: once, or in every direction with `view="around"`."""
+        return len(self._turns)
+
     def __call__(self, points: NDArray[Any]) -> Detections:
         """Detect objects in one scan.
 
         Args:
-            points: (N, 4) x, y, z in metres (LiDAR frame: x forward, y left, z up) and reflectance 0..1;
+            points: (N, 4) x, y, z in metres (x forward, y left, z up, or as the mounting says) and reflectance 0..1;
                 any real type, N may be 0. Points with a NaN or infinite value are dropped, reflectances outside 0..1
                 are set to the nearer end; the report counts both.
 
@@ -128,8 +159,10 @@ class Detector:
         Raises:
             ScanError: `points` has another shape or does not hold real numbers.
         """
-        frame = self._prepare(points)
-        return self._finish(frame, self.pipeline.infer(frame.prepared, frame.laps))
+        frame = self._open(points)
+        # Pass by pass, so that all of them need no more than one pseudo-image.
+        raw = [self.pipeline.infer(self._prepare(frame, turn), frame.laps) for turn in self._turns]
+        return self._finish(frame, raw)
 
     def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[Detections, None, None]:
         """Detections of scan after scan, in order, the same as one by one and more of them per second.
@@ -145,32 +178,52 @@ class Detector:
                 the same way. Either ends the stream and leaves the detector usable.
         """
 
-        def infer(frame: _Frame) -> tuple[_Frame, Any]:
-            frame.laps.append((_WAITING, perf_counter()))
-            return frame, self.pipeline.infer(frame.prepared, frame.laps)
+        def prepare(points: NDArray[Any]) -> tuple[_Frame, list[Any]]:
+            frame = self._open(points)
+            return frame, [self._prepare(frame, turn) for turn in self._turns]
 
-        def finish(found: tuple[_Frame, Any]) -> Detections:
+        def infer(ready: tuple[_Frame, list[Any]]) -> tuple[_Frame, list[Any]]:
+            frame, prepared = ready
+            frame.laps.append((_WAITING, perf_counter()))
+            return frame, [self.pipeline.infer(one, frame.laps) for one in prepared]
+
+        def finish(found: tuple[_Frame, list[Any]]) -> Detections:
             frame, raw = found
             frame.laps.append((_WAITING, perf_counter()))
             return self._finish(frame, raw)
 
-        return overlapped(scans, self._prepare, infer, finish)
+        return overlapped(scans, prepare, infer, finish)
 
-    def _prepare(self, points: NDArray[Any]) -> _Frame:
-        """All that comes before the slowest network."""
+    def _open(self, points: NDArray[Any]) -> _Frame:
+        """The usable points in the model's frame."""
         start = perf_counter()
         usable = _usable_points(points)
-        laps: Laps = [("input", perf_counter())]
-        prepared = self.pipeline.prepare(usable.points, laps)
-        warnings = check_input(usable.unclipped, prepared.counts, self.bundle.expected_input)
+        warnings = []
         if usable.clipped:
             text = f"{usable.clipped} reflectances lie outside 0..1 and were set to the nearer end"
             warnings.append(InputWarning("clipped", text))
-        laps.append(("input", perf_counter()))
-        return _Frame(start, laps, prepared, usable, warnings, points)
+        if not self._to_model.is_identity:
+            usable = usable.moved(self._to_model)
+        return _Frame(start, [("input", perf_counter())], usable, [], warnings, points)
 
-    def _finish(self, frame: _Frame, raw: Any) -> Detections:
-        detections = self.pipeline.finish(raw, frame.laps)
+    def _prepare(self, frame: _Frame, turn: FrameChange) -> Any:
+        """All of one pass before the slowest network; the first one compares the scan with those of the training."""
+        points = frame.usable.points if turn.is_identity else turn.points(frame.usable.points)
+        frame.laps.append(("input", perf_counter()))
+        prepared = self.pipeline.prepare(points, frame.laps)
+        if not frame.counts:
+            expected = self.bundle.expected_input
+            frame.warnings[:0] = check_input(frame.usable.unclipped, prepared.counts, expected)
+            frame.laps.append(("input", perf_counter()))
+        frame.counts.append(prepared.counts)
+        return prepared
+
+    def _finish(self, frame: _Frame, raw: list[Any]) -> Detections:
+        found = [self.pipeline.finish(one, frame.laps) for one in raw]
+        detections = merge(found, self._turns, self.spec.post.nms_iou)
+        if not self._to_model.is_identity:
+            detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
+        frame.laps.append((self.pipeline.stages[-1], perf_counter()))
         if detections.non_finite:
             text = f"the network's answer is not finite at {detections.non_finite} anchors, which were left out"
             frame.warnings.append(InputWarning("output", text))
@@ -186,14 +239,15 @@ class Detector:
         report = FrameReport(
             waiting_ms=times_ms.pop(_WAITING),
             times_ms=times_ms,
-            counts=frame.prepared.counts,
+            counts=summed(frame.counts),
+            passes=self.passes,
             non_finite_points=frame.usable.non_finite,
             clipped_reflectances=frame.usable.clipped,
             non_finite_outputs=detections.non_finite,
             warnings=tuple(warning.text for warning in frame.warnings),
         )
         source = weakref.ref(frame.source) if isinstance(frame.source, np.ndarray) else None
-        return replace(detections, _report=report, _source=source, _ranges=self._ranges)
+        return replace(detections, _report=report, _source=source, _ranges=self._ranges, _level=self._level)
 
     def _choose(
         self, provider: providers.Provider | Literal["auto"], precision: providers.Precision | None

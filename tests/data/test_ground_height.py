@@ -5,6 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_pillars.data.expected_input import ground_z_m
+from asca_pillars.data.ground_height import estimate_height, measured_mounting
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.errors import ScanError
 
 
 def street(count: int = 4000) -> NDArray[np.float32]:
@@ -26,3 +29,46 @@ def test_too_few_points_near_the_sensor() -> None:
     assert ground_z_m(street(40)) is None
     assert ground_z_m(street()[:0]) is None
     assert ground_z_m(street() + np.float32([100, 0, 0, 0])) is None
+
+
+def sloped(height: float, tilt_deg: float = 0.0, seed: int = 0, noise_m: float = 0.02) -> NDArray[np.float32]:
+    """Ground all around, so far below the sensor, with walls on both sides and a few cars."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((-25, -12, 0, 0.1), (25, 12, 0, 0.5), (20_000, 4))
+    points[:, 2] = np.tan(np.radians(tilt_deg)) * points[:, 0] - height + rng.normal(0, noise_m, len(points))
+    points[:5000, 1] = rng.choice([-12, 12], 5000)
+    points[:5000, 2] += rng.uniform(0, 5, 5000)
+    points[5000:6000, :3] = rng.uniform((5, 2, -height + 0.3), (9, 4, -height + 1.5), (1000, 3))
+    return points.astype(np.float32)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.4, 1.73, 3.2])
+def test_the_height_is_estimated(height: float) -> None:
+    estimate = estimate_height([sloped(height, seed=seed) for seed in range(3)])
+    assert estimate.height_m == pytest.approx(height, abs=0.03)
+    assert estimate.spread_m < 0.05 and estimate.share > 0.8 and estimate.scans == 3
+    assert f"{height:.2f} m" in str(estimate) or abs(estimate.height_m - height) > 0.005
+
+
+def test_the_height_is_estimated_along_the_axes() -> None:
+    points = sloped(1.2)
+    points[:, 1:3] *= -1
+    mounting, estimate = measured_mounting([points], Mounting(axes="x,-y,-z"))
+    assert mounting == Mounting(sensor_height_m=estimate.height_m, axes="x,-y,-z")
+    assert estimate.height_m == pytest.approx(1.2, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("scans", "message"),
+    [
+        ([], "without a scan"),
+        ([sloped(1.7)[:100]], "scan 1: too few points"),
+        ([sloped(1.7, tilt_deg=9)], "tilted by 9 degrees"),
+        ([sloped(1.7, noise_m=2.0)], "of the low points"),
+        ([sloped(1.7), sloped(1.2)], "2 scans disagree by 0.5"),
+    ],
+)
+def test_an_unsure_height_is_refused(scans: list[NDArray[np.float32]], message: str) -> None:
+    with pytest.raises(ScanError, match=message) as error:
+        estimate_height(scans)
+    assert "--sensor-height" in str(error.value)

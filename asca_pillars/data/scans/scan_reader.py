@@ -1,6 +1,7 @@
 """Scan files of any common format to points (N, 4) float32: x, y, z in metres, reflectance in 0..1."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from asca_pillars.data.scans.reflectance import (
     ambiguity,
     checked_scale,
     common_scale,
+    decide_scale,
     unit_reflectance,
 )
 from asca_pillars.errors import ScanError
@@ -77,17 +79,32 @@ def read_scan(path: str | Path, *, columns: int | None = None, reflectance_scale
     return _finite_scan(stored, reflectance_scale)
 
 
-def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = None, sample: int = 16) -> float:
+class FolderScale(NamedTuple):
+    """What the reflectances of scans that belong together are divided by, and why that may be wrong, if it may."""
+
+    scale: ReflectanceScale
+    doubt: str | None
+
+
+def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = None, sample: int = 16) -> FolderScale:
     """One reflectance scale for scans that belong together, from `sample` of them, evenly spaced.
 
-    A dark scan among brighter ones is then not read on another scale.
-
-    Raises:
-        ScanError: as `read_scan`.
+    A dark scan among brighter ones is then not read on another scale. Scans that cannot be read have no say; where
+    none has reflectances, the scale is auto.
     """
     chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
-    stored = [_read_stored(path, columns) for path in chosen]
-    return common_scale([(one.reflectance, one.dtype) for one in stored if one.reflectance is not None])
+    stored = []
+    for path in chosen:
+        with suppress(ScanError):
+            one = _read_stored(path, columns)
+            if one.reflectance is not None:
+                stored.append((one.reflectance, one.dtype))
+    if not stored:
+        return FolderScale("auto", None)
+    scale = common_scale(stored)
+    by_values = any(decide_scale(*one)[1] == "values" for one in stored)
+    doubts = [ambiguity(values, scale) for values, _ in stored] if by_values else [None]
+    return FolderScale(scale, doubts[0] if all(doubts) else None)
 
 
 def stored_points(path: Path, *, columns: int | None = 4) -> NDArray[np.float32]:

@@ -33,6 +33,8 @@ class BenchmarkReport:
     """Opening the bundle: checksums, sessions, canvas."""
     frames: int
     """Measured warm frames."""
+    passes: int
+    """Of the network for each frame."""
     scans: int
     points: tuple[int, ...]
     """Points of each scan."""
@@ -93,6 +95,7 @@ def benchmark(
         cold_ms=cold_ms,
         load_s=detector.load_s,
         frames=len(frames),
+        passes=detector.passes,
         scans=len(scans),
         points=tuple(len(scan) for scan in scans),
         pillars=tuple(pillars_of(frame) for frame in passes[0]),

@@ -13,6 +13,7 @@ from asca_deploy.benchmark.box_differences import BoxDifference, box_difference
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
 from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider
+from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import AscaError
 from asca_pillars.system import default_threads
 
@@ -46,12 +47,14 @@ def measure_matrix(
     scans: Sequence[NDArray[np.float32]],
     rounds: int = 10,
     track: Track = silently,
+    mounting: Mounting | None = None,
 ) -> tuple[MatrixRow, ...]:
     """Open every way that there is and time those that run in alternation.
 
     Args:
         bundles: folders by name. The first one's default on the CPU is the reference and the first row.
         scans: (N, 4) each.
+        mounting: of their sensor.
     """
     opened: dict[Way, Detector | str] = {}
     ways = [way for bundle in bundles for way in _ways(bundle)]
@@ -59,7 +62,7 @@ def measure_matrix(
         way = ways[number]
         # What does not run with so many threads does not with others, and is one row.
         if not any(isinstance(result, str) and _same_but_threads(way, other) for other, result in opened.items()):
-            opened[way] = _open(bundles[way.bundle], way, scans[0])
+            opened[way] = _open(bundles[way.bundle], way, scans[0], mounting)
     detectors = {str(way): detector for way, detector in opened.items() if isinstance(detector, Detector)}
     speeds = {speed.name: speed for speed in compare(detectors, scans, rounds, track).contestants}
     boxes = {name: [detector(scan) for scan in scans] for name, detector in detectors.items()}
@@ -86,10 +89,12 @@ def _same_but_threads(way: Way, failed: Way) -> bool:
     return way[:3] == failed[:3]
 
 
-def _open(folder: Path, way: Way, scan: NDArray[np.float32]) -> Detector | str:
+def _open(folder: Path, way: Way, scan: NDArray[np.float32], mounting: Mounting | None) -> Detector | str:
     """The detector, after its first scan, or why there is none."""
     try:
-        detector = Detector(folder, provider=way.provider, precision=way.precision, threads=way.threads)
+        detector = Detector(
+            folder, provider=way.provider, precision=way.precision, threads=way.threads, mounting=mounting
+        )
         detector(scan)
     except AscaError as error:
         return str(error)

@@ -150,8 +150,9 @@ def test_a_folder_has_one_scale(tmp_path):
         (tmp_path / f"{number}.bin").write_bytes(points.tobytes())
     paths = sorted(tmp_path.iterdir())
     assert read_scan(paths[2]).notes.reflectance_scale == 1
-    scale = folder_reflectance_scale(paths)
-    assert scale == 255
+    (tmp_path / "9.bin").write_bytes(b"damaged")
+    scale, doubt = folder_reflectance_scale([*paths, tmp_path / "9.bin"])
+    assert (scale, doubt) == (255, None)
     assert read_scan(paths[2], reflectance_scale=scale).points[:, 3].max() <= 1 / 255
 
 

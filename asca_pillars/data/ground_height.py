@@ -1,0 +1,141 @@
+"""How high the sensor sits above the ground, estimated from scans: `--sensor-height auto`."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.errors import ScanError
+
+NEAR_M = (3.0, 20.0)  # beyond the vehicle itself, before the beams become sparse
+CELL_M = 1.0
+BAND_M = 0.12
+"""Half the thickness of what counts as the plane: camber and kerbs within it."""
+MIN_CELLS = 40
+MIN_SHARE = 0.3
+"""Of the cells whose low point must lie on the plane."""
+MAX_SHARE_BELOW = 0.3
+MAX_TILT_DEG = 5.0
+MAX_SPREAD_M = 0.3
+_DRAWS = 200
+_BY_HAND = "give the height in metres (--sensor-height 1.8, or sensor_height_m of the mounting)"
+
+
+class GroundPlane(NamedTuple):
+    """The ground near one sensor, level frame."""
+
+    height_m: float
+    """Of the origin above it."""
+    tilt_deg: float
+    """Between its normal and z."""
+    share: float
+    """Of the cells of 1 m whose low point lies within BAND_M of the plane."""
+    share_below: float
+    """Of the cells whose low point lies further below it: a plane above others is no ground."""
+    cells: int
+
+    @property
+    def doubt(self) -> str | None:
+        """Why this may not be the ground; None if it is."""
+        if self.share < MIN_SHARE or self.share_below > MAX_SHARE_BELOW:
+            return f"only {self.share:.0%} of the low points lie on a plane, {self.share_below:.0%} below it"
+        if self.tilt_deg > MAX_TILT_DEG:
+            return f"the ground is tilted by {self.tilt_deg:.0f} degrees; give the pose of the sensor"
+        return None
+
+
+class HeightEstimate(NamedTuple):
+    """The sensor's height over several scans."""
+
+    height_m: float
+    """Median."""
+    spread_m: float
+    """Between the lowest and the highest scan."""
+    share: float
+    """Smallest `GroundPlane.share`."""
+    scans: int
+
+    def __str__(self) -> str:
+        agree = "" if self.scans == 1 else f", which agree within {self.spread_m:.2f} m"
+        return (
+            f"{self.height_m:.2f} m above the ground, estimated from {self.scans} scan{'s' * (self.scans > 1)}{agree}: "
+            f"{self.share:.0%} of the low points near the sensor lie on the plane"
+        )
+
+
+def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = None) -> HeightEstimate:
+    """How high the origin of a mounting's level frame is above the ground, from scans of one sensor.
+
+    Args:
+        scans: (N, >=3) finite x, y, z in metres, as they come.
+        mounting: axes or pose; its height does not matter. None: x forward, y left, z up.
+
+    Raises:
+        ScanError: a scan shows no clear ground, or the scans contradict each other; says how.
+    """
+    level = (mounting or Mounting()).level
+    planes = []
+    for number, points in enumerate(scans, start=1):
+        plane = fit_ground_plane(level.points(points))
+        doubt = "too few points near the sensor" if plane is None else plane.doubt
+        if plane is None or doubt:
+            raise ScanError(f"the sensor's height cannot be estimated from scan {number}: {doubt}; {_BY_HAND}")
+        planes.append(plane)
+    if not planes:
+        raise ScanError(f"the sensor's height cannot be estimated without a scan; {_BY_HAND}")
+    heights = np.array([plane.height_m for plane in planes])
+    spread = float(np.ptp(heights))
+    if spread > MAX_SPREAD_M:
+        text = f"{len(heights)} scans disagree by {spread:.2f} m on the sensor's height; {_BY_HAND}"
+        raise ScanError(text)
+    return HeightEstimate(float(np.median(heights)), spread, min(plane.share for plane in planes), len(planes))
+
+
+def measured_mounting(
+    scans: Iterable[NDArray[Any]], mounting: Mounting | None = None
+) -> tuple[Mounting, HeightEstimate]:
+    """The mounting with the height that its scans show, see `estimate_height`."""
+    estimate = estimate_height(scans, mounting)
+    return replace(mounting or Mounting(), sensor_height_m=estimate.height_m), estimate
+
+
+def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
+    """The plane through most low points near the sensor: (N, >=3) level frame, metres; None: too few of them.
+
+    One low point per square metre has a say, so that the dense rings near the sensor do not outvote the rest. The
+    draws are seeded: the same points give the same plane.
+    """
+    low = _low_points(points)
+    if len(low) < MIN_CELLS:
+        return None
+    rng = np.random.default_rng(0)
+    triples = low[rng.integers(0, len(low), (_DRAWS, 3))]
+    design = np.concatenate([triples[:, :, :2], np.ones((_DRAWS, 3, 1))], axis=2)
+    regular = np.abs(np.linalg.det(design)) > 10.0  # of twice the triangle's area, square metres
+    planes = np.linalg.solve(design[regular], triples[regular, :, 2, None])[..., 0]
+    full = np.column_stack([low[:, :2], np.ones(len(low))])
+    hits = (np.abs(low[:, 2] - planes @ full.T) < BAND_M).sum(axis=1)
+    plane = planes[hits.argmax()]
+    for _ in range(3):
+        near = np.abs(low[:, 2] - full @ plane) < BAND_M
+        if near.sum() < 3:
+            return None
+        plane = np.linalg.lstsq(full[near], low[near, 2], rcond=None)[0]
+    above = low[:, 2] - full @ plane
+    tilt = float(np.degrees(np.arctan(np.hypot(*plane[:2]))))
+    share, below = float((np.abs(above) < BAND_M).mean()), float((above < -2 * BAND_M).mean())
+    return GroundPlane(float(-plane[2]), tilt, share, below, len(low))
+
+
+def _low_points(points: NDArray[Any]) -> NDArray[np.float64]:
+    """(C, 3) of each square metre near the sensor the point below which a tenth of its points lie."""
+    xyz = points[:, :3].astype(np.float64)
+    squared = np.square(xyz[:, :2]).sum(axis=1)
+    near = xyz[(squared > NEAR_M[0] ** 2) & (squared < NEAR_M[1] ** 2)]
+    cells = np.floor(near[:, :2] / CELL_M).astype(np.int64) @ [1000, 1]
+    order = np.lexsort((near[:, 2], cells))
+    _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+    return near[order[(first + count // 10)[count >= 3]]]

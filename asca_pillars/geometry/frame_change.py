@@ -1,0 +1,61 @@
+"""From one coordinate frame to another: points and boxes, there and back."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.boxes import wrap_angle
+
+
+@dataclass(frozen=True, eq=False)
+class FrameChange:
+    """A turn, or a mirror image, and a shift: p -> axes p + shift_m. Metres.
+
+    Attributes:
+        axes: (3, 3) float64 orthogonal; its rows are the new frame's axes in the old frame.
+        shift_m: (3,) float64, added after that.
+    """
+
+    axes: NDArray[np.float64]
+    shift_m: NDArray[np.float64]
+
+    @classmethod
+    def turn(cls, angle_rad: float) -> "FrameChange":
+        """Everything turns counter-clockwise about z by the angle; quarter turns are exact."""
+        quarters = round(angle_rad / (np.pi / 2))
+        if abs(angle_rad - quarters * np.pi / 2) < 1e-12:
+            cos, sin = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][quarters % 4]
+        else:
+            cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+        return cls(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]]), np.zeros(3))
+
+    @cached_property
+    def inverse(self) -> "FrameChange":
+        """The way back."""
+        return FrameChange(self.axes.T, -self.axes.T @ self.shift_m)
+
+    @cached_property
+    def is_identity(self) -> bool:
+        """Whether it changes nothing."""
+        return bool(np.array_equal(self.axes, np.eye(3)) and not self.shift_m.any())
+
+    def points(self, points: NDArray[Any]) -> NDArray[np.float32]:
+        """Points (N, >=3) float32, x, y, z first; further columns stay as they are."""
+        changed = np.array(points, np.float32)
+        changed[:, :3] = points[:, :3] @ self.axes.T.astype(np.float32)
+        changed[:, :3] += self.shift_m.astype(np.float32)
+        return changed
+
+    def boxes(self, boxes: NDArray[Any]) -> NDArray[np.float32]:
+        """Boxes (N, 7): centers move with the points, sizes stay, headings turn as seen from above.
+
+        Exact where z stays vertical. A box has no tilt of its own: in a tilted frame it is off by the frame's tilt.
+        """
+        centers = boxes[:, :3].astype(np.float64) @ self.axes.T + self.shift_m
+        yaw = boxes[:, 6].astype(np.float64)
+        arrows = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) @ self.axes[:2, :2].T
+        turned = wrap_angle(np.arctan2(arrows[:, 1], arrows[:, 0]).astype(np.float32))
+        return np.concatenate([centers, boxes[:, 3:6], turned[:, None]], axis=1).astype(np.float32)

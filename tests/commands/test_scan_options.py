@@ -1,0 +1,103 @@
+"""Scans of another sensor on the command line: axes, height, pose, scale, columns, all around."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner, Result
+
+from asca_deploy import sample_scan_path
+from asca_pillars.cli import app
+from asca_pillars.commands.options import ScanOptions
+from asca_pillars.commands.scan_input import ScanInput
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
+from asca_pillars.errors import AscaError, ConfigError
+
+
+def detect(tmp_path: Path, *arguments: object) -> tuple[Result, list[dict]]:
+    """Run `asca detect`; its boxes of the first scan."""
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["detect", "--out", str(out), *map(str, arguments)])
+    lines = (out / "detections.jsonl").read_text().splitlines() if result.exit_code == 0 else []
+    return result, [json.loads(line) for line in lines]
+
+
+@pytest.fixture(scope="module")
+def sample() -> NDArray[np.float32]:
+    return read_scan(sample_scan_path()).points
+
+
+def test_the_sample_seen_otherwise_gives_its_own_boxes(tmp_path: Path, sample: NDArray[np.float32]) -> None:
+    """x to the right, z = 0 on the ground, reflectance 0..255, five columns."""
+    _, (expected,) = detect(tmp_path, "--no-pictures")
+    mounting = Mounting(axes="y-forward")
+    points = mounting.level.inverse.points(sample + np.array([0, 0, 1.73, 0], np.float32))
+    table = np.column_stack([points[:, :3], np.round(points[:, 3] * 255), np.arange(len(points)) % 32])
+    path = tmp_path / "other.bin"
+    table.astype("<f4").tofile(path)
+    result, (found,) = detect(tmp_path, path, "--axes", "y-forward", "--sensor-height", "auto", "--columns", 5)
+    assert result.exit_code == 0, result.output
+    assert "sensor height: 0.0" in result.output and "estimated from 1 scan" in result.output
+    assert found["reflectance_scale"] == 255
+    where = np.array([[box["x_m"], box["y_m"], box["z_m"]] for box in expected["boxes"]])
+    here = np.array([[box["x_m"], box["y_m"], box["z_m"]] for box in found["boxes"]])
+    turned = np.column_stack([-where[:, 1], where[:, 0], where[:, 2] + 1.73])
+    distances = np.linalg.norm(turned[:, None] - here[None], axis=2).min(axis=1)
+    assert (distances < 0.5).mean() >= 0.8  # the height is an estimate, and the scores of some are near the threshold
+    assert (tmp_path / "out" / "other_bev.png").exists()
+
+
+def test_all_around(tmp_path: Path) -> None:
+    result, (found,) = detect(tmp_path, "--around")
+    assert result.exit_code == 0, result.output
+    assert found["passes"] == 4 and found["points"] == 4 * 123_301
+    assert "in 4 passes" in result.output and "right" in result.output
+    behind = [box for box in found["boxes"] if box["x_m"] < -5]
+    assert len(behind) >= 3
+
+
+def test_a_folder_has_one_reflectance_scale(tmp_path: Path, sample: NDArray[np.float32]) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for number, brightness in enumerate([255.0, 1.0]):  # the second one is dark
+        write_scan(folder / f"{number}.bin", sample[::10] * np.array([1, 1, 1, brightness], np.float32))
+    paths = sorted(folder.iterdir())
+    scan_input = ScanInput(ScanOptions(), paths)
+    assert any("0..255" in text for text in scan_input.said)
+    assert [scan_input.read(path).notes.reflectance_scale for path in paths] == [255, 255]
+    stated = ScanInput(ScanOptions(reflectance_scale="100"), paths)
+    assert [stated.read(path).notes.reflectance_scale for path in paths] == [100, 100]
+    assert not stated.said
+
+
+def test_the_height_of_several_scans(tmp_path: Path, sample: NDArray[np.float32]) -> None:
+    for number in range(3):
+        write_scan(tmp_path / f"{number}.bin", sample)
+    (tmp_path / "3.bin").write_bytes(b"damaged")
+    scan_input = ScanInput(ScanOptions(sensor_height="auto"), sorted(tmp_path.iterdir()))
+    assert scan_input.mounting.sensor_height_m == pytest.approx(1.73, abs=0.05)
+    assert any("from 3 scans" in text for text in scan_input.said)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (ScanOptions(sensor_height="tall"), "--sensor-height tall: give a number or auto"),
+        (ScanOptions(reflectance_scale="bright"), "--reflectance-scale bright"),
+        (ScanOptions(reflectance_scale="-1"), "reflectance_scale"),
+        (ScanOptions(axes="up"), "axes up: give x-forward"),
+        (ScanOptions(pose=Path("none.txt")), r"none\.txt"),
+    ],
+)
+def test_wrong_options(options: ScanOptions, message: str) -> None:
+    with pytest.raises(AscaError, match=message):
+        ScanInput(options, [sample_scan_path()])
+
+
+def test_bench_does_not_mix_passes_and_matrix() -> None:
+    result = CliRunner().invoke(app, ["bench", "--around", "--matrix"])
+    assert isinstance(result.exception, ConfigError)
+    assert "single passes" in str(result.exception)

@@ -1,0 +1,88 @@
+"""Which passes there are, and how their boxes become one list."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asca_deploy.around import merge, ranges_around, turns_around
+from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.geometry.ranges import Ranges
+
+Z_M = (-3.0, 1.0)
+KITTI = Ranges((0.0, 69.12), (-30.72, 30.72), Z_M)
+NAMES = ("Car", "Pedestrian")
+
+
+def detections(*rows: tuple[float, ...]) -> Detections:
+    """Rows x, y, yaw, score, label of cars of one size."""
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    boxes = np.zeros((len(table), 7), np.float32)
+    boxes[:, :2], boxes[:, 2:6], boxes[:, 6] = table[:, :2], [-1, 4, 1.6, 1.5], table[:, 2]
+    return Detections(boxes, table[:, 3].astype(np.float32), table[:, 4].astype(np.int64), NAMES)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "camera_view", "passes"),
+    [
+        (KITTI, True, 4),
+        (Ranges((0.0, 69.12), (-39.68, 39.68), Z_M), True, 4),
+        (Ranges((-51.2, 51.2), (-51.2, 51.2), Z_M), False, 1),
+        (Ranges((-51.2, 51.2), (-51.2, 51.2), Z_M), True, 4),
+        (Ranges((0.0, 40.0), (-40.0, 40.0), Z_M), False, 3),
+        (Ranges((2.0, 40.0), (-10.0, 40.0), Z_M), False, 3),
+        (Ranges((-20.0, 60.0), (-40.0, 40.0), Z_M), False, 2),
+    ],
+)
+def test_as_many_passes_as_the_field_of_view_needs(ranges: Ranges, camera_view: bool, passes: int) -> None:
+    turns = turns_around(ranges, camera_view=camera_view)
+    assert len(turns) == passes
+    assert turns[0].is_identity
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(1, 30))
+def test_every_direction_is_in_a_pass(angle: float, distance: float) -> None:
+    point = distance * np.array([[np.cos(angle), np.sin(angle), 0]])
+    ahead = [turn.points(point)[0] for turn in turns_around(KITTI, camera_view=True)]
+    assert any(0 <= x <= 69.12 and abs(y) <= 30.72 and abs(y) <= x + 1e-3 for x, y, _ in ahead)
+
+
+def test_where_the_passes_look_together() -> None:
+    assert ranges_around(KITTI, 1) == KITTI
+    assert ranges_around(KITTI, 4) == Ranges((-69.12, 69.12), (-69.12, 69.12), Z_M)
+
+
+@given(st.floats(-12, 12), st.floats(5, 28), st.floats(-3, 3), st.floats(-0.3, 0.3), st.sampled_from([0, 1]))
+def test_what_stands_on_a_seam_is_found_once(
+    off_seam_deg: float, distance: float, yaw: float, noise_m: float, label: int
+) -> None:
+    """Seen by two passes, a little apart; the one that sees it nearer to straight ahead is believed."""
+    angle = np.radians(45 + off_seam_deg)
+    x, y = distance * np.cos(angle), distance * np.sin(angle)
+    turns = turns_around(KITTI, camera_view=True)
+    first = detections((x, y, yaw, 0.5, label))
+    left = FrameChange(turns[1].axes, turns[1].shift_m).boxes(detections((x + noise_m, y, yaw, 0.9, label)).boxes)
+    second = Detections(left, np.array([0.9], np.float32), np.array([label]), NAMES)
+    empty = Detections.empty(NAMES)
+    merged = merge([first, second, empty, empty], turns, 0.01)
+    assert len(merged) == 1
+    angles = [abs(float(np.arctan2(found.boxes[0, 1], found.boxes[0, 0]))) for found in (first, second)]
+    expected = 0.5 if angles[0] <= angles[1] else 0.9
+    assert merged.scores[0] == np.float32(expected)
+    np.testing.assert_allclose(merged.boxes[0, :2], [x if expected == 0.5 else x + noise_m, y], atol=1e-4)
+    assert abs(float(wrap_angle(merged.boxes[0, 6] - yaw))) < 1e-5
+
+
+def test_neighbours_of_different_classes_both_stay() -> None:
+    turns = turns_around(KITTI, camera_view=True)
+    first, empty = detections((10, 9, 0, 0.5, 0), (10, 9, 0, 0.9, 1)), Detections.empty(NAMES)
+    merged = merge([first, empty, empty, empty], turns, 0.01)
+    np.testing.assert_array_equal(merged.labels, [1, 0])  # the better first
+
+
+def test_what_a_pass_sees_far_beside_its_sector_does_not_count() -> None:
+    turns = turns_around(KITTI, camera_view=True)
+    beside, empty = detections((5, 20, 0, 0.9, 0)), Detections.empty(NAMES)
+    assert len(merge([beside, empty, empty, empty], turns, 0.01)) == 0

@@ -1,0 +1,112 @@
+"""Scans in other frames, and every direction, with the tiny bundle: which boxes come back and where."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from asca_deploy import Detections, Detector, sample_scan_path
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.frame_change import FrameChange
+from tests.deploy.conftest import EXPECTED_INPUT, make_scan
+
+Points = NDArray[np.float32]
+TRAINED_M = 1.75  # the middle of EXPECTED_INPUT.ground_z_m
+
+
+def same(a: Detections, b: Detections, atol: float = 0.0) -> bool:
+    if len(a) != len(b) or not np.array_equal(a.labels, b.labels):
+        return False
+    turned = np.abs(wrap_angle(a.boxes[:, 6] - b.boxes[:, 6])) <= atol
+    return bool(np.allclose(a.boxes[:, :6], b.boxes[:, :6], atol=atol, rtol=0) and turned.all())
+
+
+@pytest.mark.parametrize("axes", ["y-forward", "-y,x,z", "-x,-y,z", "x,-y,-z", "x,-y,z"])
+def test_boxes_come_back_in_the_frame_of_the_scan(tiny_bundle: Path, scan: Points, axes: str) -> None:
+    assert EXPECTED_INPUT.sensor_height_m == TRAINED_M
+    expected = Detector(tiny_bundle)(scan)
+    assert len(expected) > 3
+    mounting = Mounting(axes=axes)
+    found = Detector(tiny_bundle, mounting=mounting)(mounting.level.inverse.points(scan))
+    assert same(found, Detections(mounting.level.inverse.boxes(expected.boxes), *_rest(expected)), atol=1e-5)
+    np.testing.assert_allclose(found.bearings_rad, expected.bearings_rad, atol=1e-5)
+    np.testing.assert_array_equal(found.plot(mounting.level.inverse.points(scan)), expected.plot(scan))
+
+
+def test_another_height() -> None:
+    """With the model that ships, whose answers do not hang on the last bit of a coordinate."""
+    points = read_scan(sample_scan_path()).points
+    ahead = Detector()
+    trained_m = ahead.bundle.expected_input.sensor_height_m
+    assert trained_m is not None
+    raised = points + np.array([0, 0, trained_m, 0], np.float32)  # z = 0 is the ground
+    (warning,) = ahead(raised).report.warnings
+    assert "ground" in warning
+    found = Detector(mounting=Mounting(sensor_height_m=0.0))(raised)
+    assert found.report.warnings == ()
+    expected = ahead(points)
+    assert len(found) == len(expected) > 5
+    np.testing.assert_allclose(found.boxes[:, 2] - expected.boxes[:, 2], trained_m, atol=0.05)
+
+
+def test_a_reflectance_outside_is_clipped_in_any_frame(tiny_bundle: Path, scan: Points) -> None:
+    scan[7, 3] = 1.2
+    assert Detector(tiny_bundle, mounting=Mounting(axes="y-forward"))(scan).report.clipped_reflectances == 1
+
+
+@pytest.fixture
+def revolution() -> Points:
+    """A scan all around: another street in each quarter."""
+    return np.concatenate([FrameChange.turn(k * np.pi / 2).points(make_scan(k)) for k in range(4)])
+
+
+def test_around_finds_in_each_quarter_what_a_turned_scan_has_ahead(tiny_bundle: Path, revolution: Points) -> None:
+    ahead, around = Detector(tiny_bundle), Detector(tiny_bundle, view="around")
+    assert (ahead.passes, ahead.view) == (1, "ahead")
+    assert around.passes > 1
+    found = around(revolution)
+    assert found.report.passes == around.passes
+    assert found.report.counts.points == around.passes * len(revolution)
+    narrow = np.pi / around.passes - np.radians(10)  # where no neighbour has a say
+    for number in range(around.passes):
+        turn = FrameChange.turn(-2 * np.pi * number / around.passes)
+        alone = ahead(turn.points(revolution))
+        angles = np.abs(np.arctan2(alone.boxes[:, 1], alone.boxes[:, 0]))
+        expected = turn.inverse.boxes(alone.boxes[angles < narrow])
+        distances = np.abs(found.boxes[None, :, :6] - expected[:, None, :6]).max(axis=2)
+        assert (distances.min(axis=1) < 1e-4).all()
+
+
+def test_a_turned_scan_gives_turned_boxes() -> None:
+    """To a centimeter: a zero that loses its sign may pick other points of a full pillar."""
+    points = read_scan(sample_scan_path()).points
+    detector = Detector(view="around")
+    assert detector.passes == 4
+    turn = FrameChange.turn(np.pi / 2)
+    expected, found = detector(points), detector(turn.points(points))
+    assert len(expected) > 12
+    order, other = np.lexsort(turn.boxes(expected.boxes).T), np.lexsort(found.boxes.T)
+    np.testing.assert_allclose(found.boxes[other, :6], turn.boxes(expected.boxes)[order, :6], atol=0.05)
+    np.testing.assert_allclose(found.scores[other], expected.scores[order], atol=0.02)
+
+
+def test_streams_and_threads_find_the_same_around(tiny_bundle: Path, scans: list[Points]) -> None:
+    detector = Detector(tiny_bundle, view="around", mounting=Mounting(axes="y-forward"))
+    alone = [detector(points) for points in scans]
+    assert all(map(same, detector.stream(scans), alone))
+    with ThreadPoolExecutor(3) as pool:
+        assert all(map(same, pool.map(detector, scans * 4), alone * 4))
+
+
+def test_an_unknown_view(tiny_bundle: Path) -> None:
+    with pytest.raises(ConfigError, match="view behind: give ahead or around"):
+        Detector(tiny_bundle, view="behind")  # type: ignore[arg-type]
+
+
+def _rest(found: Detections) -> tuple:
+    return found.scores, found.labels, found.class_names
