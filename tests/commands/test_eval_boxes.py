@@ -1,8 +1,6 @@
 """`asca eval` on a dataset without a camera: what is written, that it scores the same again, and what is refused."""
 
 import json
-import logging
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,15 +11,6 @@ from asca_pillars.data.boxes.box_records import json_line, read_frames
 from asca_pillars.errors import AscaError
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import write_dataset
-
-
-@pytest.fixture(autouse=True)
-def log_level() -> Iterator[None]:
-    """The command silences the runtime's log for the rest of its process."""
-    log = logging.getLogger("asca_deploy")
-    before = log.level
-    yield
-    log.setLevel(before)
 
 
 @pytest.fixture

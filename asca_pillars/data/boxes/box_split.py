@@ -162,7 +162,7 @@ class BoxSplit:
         if self.settings.reflectance_scale != "auto":
             return self.settings.reflectance_scale
         paths = [frame.scan for _, frame in sorted(self._frames.items())]
-        return folder_reflectance_scale(paths, columns=self.settings.columns)
+        return folder_reflectance_scale(paths, columns=self.settings.columns).scale
 
     def _turned(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         if self.settings.axes == "x-forward":
