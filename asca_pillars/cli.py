@@ -13,6 +13,7 @@ from asca_pillars.commands.detect import detect
 from asca_pillars.commands.doctor import doctor
 from asca_pillars.commands.eval import evaluate
 from asca_pillars.commands.export import export
+from asca_pillars.commands.import_dataset import import_dataset
 from asca_pillars.commands.inspect import inspect
 from asca_pillars.commands.prepare import prepare
 from asca_pillars.commands.simulate import simulate
@@ -28,6 +29,7 @@ app = typer.Typer(
 app.command()(detect)
 app.command()(bench)
 app.command()(simulate)
+app.command("import")(import_dataset)
 app.command()(inspect)
 app.command()(prepare)
 app.command()(train)

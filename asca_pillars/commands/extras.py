@@ -9,6 +9,7 @@ EXTRAS = {
     "sim": ("numba",),
     "openvino": ("openvino",),
     "eval": ("matplotlib",),
+    "import": ("pyarrow",),
 }
 
 

@@ -19,19 +19,29 @@ def inspect(
         typer.Option("--split", help="A list in ImageSets/, or training for every scan. Default: data.train_set."),
     ] = None,
     frames: Annotated[int, typer.Option("--frames", "-n", min=1, help="Look at so many frames, evenly spaced.")] = 500,
+    propose: Annotated[
+        Path | None,
+        typer.Option(
+            "--propose",
+            help="Measure classes, anchors, thresholds and ranges on the labels, and write the config with them to "
+            "this YAML; what is inspected is then how well it fits.",
+        ),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Look at a dataset before training: objects, points, sizes and positives per class, ranges, scans.
 
     Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 2.
 
-    Example: asca inspect data/kitti -c asca_pointpillars_kitti
+    Examples: asca inspect data/kitti -c asca_pointpillars_kitti
+    asca inspect data/own -c asca_small_sim --propose own.yaml
     """
     import dataclasses
 
     from rich.console import Console
 
     from asca_pillars.commands import inspect_tables as show
+    from asca_pillars.commands.propose_config import propose_config
     from asca_pillars.config import load_config
     from asca_pillars.data.inspection.findings import findings
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
@@ -41,8 +51,10 @@ def inspect(
 
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
-    spec, min_points = settings.model.spec, settings.data.min_points
     frames_of = open_split(data, settings.data.train_set if split is None else split)
+    if propose is not None:
+        settings = propose_config(frames_of, settings, propose, frames, console)
+    spec, min_points = settings.model.spec, settings.data.min_points
     view = settings.data.camera_view and frames_of.has_camera
     inspection = inspect_dataset(frames_of, spec, settings.data, frames=frames, progress=True)
     found = findings(inspection, spec, min_points)

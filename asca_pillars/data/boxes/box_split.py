@@ -59,11 +59,17 @@ class BoxDataset(Strict):
             raise ConfigError(f"reflectance_scale {self.reflectance_scale:g}: must be positive, such as 255, or auto")
 
 
-class _Frame(NamedTuple):
+class BoxFrame(NamedTuple):
+    """A scan and its labels; `file_records` are those of a file for all frames, None where the frame has its own."""
+
     scan: Path
     label_file: Path
-    records: BoxRecords | None
-    """None: they are read from the frame's own file."""
+    file_records: BoxRecords | None
+
+    @property
+    def records(self) -> BoxRecords:
+        """The boxes; DatasetError if the frame's own file is damaged."""
+        return read_frame_file(self.label_file) if self.file_records is None else self.file_records
 
 
 @dataclass(frozen=True)
@@ -154,8 +160,7 @@ class BoxSplit:
 
     def records(self, frame_id: str) -> BoxRecords:
         """The frame's boxes as they are labelled; DatasetError if its file is damaged."""
-        frame = self._frames[frame_id]
-        return read_frame_file(frame.label_file) if frame.records is None else frame.records
+        return self._frames[frame_id].records
 
     @cached_property
     def _reflectance_scale(self) -> ReflectanceScale:
@@ -172,25 +177,37 @@ class BoxSplit:
         return points
 
     @cached_property
-    def _frames(self) -> dict[str, _Frame]:
+    def _frames(self) -> dict[str, BoxFrame]:
         """Every labelled frame of the dataset, by its id."""
-        labels, scans = self.labels_path, self.scans_folder
-        if labels.is_dir():
-            return _frames_of_folder(labels, scans)
-        frames: dict[str, _Frame] = {}
-        places: dict[str, str] = {}
-        if labels.suffix.lower() == ".csv":
-            nothing = records_from(np.zeros((0, 7)), ())
-            frames = {frame_id_of(path, scans): _Frame(path, labels, nothing) for path in find_scans(scans)}
-        for scan, records, place in read_frames(labels):
-            path = _find_scan(scan, scans, place)
-            frame_id = frame_id_of(path, scans)
-            if frame_id in places:
-                raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
-            frames[frame_id], places[frame_id] = _Frame(path, labels, records), place
-        if not frames:
-            raise DatasetError(f"{labels}: no frame in it; write a line for each scan, as docs/DATA.md says")
-        return frames
+        return find_frames(self.labels_path, self.scans_folder)
+
+
+def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
+    """Every labelled frame by its id.
+
+    Args:
+        labels: a .jsonl or .csv file for all frames, or a folder with a .json or .csv for each.
+        scans: folder that the scans are below.
+
+    Raises:
+        DatasetError: labels that are missing, wrong, given twice, or of a scan that is not there.
+    """
+    if labels.is_dir():
+        return _frames_of_folder(labels, scans)
+    frames: dict[str, BoxFrame] = {}
+    places: dict[str, str] = {}
+    if labels.suffix.lower() == ".csv":
+        nothing = records_from(np.zeros((0, 7)), ())
+        frames = {frame_id_of(path, scans): BoxFrame(path, labels, nothing) for path in find_scans(scans)}
+    for scan, records, place in read_frames(labels):
+        path = _find_scan(scan, scans, place)
+        frame_id = frame_id_of(path, scans)
+        if frame_id in places:
+            raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
+        frames[frame_id], places[frame_id] = BoxFrame(path, labels, records), place
+    if not frames:
+        raise DatasetError(f"{labels}: no frame in it; write a line for each scan, as docs/DATA.md says")
+    return frames
 
 
 def frame_id_of(path: Path, scans: Path) -> str:
@@ -209,8 +226,8 @@ def _find_scan(scan: str, scans: Path, place: str) -> Path:
     raise DatasetError(f"{place}: no scan {scan[:200]} below {scans}; correct the name, or `scans` in {DATASET_FILE}")
 
 
-def _frames_of_folder(labels: Path, scans: Path) -> dict[str, _Frame]:
-    frames: dict[str, _Frame] = {}
+def _frames_of_folder(labels: Path, scans: Path) -> dict[str, BoxFrame]:
+    frames: dict[str, BoxFrame] = {}
     for path in sorted(entry for entry in labels.rglob("*") if entry.suffix.lower() in (".json", ".csv")):
         frame_id = frame_id_of(path, labels)
         there = [scan for suffix in SCAN_SUFFIXES if (scan := scans / f"{frame_id}{suffix}").is_file()]
@@ -219,7 +236,7 @@ def _frames_of_folder(labels: Path, scans: Path) -> dict[str, _Frame]:
             raise DatasetError(f"{path}: belongs to one scan {scans / frame_id}.*, there is {found}; rename the files")
         if frame_id in frames:
             raise DatasetError(f"{path}: {frames[frame_id].label_file.name} has labels of the scan already; remove one")
-        frames[frame_id] = _Frame(there[0], path, None)
+        frames[frame_id] = BoxFrame(there[0], path, None)
     if not frames:
         raise DatasetError(f"{labels}: no <frame>.json or <frame>.csv there; write one for each scan")
     return frames

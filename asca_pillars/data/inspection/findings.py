@@ -81,7 +81,10 @@ def _why_no_boxes(name: str, inspection: Inspection) -> str:
     if inspection.sampled:
         advice = f"look at all frames with --frames {inspection.frames_in_split}, or list other frames in ImageSets/"
     else:
-        advice = "list frames that have some in ImageSets/, or take the class out of model.spec.classes"
+        advice = (
+            "list frames that have some in ImageSets/, take the class out of model.spec.classes, or let --propose "
+            "measure the classes that there are"
+        )
     return f"no label is of this type (there are: {there}); {advice}"
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from asca_pillars.errors import ScanError
 
-SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
 
 
 class NamedScan(NamedTuple):
@@ -70,6 +70,8 @@ def _where_shared(names: Sequence[Path], others: Sequence[Path]) -> list[Path]:
 
 
 def _is_scan(relative: Path) -> bool:
+    if relative.suffix.lower() == ".feather" and not relative.stem.isdecimal():
+        return False  # Argoverse 2 names sweeps by their time; its labels and poses are feather files too
     return relative.suffix.lower() in SCAN_SUFFIXES and not any(part.startswith(".") for part in relative.parts)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.scans.arrays import read_npy
+from asca_pillars.data.scans.feather import read_feather
 from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES
 from asca_pillars.data.scans.pcd import read_pcd
 from asca_pillars.data.scans.ply import read_ply
@@ -175,5 +176,6 @@ _READERS: dict[str, Callable[[Path], StoredPoints]] = {
     ".npy": read_npy,
     ".pcd": read_pcd,
     ".ply": read_ply,
+    ".feather": read_feather,
 }
 assert tuple(_READERS) == SCAN_SUFFIXES, "find_scans finds what can be read"

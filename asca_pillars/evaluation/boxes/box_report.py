@@ -190,7 +190,7 @@ def _score_table(report: BoxReport) -> TextTable:
         )
         for item in report.at_score
     ]
-    heads = ("class", "where", "score", "objects", "detections", "found", "recall", "precision")
+    heads = ("class", "where", "score", "objects", "boxes", "found", "recall", "precision")
     return TextTable(f"Recall and precision at a fixed score, centers within {MATCH_M:g} m", heads, tuple(rows))
 
 

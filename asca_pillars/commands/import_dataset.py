@@ -1,0 +1,56 @@
+"""`asca import`: labels of other datasets as a dataset with boxes in the LiDAR frame; scans stay where they are."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+
+def import_dataset(
+    source: Annotated[Path, typer.Argument(help="The other dataset's folder; for boxes the file or folder of labels.")],
+    out: Annotated[Path, typer.Argument(help="Folder for dataset.yaml, labels.jsonl and ImageSets/.")],
+    *,
+    source_format: Annotated[
+        Literal["boxes", "argoverse2", "nuscenes"],
+        typer.Option(
+            "--from",
+            help="boxes: .csv or .jsonl for all scans, or a folder with a .csv or .json for each (docs/DATA.md). "
+            "argoverse2: a folder of logs. nuscenes: the folder with samples/ and v1.0-*/.",
+        ),
+    ] = "boxes",
+    scans: Annotated[Path | None, typer.Option("--scans", help="Folder of the scans; with --from boxes.")] = None,
+    val_share: Annotated[
+        float, typer.Option("--val-share", min=0, max=0.9, help="Share of the recordings in ImageSets/val.txt.")
+    ] = 0.2,
+) -> None:
+    """Make a dataset of scans with boxes that train, inspect, prepare and eval read; no camera is needed.
+
+    The scans are referred to, not copied. Whole recordings go to one list, because neighboring scans look alike.
+
+    Example: asca import boxes.csv data/own --scans recordings/
+    """
+    from rich.console import Console
+
+    from asca_pillars.commands.extras import require
+    from asca_pillars.data.importing.argoverse2 import read_argoverse2
+    from asca_pillars.data.importing.box_files import read_box_files
+    from asca_pillars.data.importing.imported import write_imported
+    from asca_pillars.data.importing.nuscenes import read_nuscenes
+    from asca_pillars.errors import ConfigError
+
+    if (scans is not None) != (source_format == "boxes"):
+        raise ConfigError("--scans FOLDER goes with --from boxes, and only with it: other formats say where scans are")
+    if not source.exists():
+        raise ConfigError(f"{source}: no such file or folder; check the path")
+    if scans is not None:
+        imported = read_box_files(source, scans)
+    elif source_format == "argoverse2":
+        require("import")
+        imported = read_argoverse2(source)
+    else:
+        imported = read_nuscenes(source)
+    counts = write_imported(out, imported, val_share)
+    boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"
+    console = Console(markup=False, highlight=False)
+    console.print(f"{out}: {counts.train} frames to train on, {counts.val} to validate; boxes: {boxes}", soft_wrap=True)
+    console.print(f"Next: asca inspect {out} -c asca_small_sim --propose own.yaml", soft_wrap=True)

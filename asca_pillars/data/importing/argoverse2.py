@@ -1,0 +1,55 @@
+"""Argoverse 2's sensor dataset: <log>/annotations.feather and <log>/sensors/lidar/<timestamp_ns>.feather.
+
+Boxes and sweeps are in the vehicle's frame: x forward, y left, z up, origin on the rear axle near the ground. A sweep
+is labelled by the boxes of its own timestamp. Format: https://argoverse.github.io/user-guide/datasets/lidar.html
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from asca_pillars.data.boxes.box_records import records_from
+from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.imported import Imported, ImportedFrame
+from asca_pillars.data.scans.feather import feather_table
+from asca_pillars.errors import DatasetError
+
+_CENTER = ("tx_m", "ty_m", "tz_m")
+_SIZE = ("length_m", "width_m", "height_m")
+_TURN = ("qw", "qx", "qy", "qz")
+
+
+def read_argoverse2(root: Path) -> Imported:
+    """Every sweep of every log below `root` that has boxes.
+
+    Raises:
+        DatasetError: no log, or a file that is not of this format.
+        AscaError: pyarrow is not installed.
+    """
+    logs = sorted(path.parent for path in root.rglob("annotations.feather"))
+    if not logs:
+        raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
+    frames = [frame for log in logs for frame in _frames(log)]
+    return Imported(BoxDataset(scans=str(root.resolve()), reflectance_scale=255.0), frames)
+
+
+def _frames(log: Path) -> list[ImportedFrame]:
+    path = log / "annotations.feather"
+    names = ("timestamp_ns", "track_uuid", "category", *_CENTER, *_SIZE, *_TURN)
+    table = feather_table(path, names, DatasetError)
+    w, x, y, z = (table[name] for name in _TURN)
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    boxes = np.column_stack([*(table[name] for name in (*_CENTER, *_SIZE)), yaw]).astype(np.float64)
+    if not (np.isfinite(boxes).all() and (boxes[:, 3:6] > 0).all()):
+        row = int(np.argmin(np.isfinite(boxes).all(axis=1) & (boxes[:, 3:6] > 0).all(axis=1)))
+        raise DatasetError(f"{path}: row {row} has a number that is not finite or a size that is not positive")
+    frames = []
+    for stamp in np.unique(table["timestamp_ns"]).tolist():
+        folders = (log / "sensors" / "lidar", log / "lidar")
+        scan = next((scan for folder in folders if (scan := folder / f"{stamp}.feather").is_file()), None)
+        if scan is None:
+            continue  # a part of a log may have been downloaded
+        own = table["timestamp_ns"] == stamp
+        records = records_from(boxes[own], table["category"][own].tolist(), None, table["track_uuid"][own].tolist())
+        frames.append(ImportedFrame(scan.resolve(), records, log.name))
+    return frames

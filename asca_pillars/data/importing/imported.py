@@ -1,0 +1,80 @@
+"""What an import reads of any source, and the dataset that it writes of it (`data.boxes.box_split`): nothing is copied
+that can be referred to."""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from asca_pillars.data.boxes.box_records import BoxRecords, json_line
+from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, frame_id_of
+from asca_pillars.data.kitti import write_image_set
+from asca_pillars.errors import DatasetError
+from asca_pillars.files import atomic_path, require_own
+from asca_pillars.schema import to_dict
+
+
+class ImportedFrame(NamedTuple):
+    """A scan, its boxes in the LiDAR frame (x forward), and the recording that it is of."""
+
+    scan: Path
+    records: BoxRecords
+    recording: str
+
+
+class Imported(NamedTuple):
+    """The frames of a source, and how its scans are to be read; `settings.scans` is the folder that they are below."""
+
+    settings: BoxDataset
+    frames: Sequence[ImportedFrame]
+
+
+Importer = Callable[[Path], Imported]
+"""From the source's folder."""
+
+
+class ImportCounts(NamedTuple):
+    """What was written: frames of both lists, and boxes by class."""
+
+    train: int
+    val: int
+    boxes: dict[str, int]
+
+
+def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCounts:
+    """Write dataset.yaml, labels.jsonl, and the lists train and val, which share no recording where there are several.
+
+    Raises:
+        DatasetError: there is no frame.
+        OutputError: `out` holds something else.
+    """
+    scans = Path(imported.settings.scans)
+    frames = sorted(imported.frames, key=lambda frame: (frame.recording, frame.scan))
+    if not frames:
+        raise DatasetError(f"{scans}: no labelled scan there; give the folder that holds the recordings")
+    require_own(out, "asca import", DATASET_FILE)
+    with atomic_path(out / "labels.jsonl") as temporary, temporary.open("w", encoding="utf-8") as file:
+        for frame in frames:
+            file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records))
+    train, val = _lists(frames, val_share)
+    for name, own in (("train", train), ("val", val)):
+        write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
+    content = {key: value for key, value in to_dict(imported.settings).items() if key != "labels" and value is not None}
+    with atomic_path(out / DATASET_FILE) as temporary:
+        temporary.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    boxes = Counter(kind for frame in frames for kind in frame.records.types)
+    return ImportCounts(len(train), len(val), dict(boxes.most_common()))
+
+
+def _lists(frames: list[ImportedFrame], val_share: float) -> tuple[list[ImportedFrame], list[ImportedFrame]]:
+    """The last recordings for validation, or the end of the only one: neighboring scans look alike."""
+    recordings = list(dict.fromkeys(frame.recording for frame in frames))
+    if len(recordings) > 1:
+        held_out = set(recordings[len(recordings) - max(1, math.floor(val_share * len(recordings))) :])
+        val = [frame for frame in frames if frame.recording in held_out]
+        return [frame for frame in frames if frame.recording not in held_out], val
+    first = len(frames) - math.ceil(val_share * len(frames))
+    return (frames[:first], frames[first:]) if first else (frames, frames)

@@ -1,0 +1,197 @@
+"""Imports of small datasets in their published formats, made here."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from asca_pillars.cli import app
+from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.importing.nuscenes import read_nuscenes, rotation
+from asca_pillars.data.scans.find_scans import find_scans
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import AscaError, DatasetError, ScanError
+from asca_pillars.geometry.boxes import points_in_boxes
+from tests.data.boxes.box_scenes import write_box_dataset
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["import", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def quaternion(yaw: float, axis: tuple[float, float, float] = (0, 0, 1)) -> list[float]:
+    return [float(np.cos(yaw / 2)), *(float(np.sin(yaw / 2)) * value for value in axis)]
+
+
+def test_boxes_of_ones_own(tmp_path: Path) -> None:
+    own = write_box_dataset(tmp_path / "own", 4)
+    rows = ["scan,class,x,y,z,length,width,height,yaw,track_id"]
+    rows += [f"{number:06d}.bin,Forklift,{10 + number},1,-1,2.5,1.2,2,0.5,t{number}" for number in range(3)]
+    (tmp_path / "boxes.csv").write_text("\n".join(rows))
+    output = run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.5)
+    assert "2 frames to train on, 2 to validate; boxes: Forklift 3" in output.replace("\n", " ")
+    split = BoxSplit(tmp_path / "out", "val")
+    assert split.frame_ids == ("000002", "000003")  # without a row: no objects
+    assert split.labeled_boxes("000002").boxes[0].tolist() == pytest.approx([12, 1, -1, 2.5, 1.2, 2, 0.5])
+    assert split.records("000002").track_ids == ("t2",)
+    assert split.scan_path("000002").parent == own / "scans"  # referred to, not copied
+    run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")  # replaces its own
+
+
+def test_recordings_are_not_torn_apart(tmp_path: Path) -> None:
+    own = write_box_dataset(tmp_path / "own", 4)
+    for number, folder in enumerate("aabb"):
+        (own / "scans" / folder).mkdir(exist_ok=True)
+        (own / "scans" / f"{number:06d}.bin").rename(own / "scans" / folder / f"{number:06d}.bin")
+    (tmp_path / "boxes.csv").write_text("scan,class,x,y,z,length,width,height,yaw\na/000000.bin,Car,9,0,0,4,2,1,0")
+    run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.3)
+    assert BoxSplit(tmp_path / "out", "train").frame_ids == ("a/000000", "a/000001")
+    assert BoxSplit(tmp_path / "out", "val").frame_ids == ("b/000002", "b/000003")
+
+
+def write_argoverse2(root: Path) -> Path:
+    pyarrow, feather = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.feather")
+    rng = np.random.default_rng(0)
+    for log in ("log_a", "log_b"):
+        lidar = root / "val" / log / "sensors" / "lidar"
+        lidar.mkdir(parents=True)
+        points = np.array([20.0, 5, 1]) + rng.uniform(-0.4, 0.4, (50, 3))
+        columns = {name: points[:, axis].astype(np.float16) for axis, name in enumerate("xyz")}
+        columns["intensity"] = rng.integers(0, 256, 50).astype(np.uint8)
+        columns["laser_number"] = np.zeros(50, np.uint8)
+        feather.write_feather(pyarrow.table(columns), lidar / "315966265259836000.feather")
+        labels: dict[str, Any] = {"timestamp_ns": [315966265259836000, 315966265360032000], "track_uuid": ["u", "u"]}
+        labels |= {"category": ["REGULAR_VEHICLE"] * 2, "num_interior_pts": [50, 50]}
+        values = {"length_m": 4.0, "width_m": 2, "height_m": 1.6, "tx_m": 20, "ty_m": 5, "tz_m": 1}
+        values |= dict(zip(("qw", "qx", "qy", "qz"), quaternion(0.7), strict=True))
+        labels |= {name: [float(value)] * 2 for name, value in values.items()}
+        feather.write_feather(pyarrow.table(labels), root / "val" / log / "annotations.feather")
+    return root
+
+
+def test_argoverse2(tmp_path: Path) -> None:
+    source = write_argoverse2(tmp_path / "av2")
+    assert "REGULAR_VEHICLE 2" in run(source, tmp_path / "out", "--from", "argoverse2")
+    split = BoxSplit(tmp_path / "out", "train")
+    assert split.frame_ids == ("val/log_a/sensors/lidar/315966265259836000",)  # the other sweep is not there
+    boxes = split.labeled_boxes(split.frame_ids[0]).boxes
+    assert boxes[0].tolist() == pytest.approx([20, 5, 1, 4, 2, 1.6, 0.7])
+    points = split.points(split.frame_ids[0])
+    assert points_in_boxes(points, boxes).all() and points[:, 3].min() >= 0 and 0.5 < points[:, 3].max() <= 1
+    # The sweeps are scans for every command, labels and poses beside them are not.
+    assert [path.stem for path in find_scans(source)] == ["315966265259836000"] * 2
+    assert len(read_scan(find_scans(source)[0]).points) == 50
+
+
+def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    with pytest.raises(DatasetError, match=r"no annotations\.feather below"):
+        run(tmp_path, tmp_path / "out", "--from", "argoverse2")
+    (tmp_path / "1.feather").write_bytes(b"no feather")
+    with pytest.raises(ScanError, match=r"1\.feather: no readable feather file"):
+        read_scan(tmp_path / "1.feather")
+
+
+POSE_YAW, SENSOR_YAW = 0.4, -np.pi / 2  # nuScenes' LiDAR: its y axis looks ahead
+
+
+def write_nuscenes(root: Path) -> Path:
+    """One key frame with a car full of points, and an animal."""
+    world, ego = np.array([105.0, 52.0, 1.0]), np.array([100.0, 50.0, 0.0])
+    sensor = np.array([0.9, 0.0, 1.8])
+    in_sensor = rotation(quaternion(SENSOR_YAW)).T @ (rotation(quaternion(POSE_YAW)).T @ (world - ego) - sensor)
+    points = in_sensor + np.random.default_rng(0).uniform(-0.3, 0.3, (30, 3))
+    path = root / "samples" / "LIDAR_TOP" / "n__LIDAR_TOP__1.pcd.bin"
+    path.parent.mkdir(parents=True)
+    np.column_stack([points, np.full(30, 51.0), np.arange(30) % 32]).astype("<f4").tofile(path)
+    tables: dict[str, list[dict[str, Any]]] = {
+        "scene": [{"token": "sc", "name": "scene-0001"}],
+        "sample": [{"token": "sa", "scene_token": "sc"}],
+        "sensor": [{"token": "l", "channel": "LIDAR_TOP"}, {"token": "c", "channel": "CAM_FRONT"}],
+        "calibrated_sensor": [
+            {"token": "cl", "sensor_token": "l", "translation": sensor.tolist(), "rotation": quaternion(SENSOR_YAW)},
+            {"token": "cc", "sensor_token": "c", "translation": [0, 0, 0], "rotation": quaternion(0)},
+        ],
+        "ego_pose": [{"token": "e", "translation": ego.tolist(), "rotation": quaternion(POSE_YAW)}],
+        "category": [{"token": "k", "name": "vehicle.car"}, {"token": "a", "name": "animal"}],
+        "instance": [{"token": "i", "category_token": "k"}, {"token": "j", "category_token": "a"}],
+        "sample_annotation": [
+            {
+                "token": "1",
+                "sample_token": "sa",
+                "instance_token": "i",
+                "translation": world.tolist(),
+                "size": [2.0, 4.5, 1.6],
+                "rotation": quaternion(POSE_YAW + 0.3),
+            },
+            {
+                "token": "2",
+                "sample_token": "sa",
+                "instance_token": "j",
+                "translation": [90, 40, 0],
+                "size": [0.4, 1.0, 0.5],
+                "rotation": quaternion(0),
+            },
+        ],
+    }
+    data = {"sample_token": "sa", "ego_pose_token": "e", "is_key_frame": True}
+    tables["sample_data"] = [
+        {"token": "x", "calibrated_sensor_token": "cl", "filename": str(path.relative_to(root)), **data},
+        {"token": "y", "calibrated_sensor_token": "cc", "filename": "samples/CAM_FRONT/1.jpg", **data},
+        {"token": "z", "calibrated_sensor_token": "cl", "filename": "sweeps/2.bin", **data, "is_key_frame": False},
+    ]
+    (root / "v1.0-mini").mkdir()
+    for name, rows in tables.items():
+        (root / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))
+    return root
+
+
+def test_nuscenes(tmp_path: Path) -> None:
+    source = write_nuscenes(tmp_path / "nuscenes")
+    run(source, tmp_path / "out", "--from", "nuscenes")
+    split = BoxSplit(tmp_path / "out", "train")
+    (frame_id,) = split.frame_ids
+    boxes, types = split.labeled_boxes(frame_id)
+    assert types == ("car", "animal")
+    # In the vehicle's frame, turned back by 0.4, the car stands at (5.384, -0.105); the sensor 0.9 m ahead, 1.8 m up.
+    ahead, left = 5 * np.cos(0.4) + 2 * np.sin(0.4), -5 * np.sin(0.4) + 2 * np.cos(0.4)
+    assert boxes[0].tolist() == pytest.approx([ahead - 0.9, left, -0.8, 4.5, 2, 1.6, 0.3], abs=1e-4)
+    points = split.points(frame_id)
+    assert points_in_boxes(points, boxes[:1]).all() and points[:, 3] == pytest.approx(51 / 255)
+
+
+def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
+    source = write_nuscenes(tmp_path / "nuscenes")
+    with pytest.raises(DatasetError, match=r"one v1\.0-\*/ with nuScenes' tables is needed, there is none"):
+        read_nuscenes(tmp_path)
+    table = source / "v1.0-mini" / "scene.json"
+    table.write_text("[7]")
+    with pytest.raises(DatasetError, match=r"scene\.json: no table of nuScenes"):
+        read_nuscenes(source)
+    table.unlink()
+    with pytest.raises(DatasetError, match=r"scene\.json: cannot be read"):
+        read_nuscenes(source / "v1.0-mini")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["none.csv", "out", "--scans", "s"], "none.csv: no such file or folder"),
+        (["own", "out"], "--scans FOLDER goes with --from boxes"),
+        (["own", "out", "--from", "nuscenes", "--scans", "s"], "--scans FOLDER goes with --from boxes"),
+        (["own/labels.jsonl", "own/scans", "--scans", "own/scans"], "scans"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    write_box_dataset(tmp_path / "own", 2)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(AscaError) as caught:
+        run(*arguments)
+    assert message in str(caught.value) and "\n" not in str(caught.value)

@@ -1,0 +1,121 @@
+"""Classes, anchors, thresholds and ranges that are measured on labels."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from asca_pillars.cli import app
+from asca_pillars.config import Config, DataConfig, PillarModel, load_config
+from asca_pillars.data.boxes.box_records import json_line, records_from
+from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
+from asca_pillars.data.inspection.proposal import differences, propose
+from asca_pillars.data.kitti import write_image_set
+from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.errors import AscaError, DatasetError, OutputError
+from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.schema import parse
+from tests.data.boxes.box_scenes import write_box_dataset
+from tests.scenes import SPEC
+
+CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
+SIZES = {"Forklift": (2.6, 1.2, 2.2), "Pallet": (1.2, 0.8, 0.15)}
+
+
+def write_around(root: Path, frames: int, *, reach_m: float, z_m: float = 0.0) -> Path:
+    """Boxes full of points all around the sensor, standing on z_m."""
+    rng = np.random.default_rng(0)
+    lines = []
+    for number in range(frames):
+        boxes = []
+        for size in SIZES.values():
+            turn, away = rng.uniform(-np.pi, np.pi), rng.uniform(4, reach_m)
+            spread = np.array(size) * rng.uniform(0.9, 1.1, 3)
+            boxes.append([away * np.cos(turn), away * np.sin(turn), z_m + spread[2] / 2, *spread, rng.uniform(-3, 3)])
+        array = np.array(boxes)
+        points = np.repeat(array[:, :3], 20, axis=0) + rng.uniform(-0.05, 0.05, (40, 3))
+        write_scan(root / "scans" / f"{number}.bin", np.column_stack([points, rng.random(40)]))
+        lines.append(json_line(f"{number}.bin", records_from(array, list(SIZES))))
+    (root / "labels.jsonl").write_text("".join(lines))
+    (root / "dataset.yaml").write_text("")
+    write_image_set(root, "train", [str(number) for number in range(frames)])
+    return root
+
+
+def test_anchors_have_the_size_of_the_boxes(tmp_path: Path) -> None:
+    split = BoxSplit(write_around(tmp_path, 60, reach_m=30, z_m=0.3))
+    proposal = propose(split, CONFIG)
+    assert proposal.boxes == {"Forklift": 60, "Pallet": 60}
+    for item in proposal.config.model.spec.classes:
+        size = np.array([item.length_m, item.width_m, item.height_m])
+        np.testing.assert_allclose(size, SIZES[item.name], rtol=0.03, atol=0.01)
+        assert item.z_m == pytest.approx(0.3 + SIZES[item.name][2] / 2, abs=0.05)
+        assert item.negative_iou == pytest.approx(item.positive_iou - 0.15)
+    assert not proposal.config.data.camera_view  # there is no camera
+
+
+def test_the_grid_looks_where_the_boxes_are(tmp_path: Path) -> None:
+    split = BoxSplit(write_around(tmp_path, 60, reach_m=30, z_m=0.3))
+    spec = propose(split, CONFIG).config.model.spec
+    assert spec.grid.zones == 1 and spec.grid.x_range_m[0] == -spec.grid.x_range_m[1]
+    centers = np.concatenate([split.labeled_boxes(frame_id).boxes for frame_id in split.frame_ids])
+    assert spec.ranges.hold_centers(centers).mean() >= 0.94
+    assert spec.grid.z_range_m[0] < 0.3 and spec.grid.z_range_m[1] > 2.5
+    inspection = inspect_dataset(split, spec, CONFIG.data)
+    assert not [finding for finding in findings(inspection, spec, 1) if finding.level == "error"]
+    assert all(facts.forced <= 0.45 * facts.boxes for facts in inspection.classes)
+
+
+def test_a_range_that_holds_the_boxes_stays(tmp_path: Path) -> None:
+    split = BoxSplit(write_box_dataset(tmp_path, 12))
+    proposal = propose(split, CONFIG)
+    assert proposal.config.model.spec.grid == SPEC.grid
+    assert [item.name for item in proposal.config.model.spec.classes] == ["Car", "Forklift"]
+
+
+def test_a_range_ahead_is_widened_to_legal_ones(tmp_path: Path) -> None:
+    narrow = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-2.56, 2.56), v_max_m=0.32, zones=2)
+    config = replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=narrow)))
+    split = BoxSplit(write_box_dataset(tmp_path, 12))
+    grid = propose(split, config).config.model.spec.grid
+    assert grid.zones == 2 and grid.x_range_m[1] > 20 and grid.y_range_m == (-grid.y_range_m[1], grid.y_range_m[1])
+
+
+def test_pillars_get_room(tmp_path: Path) -> None:
+    config = replace(CONFIG, model=PillarModel(spec=replace(SPEC, limits=replace(SPEC.limits, max_pillars=100))))
+    assert propose(BoxSplit(write_box_dataset(tmp_path, 12)), config).config.model.spec.limits.max_pillars >= 1000
+
+
+def test_a_type_with_few_boxes_is_no_class(tmp_path: Path) -> None:
+    split = BoxSplit(write_box_dataset(tmp_path, 4))
+    with pytest.raises(DatasetError, match=r"no type has 10 boxes with points \(there are: Car 4, Forklift 4\)"):
+        propose(split, CONFIG)
+
+
+def test_the_yaml_gives_the_same_configuration(tmp_path: Path) -> None:
+    proposed = propose(BoxSplit(write_around(tmp_path, 20, reach_m=30)), CONFIG).config
+    text = yaml.safe_dump(differences(proposed), sort_keys=False)
+    assert parse(Config, yaml.safe_load(text), "text") == proposed
+    assert "learning_rate" not in text  # what is the default stays out
+
+
+def test_the_command_writes_what_it_then_inspects(tmp_path: Path) -> None:
+    root, path = write_around(tmp_path / "own", 20, reach_m=30), tmp_path / "own.yaml"
+    arguments = ["inspect", str(root), "-c", "asca_small_sim", "--propose", str(path)]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0 and f"asca train {path}" in result.output.replace("\n", "")
+    assert load_config(path).model.spec.class_names == ("Forklift", "Pallet")
+    with pytest.raises(OutputError, match=r"own\.yaml: is there already"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_a_class_without_labels_points_to_it(tmp_path: Path) -> None:
+    root = write_around(tmp_path / "own", 20, reach_m=30)
+    with pytest.raises(AscaError, match="let --propose measure the classes that there are"):
+        CliRunner().invoke(app, ["inspect", str(root), "-c", "asca_small_sim"], catch_exceptions=False)
