@@ -47,13 +47,11 @@ class ScanInput:
         return read_scan(path, columns=self._columns, reflectance_scale=self._scales[_folder_and_suffix(path)].scale)
 
     def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
-        if len(paths) == 1:
-            return FolderScale("auto", None)  # the reader's own remarks say what it took
+        where = folder if len(paths) > 1 else paths[0]
         decided = folder_reflectance_scale(paths, columns=self._columns)
         if decided.scale not in (1.0, "auto"):
-            self.said.append(f"{folder}: reflectances are stored as 0..{decided.scale:g} (--reflectance-scale)")
-        if decided.doubt:
-            self.said.append(f"{folder}: {decided.doubt}")
+            what = f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"
+            self.said.append(f"{where}: {decided.doubt or what}")
         return decided
 
     def _mounting(self, options: ScanOptions, paths: Sequence[Path]) -> Mounting:

@@ -1,27 +1,16 @@
-"""What the scans of a training looked like, and how far another scan is from them.
-
-A wrong reflectance scale or sensor height ruins detection without any error; here it becomes a sentence.
-"""
+"""What the scans of a training looked like: measured once, kept in the bundle, compared with by `input_check`."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.schema import Strict
-
-OUTSIDE_SHARE = 0.95
-SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
 
 RING_M = (4.0, 20.0)  # beyond the vehicle's own roof, before the beams become sparse
 PERCENTILE = 10.0  # below it lie ditches and reflections
 MIN_POINTS = 50
-
-TOLERANCE_M = 0.5
-"""A ground further than this from where a detector expects it is another sensor height, not another road."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +31,6 @@ class ExpectedInput(Strict):
     def sensor_height_m(self) -> float | None:
         """Height of the sensor above the ground in the middle of those scans; None where no scan showed it."""
         return None if self.ground_z_m is None else -sum(self.ground_z_m) / 2
-
-
-class InputWarning(NamedTuple):
-    """One way in which a scan is far from the training scans; `about` names the way, `text` is for people."""
-
-    about: str
-    text: str
 
 
 def ground_z_m(points: NDArray[np.float32]) -> float | None:
@@ -83,52 +65,3 @@ def measure_expected_input(scans: Iterable[NDArray[np.float32]], camera_view: bo
         ground_z_m=(min(grounds), max(grounds)) if grounds else None,
         camera_view=camera_view,
     )
-
-
-def check_input(points: NDArray[np.float32], counts: ScanCounts, expected: ExpectedInput) -> list[InputWarning]:
-    """Compare a scan with the training scans.
-
-    Args:
-        points: (N, 4) finite x, y, z in metres, LiDAR frame, and reflectance.
-        counts: what became of them on the detector's grid.
-        expected: of the training scans.
-    """
-    fewest, most = expected.points_per_scan
-    if len(points) < fewest / 10:
-        text = f"{len(points)} points, the training scans had {fewest} to {most}"
-        return [InputWarning("points", text)]  # too few to say anything else
-    # Column by column in memory, which is how it is read: NumPy is slow along rows of four.
-    sample = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLE_POINTS)].T).T
-    warnings = [_reflectance_warning(sample[:, 3], expected), _height_warning(sample, expected)]
-    if counts.points_outside > OUTSIDE_SHARE * counts.points:
-        share = 100 * counts.points_outside / counts.points
-        text = f"{share:.1f} % of the points lie outside the grid: x is forward, y left, z up, in metres"
-        warnings.append(InputWarning("range", text))
-    return [warning for warning in warnings if warning]
-
-
-def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:
-    low, high = expected.reflectance_mean
-    largest, mean = float(reflectance.max()), float(reflectance.mean(dtype=np.float64))
-    if largest > 1.5:
-        scale = 255 if largest <= 255 else 65535
-        text = f"reflectance reaches {largest:.4g}, the model was trained on 0..1: divide it by {scale}"
-        return InputWarning("reflectance", text)
-    if not low / 3 <= mean <= high * 3:
-        text = f"mean reflectance is {mean:.3g}, in training it was {low:.3g} to {high:.3g}: rescale it to 0..1"
-        return InputWarning("reflectance", text)
-    return None
-
-
-def _height_warning(points: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:
-    ground = ground_z_m(points)
-    if ground is None or expected.ground_z_m is None:
-        return None
-    low, high = expected.ground_z_m
-    if low - TOLERANCE_M <= ground <= high + TOLERANCE_M:
-        return None
-    text = (
-        f"the ground near the sensor lies at z = {ground:.2f} m, in training at {low:.2f} to {high:.2f} m: "
-        f"add {(low + high) / 2 - ground:+.2f} m to z"
-    )
-    return InputWarning("height", text)

@@ -45,8 +45,9 @@ class FrameChange:
     def points(self, points: NDArray[Any]) -> NDArray[np.float32]:
         """Points (N, >=3) float32, x, y, z first; further columns stay as they are."""
         changed = np.array(points, np.float32)
-        changed[:, :3] = points[:, :3] @ self.axes.T.astype(np.float32)
-        changed[:, :3] += self.shift_m.astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold lies outside every range
+            changed[:, :3] = changed[:, :3] @ self.axes.T.astype(np.float32)
+            changed[:, :3] += self.shift_m.astype(np.float32)
         return changed
 
     def boxes(self, boxes: NDArray[Any]) -> NDArray[np.float32]:

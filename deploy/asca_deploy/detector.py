@@ -19,7 +19,7 @@ from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.pipeline import Laps
 from asca_deploy.stream import overlapped
-from asca_pillars.data.expected_input import InputWarning, check_input
+from asca_pillars.data.input_check import InputWarning, check_input
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError, ScanError
@@ -213,7 +213,7 @@ class Detector:
         prepared = self.pipeline.prepare(points, frame.laps)
         if not frame.counts:
             expected = self.bundle.expected_input
-            frame.warnings[:0] = check_input(frame.usable.unclipped, prepared.counts, expected)
+            frame.warnings[:0] = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting)
             frame.laps.append(("input", perf_counter()))
         frame.counts.append(prepared.counts)
         return prepared
@@ -284,7 +284,9 @@ def _usable_points(points: NDArray[Any]) -> _Usable:
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is counted
         scan = np.ascontiguousarray(array, np.float32)
     if scan.ndim != 2 or scan.shape[1] != 4:
-        advice = "; append a column of reflectances 0..1" if scan.ndim == 2 and scan.shape[1] == 3 else ""
+        columns = scan.shape[1] if scan.ndim == 2 else 0
+        advice = "; append a column of reflectances 0..1" if columns == 3 else ""
+        advice = "; give the first four columns: points[:, :4]" if columns > 4 else advice
         raise ScanError(f"the points have shape {array.shape}, not (N, 4): x, y, z, reflectance{advice}")
     finite, non_finite = np.isfinite(scan), 0
     if not finite.all():

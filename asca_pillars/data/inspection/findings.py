@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from asca_pillars.data.expected_input import TOLERANCE_M
+from asca_pillars.data.input_check import TOLERANCE_M
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
 from asca_pillars.pillars.pillar_spec import PillarSpec
 

@@ -41,7 +41,8 @@ def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:
     if size % (4 * columns):
         raise ScanError(
             f"{path}: {size} bytes are no whole number of points of {4 * columns} (float32 "
-            f"{_FOUR if columns == 4 else f'in {columns} columns'}); state the columns if there are others, or {AGAIN}"
+            f"{_FOUR if columns == 4 else f'in {columns} columns'}); state other columns "
+            f"(--columns), or {AGAIN}"
         )
     table = data.reshape(-1, columns)
     reflectance = table[:, 3] if columns > 3 else None
@@ -63,7 +64,7 @@ def _columns(path: Path, size: int, data: NDArray[np.float32]) -> int:
     if size % 16 == 0 and _plausible(data.reshape(-1, 4)):
         if not varied:
             return 4
-        raise ScanError(f"{path}: may be four columns ({_FOUR}) or five ({_FIVE}); state which (columns)")
+        raise ScanError(f"{path}: may be four columns ({_FOUR}) or five ({_FIVE}); state which (--columns)")
     return 5
 
 

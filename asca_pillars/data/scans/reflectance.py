@@ -89,7 +89,10 @@ def ambiguity(values: NDArray[np.generic], scale: float) -> str | None:
     """A sentence if reflectances taken as 0..255 may as well be 0..100."""
     if scale != 255 or _many_above(values, 100):
         return None
-    return "no reflectance is much above 100 and they were taken as 0..255; if they are 0..100, state that scale"
+    return (
+        "no reflectance is much above 100 and they were taken as 0..255; if they are 0..100, state that scale "
+        "(--reflectance-scale 100)"
+    )
 
 
 def common_scale(samples: Sequence[tuple[NDArray[np.generic], np.dtype[np.generic] | None]]) -> float:

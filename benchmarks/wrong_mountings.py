@@ -1,0 +1,111 @@
+"""Right scans made wrong on purpose: is it noticed, and does the remedy that the warning names bring the boxes back?
+
+    python -m benchmarks.wrong_mountings data/kitti/training/velodyne
+
+Files are written as another sensor's would be and read back, as `asca detect` does it.
+"""
+
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from asca_deploy import Detections, Detector
+from asca_pillars.commands.options import ScanOptions
+from asca_pillars.commands.scan_input import ScanInput
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scans.find_scans import find_scans
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import AscaError
+from asca_pillars.geometry.overlap import bev_iou
+
+MIN_IOU = 0.5
+Points = NDArray[np.float32]
+
+
+class Mistake(NamedTuple):
+    """One way to get a scan wrong."""
+
+    make: Callable[[Points], Points]
+    """(N, 4) right -> (N, 4 or 5) as the wrong file holds it."""
+    mounting: Mounting
+    """That would be right for it."""
+
+
+def _scaled(scale: float) -> Callable[[Points], Points]:
+    return lambda points: np.column_stack([points[:, :3], np.round(points[:, 3] * scale)])
+
+
+def _seen(axes: str) -> Mistake:
+    mounting = Mounting(axes=axes)
+    return Mistake(mounting.level.inverse.points, mounting)
+
+
+MISTAKES = {
+    "none": Mistake(lambda points: points, Mounting()),
+    "z = 0 on the ground": Mistake(lambda points: points + np.float32([0, 0, 1.73, 0]), Mounting(sensor_height_m=0.0)),
+    "y forward": _seen("y-forward"),
+    "z down": _seen("x,-y,-z"),
+    "reflectance 0..100": Mistake(_scaled(100), Mounting()),
+    "reflectance 0..255": Mistake(_scaled(255), Mounting()),
+    "five columns": Mistake(lambda points: np.column_stack([points, np.arange(len(points)) % 64]), Mounting()),
+}
+
+
+def main(scans: Annotated[Path, typer.Argument(help="Right scans of the sensor of the training.")]) -> None:
+    """Print how often each mistake is noticed, and how many boxes of the right scans come back."""
+    files, columns = find_scans(scans), ("mistake", "noticed", "boxes before", "with the remedy")
+    table = Table(title=f"{len(files)} scans")
+    for column in columns:
+        table.add_column(column, justify="left" if column == "mistake" else "right")
+    right = [Detector()(read_scan(path).points) for path in files]
+    for name, mistake in MISTAKES.items():
+        rows = [_try(path, mistake, boxes) for path, boxes in zip(track(files, name), right, strict=True)]
+        noticed, before, after = np.sum(rows, axis=0)
+        total = sum(map(len, right))
+        table.add_row(name, f"{noticed} of {len(files)}", f"{before} of {total}", f"{after} of {total}")
+    Console().print(table)
+
+
+def _try(path: Path, mistake: Mistake, right: Detections) -> tuple[int, int, int]:
+    """Whether it is noticed, and the boxes of the right scan that are found before and with the remedy."""
+    with tempfile.TemporaryDirectory() as folder:
+        wrong = Path(folder) / "scan.bin"
+        mistake.make(read_scan(path).points).astype("<f4").tofile(wrong)
+        texts, found = _detect(wrong, ScanOptions())
+        options = dict(re.findall(r"\(--([a-z-]+) (\S+?)(?: or auto)?\)", " ".join(texts)))
+        remedy = ScanOptions(**{name.replace("-", "_"): value for name, value in options.items()})
+        _, mended = _detect(wrong, remedy)
+    own = mistake.mounting.to_model(Detector().bundle.expected_input.sensor_height_m)
+    return (
+        int(bool(texts)),
+        _found(right, own.boxes(found.boxes), found),
+        _found(right, own.boxes(mended.boxes), mended),
+    )
+
+
+def _detect(path: Path, options: ScanOptions) -> tuple[list[str], Detections]:
+    try:
+        scan_input = ScanInput(options, [path])
+        scan = scan_input.read(path)
+    except AscaError as error:
+        return [str(error)], Detections.empty(())
+    found = Detector(mounting=scan_input.mounting)(scan.points)
+    return [*scan_input.said, *scan.notes.remarks, *found.report.warnings], found
+
+
+def _found(right: Detections, boxes: NDArray[np.float32], found: Detections) -> int:
+    same = right.labels[:, None] == found.labels[None]
+    return int((same & (bev_iou(right.boxes, boxes) >= MIN_IOU)).any(axis=1).sum())
+
+
+if __name__ == "__main__":
+    typer.run(main)
