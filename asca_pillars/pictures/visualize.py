@@ -89,7 +89,10 @@ def draw_bev(
 def draw_layers(
     points: NDArray[np.floating], layers: Sequence[BoxLayer], ranges: Ranges, *, width_px: int = 1000
 ) -> Image:
-    """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend."""
+    """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend.
+
+    Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR.
+    """
     points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
     view = View.around(np.concatenate([points[:, :2], *(o.reshape(-1, 2) for o in outlines)]), ranges, width_px)

@@ -138,7 +138,7 @@ class Detector:
         that live as long as the iterator; see `asca_deploy.stream`.
 
         Args:
-            scans: each as for a call; read in another thread, at most one ahead of the one asked for.
+            scans: (N, 4) each, as for a call; read in another thread, at most one ahead of the one asked for.
 
         Raises:
             ScanError: a scan cannot be used; the scans before it have been yielded. Errors of `scans` itself come in

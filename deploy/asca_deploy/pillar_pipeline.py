@@ -111,14 +111,14 @@ class PillarPipeline:
         return PreparedPillars(canvas, pillars.stats)
 
     def infer(self, prepared: PreparedPillars, laps: Laps) -> Maps:
-        """The canvas -> logits and residuals on the head's map."""
+        """The canvas -> head maps (channels, H, W) of logits and residuals."""
         maps = self.neck_and_head(prepared.canvas.image)
         self._free.append(prepared.canvas)
         laps.append(("neck+head", perf_counter()))
         return maps
 
     def finish(self, raw: Maps, laps: Laps) -> Detections:
-        """Head maps -> boxes above the score threshold that survive the rotated NMS."""
+        """Head maps (channels, H, W) -> boxes, LiDAR frame, above the score threshold that the rotated NMS keeps."""
         detections = decode(raw, self._anchors, self.spec.classes, self.spec.post)
         laps.append(("decode", perf_counter()))
         return detections
@@ -128,7 +128,7 @@ class PillarPipeline:
         return pillarize(points, self.spec.grid, self.spec.limits)
 
     def encode(self, pillars: Pillars) -> NDArray[Any]:
-        """Features (M, 9) -> pillar features (P, C), of the canvas's type. Paper section 3.2."""
+        """Features (M, 9) -> unitless pillar features (P, C), of the canvas's type. Paper section 3.2."""
         if not len(pillars.cells):
             return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
         values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three

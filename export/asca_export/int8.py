@@ -66,8 +66,8 @@ def quantize_bundle(
     Args:
         folder: a proven float bundle.
         detector: what it was exported from, in evaluation mode.
-        calibration: scans (N, 4) that set the ranges, at least MIN_CALIBRATION of them with points on the grid; those
-            that are among `scans` are left out, or the comparison would be with what it was fitted to.
+        calibration: scans (N, 4), LiDAR frame, that set the ranges, at least MIN_CALIBRATION of them with points on
+            the grid; those that are among `scans` are left out, or the comparison would be with what it was fitted to.
         scans: to measure on.
         say: told what is being done.
 

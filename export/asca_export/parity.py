@@ -40,7 +40,7 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
     Args:
         detector: in evaluation mode.
         runtime: opened on the bundle that was exported from it.
-        scans: (N, 4) each.
+        scans: (N, 4) each, LiDAR frame.
 
     Raises:
         ExportError: they differ; names the first stage that does, and the scan.
@@ -84,7 +84,7 @@ def _require_close(
 
 
 def compare_boxes(expected: Maps, found: Maps, spec: PillarSpec, scan: int = 0) -> BoxDifference:
-    """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
+    """Decode both head maps, (channels, H, W), and pair the boxes before and after NMS; every box needs a partner.
 
     Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
     suppression nothing but the thresholds can excuse a difference; after it, which of two overlapping boxes of equal

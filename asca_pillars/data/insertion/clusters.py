@@ -13,7 +13,9 @@ _TILE_M = 5.0
 
 
 def cluster_boxes(obstacles: NDArray[np.float64], ground: Ground) -> NDArray[np.float32]:
-    """Steps 3 and 4: DBSCAN of obstacle points (N, 3), and the minimum-area rectangle of each cluster as a box.
+    """Steps 3 and 4: DBSCAN of obstacle points (N, 3), and the minimum-area rectangle of each cluster as a box (K, 7).
+
+    Points and boxes are in metres and radians, LiDAR frame.
 
     Clustered are the cells in which points lie, weighted by their number: some thousand instead of ten thousands. A
     cluster larger than any vehicle is a row of houses, hedges and parked cars; its rectangle would take the street

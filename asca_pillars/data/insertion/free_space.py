@@ -45,7 +45,7 @@ class FreeSpace:
 
     @cached_property
     def cells(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Middles (2, F) of the free cells, x and y, and their distances (F,) from the sensor."""
+        """Centers (2, F) of the free cells, x and y, and their distances (F,) from the sensor, metres, LiDAR frame."""
         if self.ground is None:
             return np.zeros((2, 0)), np.zeros(0)
         xy = self.ground.origin_m[:, None] + (np.array(np.nonzero(self.free)) + 0.5) * CELL_M
@@ -63,7 +63,7 @@ class FreeSpace:
 
 
 def find_free_space(points: _Floats) -> FreeSpace:
-    """Steps 2 to 4 on the points (N, >=3) of one scan."""
+    """Steps 2 to 4 on the points (N, >=3) of one scan, metres, LiDAR frame."""
     nothing = FreeSpace(None, np.zeros((0, 0), bool), np.zeros((0, 7), np.float32))
     ground = fit_ground(points)
     if ground is None:

@@ -94,7 +94,7 @@ def measure_frame(split: KittiSplit, frame_id: str, spec: PillarSpec, data: Data
 
 
 def match(frame: LabeledFrame, spec: PillarSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The `MatchOutcome` of each box (M,), and the number of positive anchors of each class (C,)."""
+    """The `MatchOutcome` of each box (M,), and counts (C,) of the positive anchors of each class."""
     # Rows in the place of the labels tell which boxes the grid holds.
     kept = within_ranges(replace(frame, labels=np.arange(len(frame.boxes))), spec.ranges).labels
     boxes, labels = frame.boxes[kept], frame.labels[kept]
@@ -111,7 +111,7 @@ def match(frame: LabeledFrame, spec: PillarSpec) -> tuple[NDArray[np.int64], NDA
 
 
 def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: PillarSpec) -> ScanMeasure:
-    """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4)."""
+    """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4), in the LiDAR frame."""
     finite = stored[np.isfinite(stored).all(axis=1)]
     ground = ground_z_m(finite)
     cells = spec.grid.cells(seen)

@@ -86,14 +86,17 @@ def decide_scale(
 
 
 def ambiguity(values: NDArray[np.generic], scale: float) -> str | None:
-    """A sentence if reflectances taken as 0..255 may as well be 0..100."""
+    """A sentence if reflectances (N,) taken as 0..255 may as well be 0..100."""
     if scale != 255 or _many_above(values, 100):
         return None
     return "no reflectance is much above 100 and they were taken as 0..255; if they are 0..100, state that scale"
 
 
 def common_scale(samples: Sequence[tuple[NDArray[np.generic], np.dtype[np.generic] | None]]) -> float:
-    """One scale for the scans of a folder: the largest that any of a sample of them, (values, dtype), is stored in."""
+    """One scale for the scans of a folder: the largest that any of a sample of them is stored in.
+
+    Each sample is a scan's reflectances (N,), and the type that its file declares for them.
+    """
     return max((decide_scale(values, dtype)[0] for values, dtype in samples), default=1.0)
 
 

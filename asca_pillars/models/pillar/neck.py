@@ -40,7 +40,7 @@ class RPNNeck(nn.Module):
         self.out_channels = upsample_channels * len(self.blocks)
 
     def forward(self, canvas: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, out_channels, H / 2, W / 2); 384 channels with Table 1's widths."""
+        """Unitless (B, C, H, W) -> (B, out_channels, H / 2, W / 2); 384 channels with Table 1's widths."""
         maps = []
         for block, deblock in zip(self.blocks, self.deblocks, strict=True):
             canvas = block(canvas)

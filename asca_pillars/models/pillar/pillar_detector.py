@@ -39,7 +39,7 @@ class PillarDetector(nn.Module):
         self.head = head
 
     def forward(self, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Pillars of B frames -> head maps, see `SSDHead`."""
+        """Pillars of B frames -> head maps (B, channels, H, W) of logits and residuals, see `HeadMaps`."""
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
@@ -48,16 +48,16 @@ class PillarDetector(nn.Module):
         return maps
 
     def predict(self, batch: LabeledPillars) -> HeadMaps[Tensor]:
-        """Head maps of B labelled frames."""
+        """Head maps (B, channels, H, W) of logits and residuals of B labelled frames."""
         maps: HeadMaps[Tensor] = self(batch.pillars)
         return maps
 
     def loss(self, outputs: HeadMaps[Tensor], batch: LabeledPillars) -> Mapping[str, Tensor]:
-        """The terms of eq. (15) by name, see `detection_loss`."""
+        """Terms of the loss, eq. (15), by name, scalars, from head maps (B, channels, H, W); see `detection_loss`."""
         return detection_loss(outputs, batch.targets, self.loss_weights)._asdict()
 
     def detect(self, outputs: HeadMaps[Tensor], spec: DetectorSpec) -> list[Detections]:
-        """Boxes in the head maps of each frame, with the thresholds of `spec`."""
+        """Boxes in head maps (B, channels, H, W) for each frame, LiDAR frame, with the thresholds of `spec`."""
         arrays = [part.float().cpu().numpy() for part in outputs]
         return [spec.decode(HeadMaps(*frame)) for frame in zip(*arrays, strict=True)]
 

@@ -61,7 +61,7 @@ MOTORCYCLE_SHARE = 0.2  # of Misc, whose smallest quarter is two-wheelers
 
 
 def draw_size(rng: np.random.Generator, name: str) -> Floats:
-    """Length, width, height of a label box, metres."""
+    """(3,) length, width, height of a label box, metres."""
     if name == "Misc" and rng.random() < MOTORCYCLE_SHARE:
         return rng.uniform((1.7, 0.60, 1.45), (2.3, 0.90, 1.85))
     if name == "Car" and rng.random() < MICROCAR_SHARE:

@@ -51,7 +51,7 @@ def measure_matrix(
 
     Args:
         bundles: folders by name. The first one's default on the CPU is the reference and the first row.
-        scans: (N, 4) each.
+        scans: (N, 4) each, LiDAR frame.
     """
     opened: dict[Way, Detector | str] = {}
     ways = [way for bundle in bundles for way in _ways(bundle)]
