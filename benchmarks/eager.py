@@ -41,6 +41,7 @@ Scans = Sequence[NDArray[np.float32]]
 
 
 def main(
+    *,
     scans: Annotated[Path | None, typer.Argument(help="A scan or a folder of them. Default: the sample.")] = None,
     config: Annotated[
         str, typer.Option(help="Without a checkpoint: network to give random weights, a YAML or one that ships.")

@@ -142,7 +142,7 @@ def _stable_argsort(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return order
 
 
-def _fill_pillars(
+def _fill_pillars(  # noqa: PLR0917  (called with the arguments of its compiled form)
     points: NDArray[np.float32],
     order: NDArray[np.int64],
     cells: NDArray[np.int64],

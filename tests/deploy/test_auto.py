@@ -47,9 +47,11 @@ def rescored(index: int, score: float) -> Detections:
 def with_a_fourth(score: float) -> Detections:
     extra = BOXES[:1] + np.array([20, 0, 0, 0, 0, 0, 0], np.float32)
     return Detections(
-        np.concatenate([BOXES, extra]), np.append(FOUND.scores, np.float32(score)), np.append(FOUND.labels, 2),
+        np.concatenate([BOXES, extra]),
+        np.append(FOUND.scores, np.float32(score)),
+        np.append(FOUND.labels, 2),
         FOUND.class_names,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(

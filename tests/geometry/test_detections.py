@@ -66,9 +66,16 @@ def test_iteration_gives_each_detection() -> None:
 def test_plain_values() -> None:
     first = THREE.to_dicts()[0]
     assert first == {
-        "class": "Car", "score": 0.9, "x_m": 3.0, "y_m": -4.0, "z_m": 0.0,
-        "length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "yaw_rad": 0.0,
-    }  # fmt: skip
+        "class": "Car",
+        "score": 0.9,
+        "x_m": 3.0,
+        "y_m": -4.0,
+        "z_m": 0.0,
+        "length_m": 4.0,
+        "width_m": 2.0,
+        "height_m": 1.5,
+        "yaw_rad": 0.0,
+    }
     assert json.loads(THREE.to_json()) == THREE.to_dicts()
 
 

@@ -94,6 +94,7 @@ class Lidar:
 
     @property
     def rings(self) -> int:
+        """Number of lasers."""
         return len(self.elevation_deg)
 
     @property
@@ -129,6 +130,7 @@ class Firings:
 
     @property
     def lost_power(self) -> float:
+        """The received power below which a firing returns nothing in this scan."""
         return self.zero_power * self.lidar.lost_share_of_zero_power
 
 

@@ -31,6 +31,7 @@ class Stretch:
 
     @property
     def middle_m(self) -> float:
+        """Its middle along the road."""
         return self.start_m + self.length_m / 2
 
     def along(self, step_m: float) -> Floats:
@@ -105,6 +106,7 @@ class Builder:
         radius: float,
         reflectance: float,
         cross: bool = False,
+        *,
         taper: float = 1.0,
         lean: tuple[float, float] = (0.0, 0.0),
     ) -> None:
@@ -131,6 +133,7 @@ class Builder:
         reflectance: float,
         density_per_m: Floats,
         cross: bool = False,
+        *,
         turned: bool = True,
     ) -> None:
         """N clouds of leaves: ellipsoids of radii (N, 3), metres, around z (N,) above the ground.

@@ -11,8 +11,10 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SizeStatistics:
-    """Label sizes in metres, each (length, width, height), and the correlations length-width, length-height,
-    width-height."""
+    """Label sizes in metres, each (length, width, height), and their correlations.
+
+    Correlations are length-width, length-height, width-height.
+    """
 
     mean: tuple[float, float, float]
     deviation: tuple[float, float, float]
