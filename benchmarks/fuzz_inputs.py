@@ -73,7 +73,7 @@ def kinds(folder: Path) -> list[Kind]:
     bundle = _bundle(folder / "bundle")
     labels = (f"{LABEL}\n{LABEL.replace('Car', 'DontCare')}\n".encode(), b"", LABEL.replace("0.00", "-1").encode())
     scored = (f"{LABEL} 0.9\n{LABEL} 0.1\n".encode(), b"")
-    overrides = ("train.epochs=20", "detector.grid.x_range_m=[0, 61.44]", "augment.insert.proportions={Car: 1}")
+    overrides = ("train.epochs=20", "model.spec.grid.x_range_m=[0, 61.44]", "augment.insert.proportions={Car: 1}")
     text = yaml.safe_dump(to_dict(Config()), sort_keys=False)
     configs = (b"name: x\naugment: {scale: [1, 2]}\n", *(p.read_bytes() for p in shipped_configs().values()))
     sections = [f"{key}:{part}".encode() for key, part in _sections(text)]
@@ -160,5 +160,5 @@ def _sections(text: str) -> list[tuple[str, str]]:
 
 def _numbers(config: Config) -> Any:
     """The numbers of a config, and those of the grid that follow from it."""
-    grid = config.detector.grid
+    grid = config.model.spec.grid
     return to_dict(config), grid.nx, grid.ny

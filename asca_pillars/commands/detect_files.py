@@ -7,14 +7,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-import cv2
-
 from asca_deploy import Detections
 from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.scans.scan_reader import Scan
-from asca_pillars.files import atomic_path, write_json
+from asca_pillars.files import atomic_path, require_own, write_json
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.pictures.visualize import draw_bev, draw_on_image, write_png
+from asca_pillars.pictures.visualize import draw_bev, draw_on_image, read_image, write_png
 
 RUN_FILE = "detections.jsonl"
 
@@ -23,19 +21,21 @@ class ResultWriter:
     """Writes the results of scan after scan to a folder; `detections.jsonl` appears when the block ends well.
 
     Args:
-        out: the folder; files of other names in it stay.
+        out: the folder: absent, empty, or that of an earlier run. Results of other scans in it stay.
         ranges: what the bird's-eye pictures show.
         pictures: False writes no picture.
+
+    Raises:
+        OutputError: when the block is entered, if `out` holds files of something else.
     """
 
     def __init__(self, out: Path, ranges: Ranges, *, pictures: bool) -> None:
         self._out, self._ranges, self._pictures = out, ranges, pictures
         self._stack = ExitStack()
-        self._lines: IO[str]
+        self._lines: IO[str] | None = None
 
     def __enter__(self) -> "ResultWriter":
-        temporary = self._stack.enter_context(atomic_path(self._out / RUN_FILE))
-        self._lines = self._stack.enter_context(temporary.open("w", encoding="utf-8"))
+        require_own(self._out, "asca detect", RUN_FILE)
         return self
 
     def __exit__(
@@ -45,6 +45,8 @@ class ResultWriter:
 
     def __call__(self, path: Path, name: Path, scan: Scan, detections: Detections) -> None:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
+        if self._lines is None:
+            self._lines = self._open()
         content = _content(path, scan, detections)
         write_json(self._named(name, ".json"), content)
         self._lines.write(json.dumps(content) + "\n")
@@ -54,12 +56,18 @@ class ResultWriter:
         if path.parent.name != "velodyne" or not calib_path.exists():
             return
         calibration = read_calibration(calib_path)
-        image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
-        image = cv2.imread(str(image_path)) if image_path.exists() else None
+        image = read_image(path.parent.parent / "image_2" / f"{path.stem}.png")
         _write_kitti(self._named(name, ".txt"), detections, calibration, image)
         if image is not None and self._pictures:
             drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
             write_png(self._named(name, "_image.png"), drawn)
+
+    def _open(self) -> IO[str]:
+        if not (self._out / RUN_FILE).exists():
+            with atomic_path(self._out / RUN_FILE):
+                pass  # marks the folder from the start, so that a run that was killed can be given again
+        temporary = self._stack.enter_context(atomic_path(self._out / RUN_FILE))
+        return self._stack.enter_context(temporary.open("w", encoding="utf-8"))
 
     def _named(self, name: Path, ending: str) -> Path:
         # Not with_suffix: a name may hold dots of its own.

@@ -1,23 +1,99 @@
-"""`asca detect` says what it dropped and what it ran on."""
+"""`asca detect`: one result per scan whatever their names, one bad scan does not end the rest, and what it says."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from asca_deploy import sample_scan_path
-from asca_pillars.commands.detect import run
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.commands.detect import detect
+from asca_pillars.commands.detect_files import ResultWriter
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
+from asca_pillars.errors import OutputError, ScanError
+
+POINTS = read_scan(sample_scan_path()).points[::10].copy()
 
 
 def test_dropped_points_and_arithmetic_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points = read_scan(sample_scan_path()).points[::10].copy()
+    points = POINTS.copy()
     points[:7, 0] = np.nan
     np.save(tmp_path / "scan.npy", points)
-    run(tmp_path / "scan.npy", tmp_path / "out", None, None, "cpu", None, 1)
+    detect([tmp_path / "scan.npy"], out=tmp_path / "out", threads=1)
     said = " ".join(capsys.readouterr().out.split())
-    assert "7 points of 1 scan(s) are not finite and were dropped" in said and said.count("not finite") == 1
+    assert "scan.npy: 7 points are not finite and were dropped" in said and said.count("not finite") == 1
     assert "cpu int8, 1 threads" in said
     written = json.loads((tmp_path / "out" / "scan.json").read_text())
     assert (written["points_not_finite"], written["points"]) == (7, len(points) - 7)
+
+
+def test_a_damaged_scan_is_named_and_the_others_are_detected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("1.bin", "3.bin"):
+        write_scan(tmp_path / "mix" / name, POINTS)
+    (tmp_path / "mix" / "2.bin").write_bytes(b"torn")
+    with pytest.raises(ScanError, match=r"1 of 3 scans could not be read"):
+        detect([tmp_path / "mix"], out=tmp_path / "out", threads=1, pictures=False)
+    captured = capsys.readouterr()
+    assert "2.bin: 4 bytes" in captured.err and "3.bin" in captured.out
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "3.json", "detections.jsonl"}
+
+
+def test_scans_of_one_stem_keep_their_results_apart(tmp_path: Path) -> None:
+    write_scan(tmp_path / "same" / "a.bin", POINTS)
+    np.save(tmp_path / "same" / "a.npy", POINTS[:100])
+    write_scan(tmp_path / "same" / "below" / "a.bin", POINTS)
+    detect([tmp_path / "same"], out=tmp_path / "out", threads=1, pictures=False)
+    names = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.json")}
+    assert names == {"a.bin.json", "a.npy.json", "below/a.json"}
+
+
+def test_one_file_holds_the_whole_run_line_by_line(tmp_path: Path) -> None:
+    for name in ("1.bin", "2.bin"):
+        write_scan(tmp_path / "drive" / name, POINTS)
+    detect([tmp_path / "drive"], out=tmp_path / "out", threads=1)
+    lines = [json.loads(line) for line in (tmp_path / "out" / "detections.jsonl").read_text().splitlines()]
+    assert [Path(line["scan"]).name for line in lines] == ["1.bin", "2.bin"]
+    assert lines == [json.loads((tmp_path / "out" / f"{name}.json").read_text()) for name in ("1", "2")]
+    assert (tmp_path / "out" / "1_bev.png").is_file()
+
+
+def test_a_folder_of_other_files_is_refused_and_one_of_an_earlier_run_is_not(tmp_path: Path) -> None:
+    for name in ("1.bin", "2.bin"):
+        write_scan(tmp_path / "scans" / name, POINTS)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "1.json").write_text("mine")
+    with pytest.raises(OutputError, match=r"holds 1\.json and nothing that `asca detect` wrote"):
+        detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
+    assert (tmp_path / "mine" / "1.json").read_text() == "mine"
+    for scans in (tmp_path / "scans", tmp_path / "scans" / "2.bin"):
+        detect([scans], out=tmp_path / "out", threads=1, pictures=False)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "2.json", "detections.jsonl"}
+    assert len((tmp_path / "out" / "detections.jsonl").read_text().splitlines()) == 1
+
+
+def test_a_run_that_was_broken_off_can_be_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("1.bin", "2.bin"):
+        write_scan(tmp_path / "scans" / name, POINTS)
+    write = ResultWriter.__call__
+
+    def stop_at_the_second(self: ResultWriter, path: Path, *rest: Any) -> None:
+        if path.name == "2.bin":
+            raise KeyboardInterrupt
+        write(self, path, *rest)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(ResultWriter, "__call__", stop_at_the_second)
+        detect([tmp_path / "scans"], out=tmp_path / "out", threads=1, pictures=False)
+    assert (tmp_path / "out" / "1.json").is_file()
+    detect([tmp_path / "scans"], out=tmp_path / "out", threads=1, pictures=False)
+    assert len((tmp_path / "out" / "detections.jsonl").read_text().splitlines()) == 2
+
+
+def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
+    for name in ("1.bin", "2.bin"):
+        (tmp_path / name).write_bytes(b"torn")
+    with pytest.raises(ScanError, match="none of the 2 scans can be read"):
+        detect([tmp_path], out=tmp_path / "out", threads=1)

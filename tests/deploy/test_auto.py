@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector, auto
+from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider
 from asca_pillars.errors import BundleError, ProviderError
 from asca_pillars.geometry.anchors import KITTI_CLASSES
 from asca_pillars.geometry.detections import Detections
@@ -97,6 +98,11 @@ def test_without_a_clear_box_nothing_is_proven() -> None:
         assert "unproven" in str(auto.disagreement(nothing, nothing, THRESHOLDS))
 
 
+def way(name: str) -> tuple[Provider, Precision]:
+    """cpu_float32 -> its provider and precision."""
+    return next((p, q) for p in PROVIDERS for q in PRECISIONS if f"{p}_{q}" == name)
+
+
 class Machine:
     """Networks of stub providers: what each finds, and how long that takes by a clock of their own."""
 
@@ -105,11 +111,11 @@ class Machine:
         seconds: float
 
     def __init__(self, **networks: tuple[Detections | Exception, float]) -> None:
-        self.networks = {tuple(name.split("_")): self.Network(*network) for name, network in networks.items()}
-        self.opened: list[tuple[str, str]] = []
+        self.networks = {way(name): self.Network(*network) for name, network in networks.items()}
+        self.opened: list[tuple[Provider, Precision]] = []
         self.now = 100.0
 
-    def open(self, provider: str, precision: str) -> Network:
+    def open(self, provider: Provider, precision: Precision) -> Network:
         self.opened.append((provider, precision))
         network = self.networks[provider, precision]
         if isinstance(network.found, ProviderError):
@@ -122,7 +128,7 @@ class Machine:
             raise network.found
         return network.found
 
-    def choose(self, precision: str | None = None) -> auto.Choice[Network]:
+    def choose(self, precision: Precision | None = None) -> auto.Choice[Network]:
         names = list(self.networks)
         return auto.choose(names, self.open, self.detect, THRESHOLDS, precision, lambda: self.now)
 

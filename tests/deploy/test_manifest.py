@@ -269,7 +269,7 @@ WITHOUT_EFFECT_ON_BOXES = (
     "provenance",
     "backbone_gmac",
 )
-HOSTILE = (
+HOSTILE: tuple[Any, ...] = (
     None,
     True,
     False,

@@ -3,6 +3,7 @@
 import copy
 import json
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,8 +35,8 @@ def test_names_and_distances() -> None:
         (np.zeros(3, bool), []),
     ],
 )
-def test_parts(index: object, names: list[str]) -> None:
-    part = THREE[index]  # type: ignore[index]
+def test_parts(index: Any, names: list[str]) -> None:
+    part = THREE[index]
     assert part.names == names
     assert part.boxes.shape == (len(names), 7)
     assert part.class_names == THREE.class_names

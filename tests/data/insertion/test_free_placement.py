@@ -15,7 +15,7 @@ from asca_pillars.geometry.boxes import footprints, points_in_boxes, wrap_angle
 from asca_pillars.pillars.grid import PillarGrid
 from tests.data.insertion.simple_streets import LEVEL, cast, stand, street
 
-GRID = PillarGrid(x_range_m=(0, 40.96), y_range_m=(-20.48, 20.48), v_max_m=0.32, zones=1)
+GRID = PillarGrid(x_range_m=(0, 40.96), y_range_m=(-20.48, 20.48), v_max_m=0.32, zones=1).ranges
 NO_BOXES = np.zeros((0, 7), np.float32)
 
 

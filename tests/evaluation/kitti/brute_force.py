@@ -89,9 +89,14 @@ def curve(frames: list, name: str, metric: str, difficulty: str, band: Band) -> 
     for truths, found in frames:
         scores += match(truths, found, name, metric, difficulty, band, None)[0]
     thresholds = pick_thresholds(scores, counted)
-    tp, fp, fn, similarity = [], [], [], []
+    tp: list[int] = []
+    fp: list[int] = []
+    fn: list[int] = []
+    similarity: list[float] = []
     for threshold in thresholds:
-        tp.append(0), fp.append(0), fn.append(0), similarity.append(0.0)
+        for counts in (tp, fp, fn):
+            counts.append(0)
+        similarity.append(0.0)
         for truths, found in frames:
             matched, false, missed, similar = match(truths, found, name, metric, difficulty, band, threshold)
             tp[-1] += len(matched)

@@ -38,7 +38,7 @@ def scan(lidar: Lidar, rho_m: float | np.ndarray, reflectance: float = 0.405, se
     rho = np.broadcast_to(np.asarray(rho_m, float), shape)
     none = np.zeros(0, np.int64)
     owner = np.where(rho == rho.min(), 0, -1)
-    hits = Hits(rho, np.ones(shape), np.full(shape, reflectance), owner, none, none)
+    hits = Hits(rho, np.ones(shape, np.float32), np.full(shape, reflectance, np.float32), owner, none, none)
     return measure(hits, firings, np.random.default_rng(seed)), firings
 
 
