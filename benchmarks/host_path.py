@@ -108,7 +108,7 @@ def measure_ms(stage: Callable[[], Any]) -> float:
 def in_numpy() -> Iterator[None]:
     """As without numba."""
     modules = ("pillars.pillarize", "geometry.overlap")
-    first, second = (patch(f"asca_pillars.{name}.load_kernels", lambda: None) for name in modules)
+    first, second = (patch(f"asca_pillars.{name}.load_kernels", lambda _: None) for name in modules)
     with first, second:
         yield
 

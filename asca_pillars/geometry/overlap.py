@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.kernels import load_kernels
 
+KERNELS = "asca_pillars.geometry.overlap_kernels"
+
 _Boxes = NDArray[np.floating[Any]]
 _Doubles = NDArray[np.float64]
 _Point = tuple[_Doubles, _Doubles]  # x and y of K points, each (K,)
@@ -111,7 +113,7 @@ def rotated_nms(
         scores: (N,), any monotonic measure.
     """
     order = np.argsort(-scores, kind="stable")
-    kernels = load_kernels()
+    kernels = load_kernels(KERNELS)
     suppress = _suppress if kernels is None else kernels.suppress
     return order[
         suppress(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)

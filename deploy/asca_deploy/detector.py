@@ -21,6 +21,7 @@ from asca_deploy.stream import overlapped
 from asca_pillars.data.expected_input import InputWarning, check_input
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ScanError
+from asca_pillars.geometry import overlap
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_report import FrameReport
 from asca_pillars.geometry.kernels import load_kernels
@@ -91,7 +92,7 @@ class Detector:
         score_threshold: float | None = None,
     ) -> None:
         start = perf_counter()
-        load_kernels()  # here rather than in the first scan
+        load_kernels(overlap.KERNELS)  # here rather than in the first scan
         self.folder = find_bundle(bundle)
         self.threads = check_threads(threads)
         check_onnxruntime()

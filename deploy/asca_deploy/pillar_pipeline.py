@@ -13,9 +13,10 @@ from asca_deploy.graph import Session, Tensor, check_interface
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.geometry.decode import HeadMaps, decode
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import FEATURES, PillarCounts, Pillars, pillarize
+from asca_pillars.pillars.pillarize import FEATURES, KERNELS, PillarCounts, Pillars, pillarize
 
 Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 
@@ -89,6 +90,7 @@ class PillarPipeline:
         precision: providers.Precision = "float32",
         threads: int = 1,
     ) -> None:
+        load_kernels(KERNELS)  # here rather than in the first scan
         self.bundle = bundle
         self.spec: PillarSpec = bundle.spec
         self._encoder = _open_encoder(folder, bundle)

@@ -1,7 +1,6 @@
 """The compiled forms against the NumPy forms, bit for bit, and the results that no form may change."""
 
 import dataclasses
-import sys
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -19,6 +18,7 @@ from asca_pillars.geometry import overlap
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.geometry.overlap import rotated_nms
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillarize import KERNELS as PILLAR_KERNELS
 from asca_pillars.pillars.pillarize import PillarLimits, Pillars, pillarize
 
 # Rectangular, off center, with a positive minimum, and columns of one to three depths.
@@ -35,8 +35,8 @@ DRAWN = 57, 4111435180, 2859312739, 1432910283
 def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
     """The function's result where numba is not installed."""
     with (
-        patch("asca_pillars.pillars.pillarize.load_kernels", lambda: None),
-        patch("asca_pillars.geometry.overlap.load_kernels", lambda: None),
+        patch("asca_pillars.pillars.pillarize.load_kernels", lambda _: None),
+        patch("asca_pillars.geometry.overlap.load_kernels", lambda _: None),
     ):
         return function(*arguments)
 
@@ -192,10 +192,14 @@ def test_compiled_without_a_cache_where_none_can_be_written(monkeypatch: pytest.
     assert double(21) == 42
 
 
+@pytest.mark.parametrize("name", [overlap.KERNELS, PILLAR_KERNELS])
+def test_the_compiled_forms_exist(name: str) -> None:
+    assert load_kernels(name) is not None, "or every comparison above compares NumPy with itself"
+
+
 def test_nothing_is_compiled_at_use() -> None:
-    compiled = load_kernels()
-    assert compiled is not None
-    module = sys.modules[compiled.suppress.__module__]
+    module = load_kernels(overlap.KERNELS)
+    assert module is not None
     with pytest.raises(TypeError, match="No matching definition"):
         module._suppress(
             np.zeros((1, 7), np.float32), 0.5, 1, np.empty((1, 3)), np.empty((1, 5)), np.empty(1, np.int64)
