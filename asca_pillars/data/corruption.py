@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from asca_pillars.config import AugmentConfig
 from asca_pillars.geometry.boxes import points_in_boxes
 
-FEWEST_POINTS = 5  # an object keeps so many, or it is not cut: nobody could find it
+FEWEST_POINTS = 5  # an object keeps so many, or it is not cut, for it could not be found
 WIDEST_CUT = 0.5  # of an object's extent in azimuth or elevation
 
 

@@ -39,7 +39,7 @@ class Preparation(Protocol):
 class Trainable(Protocol):
     """A detector that can be trained; a `torch.nn.Module` that has the methods below.
 
-    Outputs are the family's own: what `predict` gives goes to `loss` and to `detect`, and nobody else looks inside.
+    Outputs are the family's own: what `predict` gives goes to `loss` and to `detect` only.
     """
 
     @property

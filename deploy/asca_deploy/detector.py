@@ -68,7 +68,7 @@ class Detector:
     Args:
         bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the 8-bit one
             that ships.
-        provider: of the slowest network: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one at hand
+        provider: of the slowest network: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one available
             that finds in the sample scan what "cpu" finds. `self.provider` and `self.precision` say what was taken,
             `self.candidates` how each one did. The other graphs always run on onnxruntime's CPU provider.
         precision: "float32", in which the bundle was proven, or "reduced" where the provider has something faster
@@ -212,7 +212,7 @@ class Detector:
             return pipeline.finish(pipeline.infer(pipeline.prepare(points, laps), laps), laps)
 
         return auto.choose(
-            providers.at_hand(), open_pipeline, detect, self.bundle.spec, precision, weights=self.bundle.precision
+            providers.available(), open_pipeline, detect, self.bundle.spec, precision, weights=self.bundle.precision
         )
 
 

@@ -122,7 +122,7 @@ def _core() -> "openvino.Core":
 def _import_openvino() -> Any:
     """Import the package without its report to the manufacturer.
 
-    It sends one at every import, unless the package that does so cannot be imported; a vehicle reports to nobody.
+    It sends one at every import, unless the package that does so cannot be imported; a vehicle must not report.
     """
     telemetry = "openvino_telemetry"
     absent = telemetry not in sys.modules

@@ -150,7 +150,7 @@ class PillarPipeline:
 def _open_encoder(folder: Path, bundle: Bundle) -> Session:
     # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
     # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is
-    # the fastest form all the same, ten times faster than ScatterElements.
+    # still the fastest form, ten times faster than ScatterElements.
     path = folder / bundle.graphs[ENCODER].file
     inputs = {
         "features": Tensor("float32", (None, len(FEATURES))),

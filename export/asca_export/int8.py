@@ -59,7 +59,7 @@ def quantize_bundle(
     detector: PillarDetector,
     calibration: Sequence[Points],
     scans: Sequence[Points],
-    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
     """Replace the graphs and the manifest in `folder` by 8-bit ones.
 
@@ -69,7 +69,7 @@ def quantize_bundle(
         calibration: scans (N, 4), LiDAR frame, that set the ranges, at least MIN_CALIBRATION of them with points on
             the grid; those that are among `scans` are left out, or the comparison would be with what it was fitted to.
         scans: to measure on.
-        say: told what is being done.
+        progress: told what is being done.
 
     Raises:
         ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
@@ -84,12 +84,12 @@ def quantize_bundle(
             f"needed; {len(calibration) - len(own)} were left out because parity is proven on them: "
             "give other scans to --calibrate"
         )
-    say("Calibrating")
+    progress("Calibrating")
     steps = canvas_steps(each.features for each in encoded)
     form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
     rounded = FastBackbone(detector, steps).eval()
     scale_to_steps(rounded, _canvases(encoded, bundle, form, steps), steps)
-    say("Rounding the weights")
+    progress("Rounding the weights")
     moments = input_moments(rounded, _canvases(encoded, bundle, form, steps), steps)
     exact, layers = copy.deepcopy(rounded), layer_names(rounded)
     round_weights(exact, [], moments)
@@ -110,7 +110,7 @@ def quantize_bundle(
             logits = (session.run(["scores"], {"canvas": canvas})[0] for canvas in canvases)
             return _logit_error(expected, logits, len(bundle.spec.classes))
 
-        found = _sweep(layers, error_of, say)
+        found = _sweep(layers, error_of, progress)
         eight_bit = [layer for layer in layers if layer not in found.kept_float]
         qdq.quantize_backbone(
             template, graphs.graph_path(folder, BACKBONE), eight_bit, _parameters(exact, rounded, eight_bit)
@@ -141,12 +141,12 @@ def quantize_bundle(
 
 
 def _sweep(
-    layers: Sequence[str], error_of: Callable[[Sequence[str]], float], say: Callable[[str], None]
+    layers: Sequence[str], error_of: Callable[[Sequence[str]], float], progress: Callable[[str], None]
 ) -> _Sensitivity:
     """Try every layer in floating point, and keep the most harmful ones so until the error is small enough."""
     total, alone = error_of(layers), {}
     for number, layer in enumerate(layers, start=1):
-        say(f"Sensitivity of layer {number} of {len(layers)}")
+        progress(f"Sensitivity of layer {number} of {len(layers)}")
         alone[layer] = error_of([other for other in layers if other != layer])
     kept: list[str] = []
     for layer in sorted(layers, key=alone.__getitem__):

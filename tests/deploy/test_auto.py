@@ -133,8 +133,8 @@ class Machine:
         return auto.choose(names, self.open, self.detect, THRESHOLDS, precision, lambda: self.now)
 
 
-def verdicts(choice: auto.Choice[Machine.Network]) -> dict[str, str]:
-    return {f"{item.provider}_{item.precision}": item.verdict for item in choice.candidates}
+def outcomes(choice: auto.Choice[Machine.Network]) -> dict[str, str]:
+    return {f"{item.provider}_{item.precision}": item.outcome for item in choice.candidates}
 
 
 def test_the_fastest_that_agrees_is_taken() -> None:
@@ -151,7 +151,7 @@ def test_the_fastest_that_agrees_is_taken() -> None:
     assert choice.network is machine.networks["cuda", "float32"]
     times_ms = {f"{item.provider}_{item.precision}": item.median_ms for item in choice.candidates}
     assert times_ms["cuda_float32"] == pytest.approx(3) and times_ms["cpu_float32"] == pytest.approx(70)
-    found = verdicts(choice)
+    found = outcomes(choice)
     assert found["cpu_float32"] == found["cuda_float32"] == found["openvino_reduced"] == auto.AGREES
     assert "misses a Pedestrian" in found["cuda_reduced"]
     assert "ask for it by name" in found["tensorrt_reduced"] and ("tensorrt", "reduced") not in machine.opened
@@ -163,7 +163,7 @@ def test_the_fastest_that_agrees_is_taken() -> None:
 def test_the_stock_cpu_stays_where_nothing_is_faster() -> None:
     machine = Machine(cpu_float32=(FOUND, 0.02), openvino_float32=(FOUND, 0.03), cuda_float32=(MemoryError(), 0.0))
     assert machine.choose().provider == "cpu"
-    assert verdicts(machine.choose())["cuda_float32"] == "does not run: MemoryError"
+    assert outcomes(machine.choose())["cuda_float32"] == "does not run: MemoryError"
     assert Machine(cpu_float32=(FOUND, 0.02)).choose().provider == "cpu"
 
 
@@ -177,7 +177,7 @@ def test_candidates_come_to_an_end() -> None:
     machine = Machine(cpu_float32=(FOUND, 0.3), openvino_reduced=(FOUND, 0.25), openvino_float32=(FOUND, 0.001))
     choice = machine.choose()
     assert choice.precision == "reduced"
-    assert verdicts(choice)["openvino_float32"] == "left out after 2 s"
+    assert outcomes(choice)["openvino_float32"] == "left out after 2 s"
 
 
 def test_a_precision_that_was_asked_for() -> None:

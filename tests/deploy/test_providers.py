@@ -6,7 +6,7 @@ import onnxruntime
 import pytest
 
 from asca_deploy import Detector, openvino_session, providers
-from asca_deploy.providers import Precision, Provider, at_hand, require
+from asca_deploy.providers import Precision, Provider, available, require
 from asca_pillars.errors import BundleError, ProviderError
 
 CPU = "CPUExecutionProvider"
@@ -50,8 +50,8 @@ GPU = ([TENSORRT, CUDA, CPU], True, True)
     indirect=["machine"],
 )
 @pytest.mark.usefixtures("machine")
-def test_what_is_at_hand(found: list[tuple[str, str]]) -> None:
-    assert at_hand() == found
+def test_what_is_available(found: list[tuple[str, str]]) -> None:
+    assert available() == found
 
 
 @pytest.mark.parametrize(

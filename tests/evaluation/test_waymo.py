@@ -1,4 +1,4 @@
-"""Waymo's metrics: against the dataset's own tool, against hand-derived figures, and against a slow twin."""
+"""Waymo's metrics: against the dataset's own tool, against hand-derived figures, and against a slow reference."""
 
 from itertools import permutations, product
 from math import ceil, inf, pi

@@ -156,7 +156,7 @@ def test_boxes_that_differ_are_noticed() -> None:
 
 
 def test_ties_are_no_differences() -> None:
-    """Two overlapping anchors of equal score: which one survives is nobody's fault."""
+    """Two overlapping anchors of equal score: which one survives is arbitrary."""
     maps = _maps(0)
     maps.scores[:] = -20
     left, right = maps.scores.copy(), maps.scores.copy()

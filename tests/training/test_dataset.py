@@ -58,7 +58,7 @@ def test_types_that_are_classes_neighbors_and_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("classes", "expected"),
     [
-        (("Pedestrian",), [0, IGNORED]),  # without cars, a van is nobody's neighbor
+        (("Pedestrian",), [0, IGNORED]),  # without cars, a van is no class's neighbor
         (("Cyclist", "Car"), [1, IGNORED]),
         (("Car", "Van"), [0, 1]),  # a class of its own is no neighbor
     ],

@@ -31,7 +31,7 @@ def cluster_boxes(obstacles: NDArray[np.float64], ground: Ground) -> NDArray[np.
     middles = (index + 0.5) * _CELL_M
     labels = DBSCAN(eps=CLUSTER_EPS_M, min_samples=CLUSTER_MIN_POINTS).fit(middles, sample_weight=count).labels_
     labels = labels[inverse.ravel()]
-    clustered = labels >= 0  # lone points stay out here; their cells are blocked all the same
+    clustered = labels >= 0  # lone points stay out here; their cells are blocked too
     obstacles, labels = obstacles[clustered], labels[clustered]
     order = np.argsort(labels, kind="stable")
     obstacles, labels = obstacles[order], labels[order]

@@ -1,6 +1,6 @@
 """Where an object may be put into a scan: seen ground minus what stands on it (section 3.5, steps 2 to 4).
 
-Ground that is seen: along one azimuth the beams of a spinning LiDAR land ring after ring. Between two neighbouring
+Ground that is seen: along one azimuth the beams of a spinning LiDAR land ring after ring. Between two neighboring
 landings the beam to the farther one passed low over the ground, so nothing tall stands there, although a gap of metres
 separates the returns. A gap longer than that argument carries, an obstacle in it, a step or a slope ends the free
 ground. Ground behind an obstacle is not seen and therefore not free, nor is anything beside the camera's view.

@@ -28,7 +28,7 @@ class MatchOutcome(IntEnum):
     OVERLAPPED = 1
     """An anchor overlaps it by positive_iou."""
     FORCED = 2
-    """None does; the nearest ones are to find it all the same, and fit it badly."""
+    """None does; the nearest ones are matched to it nevertheless, and fit it badly."""
     MISSED = 3
     """No anchor is to find it."""
 

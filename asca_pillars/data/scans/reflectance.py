@@ -14,7 +14,7 @@ ReflectanceScale = Literal["auto"] | float
 
 # A few values above a scale are specks or retroreflectors; of a scale that is too small there are always more.
 _SHARE_ABOVE = 0.001
-_SLACK = 2.0  # nobody stores 0..255 of which hardly anything reaches 2; values just above 1 are common
+_SLACK = 2.0  # a scan stored in 0..255 has many values above 2; values just above 1 are common
 
 
 class Scaled(NamedTuple):

@@ -1,4 +1,4 @@
-"""How often a detector fires at what nobody labelled: clusters as large as a person, tall thin ones, bright ones."""
+"""How often a detector fires at what is not labelled: clusters as large as a person, tall thin ones, bright ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

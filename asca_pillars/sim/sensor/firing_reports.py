@@ -31,7 +31,7 @@ class Met(NamedTuple):
     cosine: npt.NDArray[np.float32]
     reflectance: npt.NDArray[np.float32]
     owner: npt.NDArray[np.int32]
-    hidden: npt.NDArray[np.bool_]  # firings that the own car stops
+    hidden: npt.NDArray[np.bool_]  # firings that the ego vehicle blocks
 
 
 class Lasers(NamedTuple):

@@ -293,7 +293,7 @@ def test_points_that_are_not_numbers_and_scans_that_see_nothing(data: Path) -> N
 
 
 def refusal(root: Path, config: Config, tmp_path: Path) -> str:
-    """The line that `asca inspect` fails with; the JSON is written all the same."""
+    """The line that `asca inspect` fails with; the JSON is written anyway."""
     path = tmp_path / "config.yaml"
     path.write_text(yaml.safe_dump(to_dict(config)))
     with pytest.raises(DatasetError) as error:

@@ -1,4 +1,4 @@
-"""Recall and precision at a fixed score: hand-made frames for every rule, a slow twin, and published intervals."""
+"""Recall and precision at a fixed score: hand-made frames for every rule, a slow reference, and published intervals."""
 
 import math
 from dataclasses import replace
