@@ -25,6 +25,7 @@ from rich.progress import track
 
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import compare
+from asca_deploy.providers import Precision, Provider
 from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.commands.bench_tables import comparison_table
 from asca_pillars.data.scans.find_scans import find_scans
@@ -41,6 +42,7 @@ Scans = Sequence[NDArray[np.float32]]
 
 
 def main(
+    *,
     scans: Annotated[Path | None, typer.Argument(help="A scan or a folder of them. Default: the sample.")] = None,
     config: Annotated[
         str, typer.Option(help="Without a checkpoint: network to give random weights, a YAML or one that ships.")
@@ -48,8 +50,8 @@ def main(
     checkpoint: Annotated[Path | None, typer.Option(help="Weights for PyTorch.")] = None,
     bundle: Annotated[Path | None, typer.Option(help="Its export. Default: exported now.")] = None,
     int8: Annotated[bool, typer.Option("--int8", help="Export in 8 bits.")] = False,
-    provider: Annotated[str, typer.Option(help="Where the bundle runs.")] = "cpu",
-    precision: Annotated[str, typer.Option(help="In which the bundle runs: float32 or reduced.")] = "float32",
+    provider: Annotated[Provider, typer.Option(help="Where the bundle runs.")] = "cpu",
+    precision: Annotated[Precision, typer.Option(help="In which the bundle runs: float32 or reduced.")] = "float32",
     threads: Annotated[int | None, typer.Option(help="Of both. Default: the physical cores.")] = None,
     rounds: Annotated[int, typer.Option(min=1, help="In which all take a turn.")] = 10,
     tolerance: Annotated[

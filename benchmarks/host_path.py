@@ -8,7 +8,7 @@ milliseconds. Memory is as after a frame of the network: other data has pushed t
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 from unittest.mock import patch
@@ -40,7 +40,7 @@ def main(
     print(f"{cpu_model()}, bundle {bundle.name}, {rounds} rounds\n")
     for path in scans or [sample_scan_path()]:
         points = read_scan(path).points
-        in_view = (np.abs(points[:, 1:3]) <= points[:, :1] * np.float32(CAMERA_VIEW)).all(axis=1)
+        in_view = (np.abs(points[:, 1:3]) <= points[:, :1] * np.array(CAMERA_VIEW, np.float32)).all(axis=1)
         for view, part in (("full", points), ("camera view", points[in_view])):
             print(f"{path.name}, {view}: {len(part)} points")
             report(host_path(part, bundle), rounds)
@@ -76,8 +76,9 @@ def suppression(count: int) -> Callable[[], Any]:
 def report(stages: dict[str, Callable[[], Any]], rounds: int) -> None:
     """Time the stages in both forms and print them."""
     times_ms = np.empty((rounds + 1, 2, len(stages)))  # the first round is not counted
+    forms: tuple[Callable[[], AbstractContextManager[None]], ...] = (nullcontext, in_numpy)
     for one_round in times_ms:
-        for form, one_form in zip((nullcontext, in_numpy), one_round, strict=True):
+        for form, one_form in zip(forms, one_round, strict=True):
             with form():
                 for index, stage in enumerate(stages.values()):
                     one_form[index] = measure_ms(stage)
@@ -107,7 +108,7 @@ def measure_ms(stage: Callable[[], Any]) -> float:
 def in_numpy() -> Iterator[None]:
     """As without numba."""
     modules = ("pillars.pillarize", "geometry.overlap")
-    first, second = (patch(f"asca_pillars.{name}.load_kernels", lambda: None) for name in modules)
+    first, second = (patch(f"asca_pillars.{name}.load_kernels", lambda _: None) for name in modules)
     with first, second:
         yield
 

@@ -1,9 +1,9 @@
-"""Time and memory of the KITTI evaluation on made-up frames, and how its brute-force twin compares.
+"""Time and memory of the KITTI evaluation on made-up frames, and how its brute-force reference compares.
 
     python -m benchmarks.kitti_eval
 
 As many frames as KITTI's validation split has, with about as many objects; most detections are objects found two or
-three times, as a detector reports them before suppression. The twin does a few of the frames and must agree.
+three times, as a detector reports them before suppression. The reference does a few of the frames and must agree.
 """
 
 import resource
@@ -19,7 +19,7 @@ from rich.console import Console
 
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, KittiResults, evaluate
 from asca_pillars.evaluation.kitti.objects import FrameObjects
-from tests.evaluation.kitti.brute_force import Twin, brute_force
+from tests.evaluation.kitti.brute_force import ReferenceCurve, brute_force
 
 CLASS_NAMES = ("Car", "Pedestrian", "Cyclist")
 TYPES = np.array([*CLASS_NAMES, "Van", "Person_sitting", "Truck"])
@@ -34,7 +34,7 @@ def main(
     frames: Annotated[int, typer.Option(help="Frames to evaluate.")] = 3769,
     detections: Annotated[int, typer.Option(help="Detections in each frame.")] = 100,
     bands: Annotated[int, typer.Option(help="Distance bands of 20 m to evaluate besides.")] = 0,
-    twin_frames: Annotated[int, typer.Option(help="Frames for the brute-force twin.")] = 20,
+    reference_frames: Annotated[int, typer.Option(help="Frames for the brute-force reference.")] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the made-up frames.")] = 0,
 ) -> None:
     """Print time, memory and the comparison."""
@@ -54,17 +54,17 @@ def main(
         values = [f"{results.overall.curves[name, '3d', difficulty].r40:.2f}" for difficulty in DIFFICULTIES]
         console.print(f"  {name}: 3D AP R40 {' / '.join(values)}")
 
-    few_truth, few_found = list(truth[:twin_frames]), list(found[:twin_frames])
+    few_truth, few_found = list(truth[:reference_frames]), list(found[:reference_frames])
     start = time.perf_counter()
     few = evaluate(few_truth, few_found, CLASS_NAMES).overall
     fast_s = time.perf_counter() - start
     start = time.perf_counter()
-    twins = brute_force(few_truth, few_found, CLASS_NAMES)
+    references = brute_force(few_truth, few_found, CLASS_NAMES)
     slow_s = time.perf_counter() - start
-    _check(few, twins)
+    _check(few, references)
     console.print(
-        f"{twin_frames} frames: twin {slow_s:.1f} s, ours {fast_s:.2f} s, {slow_s / fast_s:.0f} times as fast; "
-        f"all {len(twins)} curves agree"
+        f"{reference_frames} frames: reference {slow_s:.1f} s, ours {fast_s:.2f} s, "
+        f"{slow_s / fast_s:.0f} times as fast; all {len(references)} curves agree"
     )
 
 
@@ -139,14 +139,14 @@ def _objects(
     )
 
 
-def _check(results: KittiResults, twins: dict[tuple[str, str, str], Twin]) -> None:
-    if results.curves.keys() != twins.keys():
-        raise SystemExit("the twin evaluates other curves")
-    for key, twin in twins.items():
+def _check(results: KittiResults, references: dict[tuple[str, str, str], ReferenceCurve]) -> None:
+    if results.curves.keys() != references.keys():
+        raise SystemExit("the reference evaluates other curves")
+    for key, reference in references.items():
         ours = results.curves[key]
-        for field in (f.name for f in fields(ours) if f.name in Twin._fields):
-            if not np.allclose(getattr(ours, field), getattr(twin, field), rtol=0, atol=1e-9):
-                raise SystemExit(f"the twin has other {field} of {' '.join(key)}")
+        for field in (f.name for f in fields(ours) if f.name in ReferenceCurve._fields):
+            if not np.allclose(getattr(ours, field), getattr(reference, field), rtol=0, atol=1e-9):
+                raise SystemExit(f"the reference has other {field} of {' '.join(key)}")
 
 
 def _peak_mib() -> float:

@@ -22,6 +22,7 @@ from rich.progress import Progress
 
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.resident_memory import peak_memory_mib, resident_mib
+from asca_deploy.providers import Precision, Provider
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.files import atomic_path
@@ -34,8 +35,8 @@ WARM_SHARE = 0.2  # the allocator and the graphs find their sizes first
 def main(
     scans: Annotated[int, typer.Option(min=4 * CHUNK, help="Scans to run.")] = 10_000,
     bundle: Annotated[Path | None, typer.Option(help="Default: the one that ships.")] = None,
-    provider: Annotated[str, typer.Option()] = "cpu",
-    precision: Annotated[str, typer.Option(help="float32 or reduced.")] = "float32",
+    provider: Annotated[Provider, typer.Option()] = "cpu",
+    precision: Annotated[Precision, typer.Option(help="float32 or reduced.")] = "float32",
     threads: Annotated[int | None, typer.Option()] = None,
     only: Annotated[Literal["calls", "streams"] | None, typer.Option(help="Default: half of each.")] = None,
     out: Annotated[Path | None, typer.Option("--json", help="Also write the samples to this file.")] = None,

@@ -19,6 +19,7 @@ from rich.table import Table
 
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.box_differences import box_difference
+from asca_deploy.providers import Precision, Provider
 from asca_export.parity import COMPARED_ANCHORS
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
@@ -50,12 +51,13 @@ def main(
     expected = Detector(reference)
     table = Table("", title=f"{len(points)} scan(s), against {reference} on cpu in float32")
     columns = []
-    for bundle, provider, precision in (
+    ways: tuple[tuple[str, Provider, Precision], ...] = (
         (int8, "cpu", "float32"),
         (int8, "openvino", "float32"),
         (reference, "openvino", "float32"),
         (reference, "openvino", "reduced"),
-    ):
+    )
+    for bundle, provider, precision in ways:
         name = f"{Path(bundle).name}, {provider} {precision}"
         try:
             detector = Detector(bundle, provider=provider, precision=precision)
@@ -80,8 +82,8 @@ def _column(
         logits = np.abs(ours.scores - theirs.scores)
         residuals = np.abs(ours.boxes - theirs.boxes).reshape(len(logits), 7, *logits.shape[1:])
         at_best = residuals[anchors[0], :, anchors[1], anchors[2]]
-        squares = (np.square(each).mean() for each in (logits[anchors], logits, at_best))
-        errors.append((*squares, logits.max(), residuals.max()))
+        means = (np.square(each).mean() for each in (logits[anchors], logits, at_best))
+        errors.append((*means, logits.max(), residuals.max()))
     *squares, worst_logit, worst_residual = np.array(errors).T
     best, everywhere, residual = (float(np.sqrt(square.mean())) for square in squares)
     boxes = box_difference([expected(points) for points in scans], [detector(points) for points in scans])

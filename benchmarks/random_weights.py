@@ -1,4 +1,4 @@
-"""Bundles of a network that nobody has trained, to time it: random weights cost what trained ones do.
+"""Bundles of an untrained network, to time it: random weights cost what trained ones do.
 
     python -m benchmarks.random_weights bundles/                                  # the paper's size, K = 3
     asca bench scans/ --bundle bundles/int8 --compare bundles/float32
@@ -42,7 +42,7 @@ def main(
                 scans,
                 trained_on="nothing: random weights",
                 calibration=calibration,
-                say=status.update,
+                progress=status.update,
             )
             console.print(f"{out / name}: {bundle.backbone_gmac:.2f} GMAC, {bundle.precision}")
 

@@ -42,7 +42,7 @@ from asca_pillars.pictures.drawing import BACKGROUND
 from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_layers, write_png
 from asca_pillars.schema import parse
 
-METHODS = {"gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}
+METHODS: dict[InsertMethod, str] = {"gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}
 MAX_HEIGHT_ERROR_M = 0.2
 MAX_SLOPE = np.tan(np.radians(5.0))
 BODY_ABOVE_M = 0.3
@@ -79,9 +79,9 @@ def main(
     split = KittiSplit(data, frames)
     truths = _truths(data)
     console = Console()
-    counts: dict[str, NDArray[np.int64]] = {}
-    tallies: dict[str, Tally] = {}
-    milliseconds: dict[str, list[float]] = {}
+    counts: dict[InsertMethod, NDArray[np.int64]] = {}
+    tallies: dict[InsertMethod, Tally] = {}
+    milliseconds: dict[InsertMethod, list[float]] = {}
     for method, title in METHODS.items():
         inserter = _inserter(split, settings, method)
         tallies[method], milliseconds[method] = Tally(), []
@@ -211,7 +211,9 @@ def _spread(box: NDArray[np.float64], step_m: float = 0.2) -> NDArray[np.float64
     return np.column_stack([box[0] + cos * u - sin * v, box[1] + sin * u + cos * v])
 
 
-def _placement_table(tallies: dict[str, Tally], milliseconds: dict[str, list[float]], simulated: bool) -> Table:
+def _placement_table(
+    tallies: dict[InsertMethod, Tally], milliseconds: dict[InsertMethod, list[float]], simulated: bool
+) -> Table:
     table = Table(title="Where inserted objects stand")
     table.add_column("")
     for title in METHODS.values():
@@ -231,7 +233,7 @@ def _placement_table(tallies: dict[str, Tally], milliseconds: dict[str, list[flo
     return table
 
 
-def _balance_table(counts: dict[str, NDArray[np.int64]], settings: Config, frames: int) -> Table:
+def _balance_table(counts: dict[InsertMethod, NDArray[np.int64]], settings: Config, frames: int) -> Table:
     names = settings.model.spec.class_names
     wanted = np.array([settings.augment.insert.proportions.get(name, 0.0) for name in names])
     if not settings.augment.insert.proportions:
@@ -263,10 +265,10 @@ def _draw(path: Path, split: KittiSplit, settings: Config, frame_id: str) -> Non
         ]
         layers.append(BoxLayer("labelled", frame.boxes, (255, 255, 255), thickness_px=2))
         panel = draw_layers(shown.points, layers, settings.model.spec.ranges, width_px=700)
-        panel = cv2.copyMakeBorder(panel, 40, 0, 0, 8, cv2.BORDER_CONSTANT, value=BACKGROUND)
+        framed = cv2.copyMakeBorder(panel, 40, 0, 0, 8, cv2.BORDER_CONSTANT, value=BACKGROUND)
         title = METHODS.get(method, "Original")
-        cv2.putText(panel, title, (16, 30), cv2.FONT_HERSHEY_DUPLEX, 0.8, (255, 255, 255), 1, cv2.LINE_AA)
-        panels.append(panel)
+        cv2.putText(framed, title, (16, 30), cv2.FONT_HERSHEY_DUPLEX, 0.8, (255, 255, 255), 1, cv2.LINE_AA)
+        panels.append(framed.astype(np.uint8))
     height = max(len(panel) for panel in panels)
     panels = [np.pad(panel, ((0, height - len(panel)), (0, 0), (0, 0))) for panel in panels]
     write_png(path, np.concatenate(panels, axis=1))

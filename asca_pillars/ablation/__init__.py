@@ -1,0 +1,1 @@
+"""Training and comparing the variants of the paper's Table 5."""

@@ -69,6 +69,7 @@ class Run:
 
     @property
     def checkpoint(self) -> Path:
+        """The last one that training wrote."""
         return self.folder / "checkpoints" / "last.ckpt"
 
     @property

@@ -44,7 +44,10 @@ def measure_parts(
     bundles: dict[str, Path],
     console: Console,
 ) -> dict[str, Any]:
-    """Measure part after part, print each when it is there, and return everything as plain values."""
+    """Measure part after part, print each when it is there, and return everything as plain values.
+
+    Scans are (N, 4): x, y, z in metres, LiDAR frame, and reflectance.
+    """
 
     def bar(count: int, what: str) -> Iterable[int]:
         return track(range(count), what, console=console, transient=True)

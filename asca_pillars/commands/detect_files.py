@@ -7,13 +7,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-import cv2
-
 from asca_deploy import Detections
 from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.scans.scan_reader import Scan
 from asca_pillars.files import atomic_path, require_own, write_json
-from asca_pillars.pictures.visualize import draw_on_image, write_png
+from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 
 RUN_FILE = "detections.jsonl"
 
@@ -59,7 +57,7 @@ class ResultWriter:
             return
         calibration = read_calibration(calib_path)
         image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
-        image = cv2.imread(str(image_path)) if image_path.exists() else None
+        image = read_image(image_path)
         if image is None and image_path.exists():
             self.remarks.append(f"{image_path}: cannot be read as an image; the boxes are not drawn on it")
         _write_kitti(self._named(name, ".txt"), detections, calibration, image)

@@ -40,6 +40,7 @@ class BoxTask:
 def check_arguments(
     task: BoxTask, model: Path | None, predictions: Path | None, labels: Path | None, gallery: int | None
 ) -> None:
+    """Refuse options that do not go together, with a ConfigError."""
     option = f"--protocol {task.protocol}"
     if task.data is None:
         raise ConfigError(f"{option} needs the labels: give --data ROOT")

@@ -83,6 +83,7 @@ def check_arguments(
     gallery_frames: int | None,
     score: float | None,
 ) -> None:
+    """Refuse options that do not go together, with a ConfigError."""
     if predictions is not None and model is not None:
         raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
     if predictions is None and labels is not None:
@@ -103,6 +104,7 @@ def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
 
 
 def check_protocol(protocol: str, data: Path | None, gallery_frames: int | None, score: float | None) -> None:
+    """Refuse an unknown protocol, or options of another one, with a ConfigError."""
     if protocol not in get_args(Protocol):
         raise ConfigError(f"--protocol {protocol}: choose {', '.join(get_args(Protocol))}, iou or distance")
     if data is not None and not open_split(data).has_camera:
@@ -206,6 +208,7 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
 
 
 def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:
+    """Draw the `count` frames with the most errors below `out`, if there are scans to draw."""
     count = GALLERY if count is None else count
     if task.split is None or count == 0:
         return

@@ -91,7 +91,7 @@ def export(
             trained_on=trained_on,
             command=environment.get("command", "not recorded"),
             calibration=calibration,
-            say=status.update,
+            progress=status.update,
         )
     parity = bundle.parity
     assert parity is not None, "export_bundle proves it"

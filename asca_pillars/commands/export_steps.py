@@ -56,7 +56,10 @@ def class_score(text: str) -> tuple[str, float]:
 def read_or_simulate(
     folder: Path | None, console: Console, most: int, seed: int, view: View = "full"
 ) -> list[NDArray[np.float32]]:
-    """Scans of a folder, evenly spaced if there are more than `most`; without a folder simulated ones."""
+    """Scans of a folder, evenly spaced if there are more than `most`; without a folder simulated ones.
+
+    Each is (N, 4): x, y, z in metres, LiDAR frame, and reflectance.
+    """
     if folder is not None:
         paths = find_scans(folder)
         chosen = paths if len(paths) <= most else [paths[i * len(paths) // most] for i in range(most)]

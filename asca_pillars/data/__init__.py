@@ -1,0 +1,1 @@
+"""Labelled frames, their augmentation, and the files they come from."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from asca_pillars.config import AugmentConfig
 from asca_pillars.geometry.boxes import points_in_boxes
 
-FEWEST_POINTS = 5  # an object keeps so many, or it is not cut: nobody could find it
+FEWEST_POINTS = 5  # an object keeps so many, or it is not cut, for it could not be found
 WIDEST_CUT = 0.5  # of an object's extent in azimuth or elevation
 
 
@@ -49,7 +49,7 @@ def corrupt_objects(
 
 
 def lose_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np.random.Generator) -> None:
-    """Some sensors give no reflectance for part of the points, or for none: set it, in place, in some samples.
+    """Some sensors give no reflectance for part of the points (N, 4), or for all: set it, in place, in some samples.
 
     Half of these samples get 0 for a random share of the points, the other half one value for all.
     """

@@ -37,7 +37,7 @@ def read_frame(
 ) -> LabeledFrame:
     """Points and labelled boxes of one frame.
 
-    Objects of other types are left out; neighbours of a class (KITTI's Van for Car) and objects with too few points
+    Objects of other types are left out; neighbors of a class (KITTI's Van for Car) and objects with too few points
     become IGNORED.
 
     Args:

@@ -16,7 +16,7 @@ from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.drawing import Color, Image
-from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, write_png
+from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, read_image, write_png
 
 INDEX = "index.md"
 _INTRODUCTION = """# {title}: worst frames
@@ -102,8 +102,7 @@ def _draw(frame: ScoreMatches, split: KittiSplit, labels: Path, predictions: Pat
         _layer(_IGNORED, found, frame.ignored, calibration),
     ]
     picture = draw_layers(points, layers, ranges)
-    image_path = split.image_path(frame_id)
-    image = cv2.imread(str(image_path)) if image_path.is_file() else None
+    image = read_image(split.image_path(frame_id))
     return picture if image is None else _below(picture, _draw_on(image, layers, calibration))
 
 

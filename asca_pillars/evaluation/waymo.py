@@ -7,7 +7,7 @@ Definition: P. Sun et al., "Scalability in Perception for Autonomous Driving: Wa
   class, so that the sum of IoU is greatest. Scores take no part in it: for each cutoff 0, 0.01, ..., 1 the detections
   that reach it are matched anew.
 - What holds no LiDAR point is no object. Up to 5 points, or the labelers' word, make an object LEVEL_2. At LEVEL_2
-  every object counts. At LEVEL_1 a LEVEL_2 object that nobody found is not missed, but one that was found is a find
+  every object counts. At LEVEL_1 an unfound LEVEL_2 object is not missed, but one that was found is a find
   like any other, in the precision and on both sides of the recall.
 - A find has the heading accuracy 1 - d / pi, d in [0, pi] being the difference of the headings. APH puts the sum of
   these in place of the number of finds, in the precision but not in the recall.

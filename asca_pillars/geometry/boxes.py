@@ -29,7 +29,7 @@ _WIDTH_SIGNS = np.array([0.5, 0.5, -0.5, -0.5])
 
 
 def wrap_angle(angle_rad: ArrayLike, period: float = 2 * math.pi) -> NDArray[Any]:
-    """Angles moved by whole periods into [-period / 2, period / 2); those already there come back unchanged.
+    """Angles (...,) moved by whole periods into [-period / 2, period / 2); those already there come back unchanged.
 
     float32 in, float32 out; any other type comes out as float64. The interval holds for the rounded result
     too: the float32 nearest to pi is greater than pi and never returned.

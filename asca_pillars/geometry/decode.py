@@ -63,7 +63,7 @@ def decode(
 
     Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
     rotated NMS seen from above. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
-    from a network that overflowed, are left out and counted (`Detections.non_finite`): nobody can use them.
+    from a network that overflowed, are left out and counted (`Detections.non_finite`).
 
     Args:
         maps: logits and residuals on the head's map.

@@ -107,10 +107,10 @@ class Detections:
             yield Detection(self.class_names[label], score, *box)
 
     @overload
-    def __getitem__(self, index: int) -> Detection: ...
+    def __getitem__(self, index: int | np.integer[Any]) -> Detection: ...
     @overload
     def __getitem__(self, index: slice | NDArray[Any] | list[int]) -> "Detections": ...
-    def __getitem__(self, index: int | slice | NDArray[Any] | list[int]) -> "Detection | Detections":
+    def __getitem__(self, index: int | np.integer[Any] | slice | NDArray[Any] | list[int]) -> "Detection | Detections":
         if isinstance(index, int | np.integer):
             name = self.class_names[self.labels[index]]
             return Detection(name, float(self.scores[index]), *self.boxes[index].tolist())

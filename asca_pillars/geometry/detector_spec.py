@@ -51,7 +51,7 @@ class DetectorSpec(ABC):
 
     @cached_property
     def anchors(self) -> NDArray[np.float32]:
-        """(H, W, A, 7), see `make_anchors`. Read-only."""
+        """(H, W, A, 7) boxes in the LiDAR frame, see `make_anchors`. Read-only."""
         anchors = make_anchors(*self.head_centers_m(), self.classes)
         anchors.flags.writeable = False
         return anchors
@@ -73,5 +73,8 @@ class DetectorSpec(ABC):
         )
 
     def decode(self, maps: HeadMaps[NDArray[np.float32]], cells: NDArray[np.integer[Any]] | None = None) -> Detections:
-        """Detections in this detector's head maps, or in rows of these head cells, see `decode`."""
+        """Detections, LiDAR frame, from head maps of one scan, (channels, H, W) each.
+
+        With `cells` (M,), flat indices: from rows (M, channels) of these head cells.
+        """
         return decode(maps, self.anchors, self.classes, self.post, cells)

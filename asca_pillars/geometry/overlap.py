@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.kernels import load_kernels
 
+KERNELS = "asca_pillars.geometry.overlap_kernels"
+
 _Boxes = NDArray[np.floating[Any]]
 _Doubles = NDArray[np.float64]
 _Point = tuple[_Doubles, _Doubles]  # x and y of K points, each (K,)
@@ -75,20 +77,20 @@ def _relative(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles, _Doubles, _
 
 
 def bev_iou(a: _Boxes, b: _Boxes) -> _Doubles:
-    """Shared over joint area of footprints: (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
+    """IoU of footprints: boxes (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
     a, b = a.astype(np.float64), b.astype(np.float64)
     return _over_union(bev_intersection(a, b), a[:, 3] * a[:, 4], b[:, 3] * b[:, 4])
 
 
 def iou_3d(a: _Boxes, b: _Boxes) -> _Doubles:
-    """Shared over joint volume: (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
+    """IoU of volumes: boxes (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
     a, b = a.astype(np.float64), b.astype(np.float64)
     shared = bev_intersection(a, b) * _shared_length(a[:, 2], a[:, 5], b[:, 2], b[:, 5])
     return _over_union(shared, a[:, 3] * a[:, 4] * a[:, 5], b[:, 3] * b[:, 4] * b[:, 5])
 
 
 def aligned_bev_iou(a: _Boxes, b: _Boxes) -> NDArray[np.float32]:
-    """`bev_iou` after turning each footprint to its nearest axis: (N, 7), (M, 7) -> (N, M) float32.
+    """IoU of footprints, each turned to its nearest axis first: boxes (N, 7), (M, 7) -> (N, M) float32 in [0, 1].
 
     What anchors are matched by (PointPillars): cheap enough for every anchor of a map.
     """
@@ -111,7 +113,7 @@ def rotated_nms(
         scores: (N,), any monotonic measure.
     """
     order = np.argsort(-scores, kind="stable")
-    kernels = load_kernels()
+    kernels = load_kernels(KERNELS)
     suppress = _suppress if kernels is None else kernels.suppress
     return order[
         suppress(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)

@@ -17,7 +17,7 @@ _Integers = NDArray[np.int64]
 
 
 def suppress(boxes: _Doubles, iou_threshold: float, limit: int) -> _Integers:
-    """`overlap._suppress`, box by box."""
+    """`overlap._suppress`, box by box: boxes (N, 7), best first -> indices (K,) of those kept."""
     kept = np.empty(len(boxes), np.int64)
     count = _suppress(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
     return kept[:count]

@@ -1,0 +1,1 @@
+"""Building a network from its configuration, and its checkpoints."""

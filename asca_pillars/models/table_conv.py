@@ -53,7 +53,7 @@ class _TableConv(torch.autograd.Function):
 
 
 def _by_tap(weight: Tensor) -> Tensor:
-    """(outputs, C, *kernel) -> (K, C, outputs)"""
+    """(outputs, C, *kernel) -> (K, C, outputs)."""
     return weight.flatten(2).permute(2, 1, 0)
 
 

@@ -39,7 +39,7 @@ class Preparation(Protocol):
 class Trainable(Protocol):
     """A detector that can be trained; a `torch.nn.Module` that has the methods below.
 
-    Outputs are the family's own: what `predict` gives goes to `loss` and to `detect`, and nobody else looks inside.
+    Outputs are the family's own: what `predict` gives goes to `loss` and to `detect` only.
     """
 
     @property
@@ -60,15 +60,25 @@ class Trainable(Protocol):
         ...
 
     def parameters(self) -> Iterator[nn.Parameter]:
-        """See `torch.nn.Module`, as for all that follow."""
+        """As of `torch.nn.Module`."""
         ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> dict[str, Any]:
+        """As of `torch.nn.Module`."""
+        ...
 
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
+        """As of `torch.nn.Module`."""
+        ...
 
-    def to(self, device: Any) -> Self: ...
+    def to(self, device: Any) -> Self:
+        """As of `torch.nn.Module`."""
+        ...
 
-    def train(self, mode: bool = True) -> Self: ...
+    def train(self, mode: bool = True) -> Self:
+        """As of `torch.nn.Module`."""
+        ...
 
-    def eval(self) -> Self: ...
+    def eval(self) -> Self:
+        """As of `torch.nn.Module`."""
+        ...

@@ -54,6 +54,7 @@ class View:
         return (np.array([self.y_max_m, self.x_max_m]) - xy_m[..., ::-1]) * self.px_per_m
 
     def shows(self, pixel: NDArray[np.floating], margin_px: float = 0.0) -> bool:
+        """Whether pixels (..., 2) of column, row all lie inside, at least `margin_px` from the border."""
         inner = (margin_px <= pixel) & (pixel <= np.array([self.width_px, self.height_px]) - margin_px)
         return bool(inner.all())
 
@@ -67,10 +68,12 @@ class Texts:
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def size(self, text: str) -> tuple[int, int]:
+        """Width and height of a text, pixels."""
         (width, height), _ = cv2.getTextSize(text, _FONT, self.scale, 1)
         return width, height
 
     def reserve(self, x1: float, y1: float, x2: float, y2: float) -> bool:
+        """Take a rectangle, pixels, if it is free; whether it was."""
         if any(x1 < b[2] and b[0] < x2 and y1 < b[3] and b[1] < y2 for b in self.taken):
             return False
         self.taken.append((x1, y1, x2, y2))
@@ -92,5 +95,5 @@ class Texts:
 
 
 def subpixels(pixels: NDArray[np.floating]) -> NDArray[np.int32]:
-    """Pixel coordinates as the fixed-point integers that OpenCV draws with."""
+    """Pixel coordinates (..., 2) as OpenCV's fixed-point integers, in 1 / 2**SUBPIXEL_BITS pixel."""
     return np.round(np.clip(pixels, -1e6, 1e6) * 2**SUBPIXEL_BITS).astype(np.int32)

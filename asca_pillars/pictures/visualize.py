@@ -34,6 +34,12 @@ def class_color(name: str) -> Color:
     return _CLASS_COLORS.get(name) or _OTHER_COLORS[zlib.crc32(name.encode()) % len(_OTHER_COLORS)]
 
 
+def read_image(path: Path) -> Image | None:
+    """The image (H, W, 3), blue, green, red, of a file; None if there is none or it cannot be decoded."""
+    image = cv2.imread(str(path)) if path.is_file() else None
+    return None if image is None else image.astype(np.uint8, copy=False)
+
+
 def write_png(path: str | Path, image: Image) -> None:
     """Write an image (H, W, 3), blue, green, red, as PNG."""
     with atomic_path(path) as temporary:
@@ -89,7 +95,10 @@ def draw_bev(
 def draw_layers(
     points: NDArray[np.floating], layers: Sequence[BoxLayer], ranges: Ranges, *, width_px: int = 1000
 ) -> Image:
-    """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend."""
+    """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend.
+
+    Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR.
+    """
     points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
     view = View.around(np.concatenate([points[:, :2], *(o.reshape(-1, 2) for o in outlines)]), ranges, width_px)
@@ -136,7 +145,7 @@ def draw_on_image(
             face = np.array([front[0, 0], front[0, 1], front[2, 1], front[2, 0]])
             tinted = canvas.copy()
             cv2.fillPoly(tinted, [subpixels(face)], color, cv2.LINE_AA, SUBPIXEL_BITS)
-            canvas = cv2.addWeighted(tinted, 0.35, canvas, 0.65, 0)
+            cv2.addWeighted(tinted, 0.35, canvas, 0.65, 0, dst=canvas)
         thickness = 2 if depths_m[i] < 25 else 1
         for ends in edges[i][np.isfinite(edges[i]).all(axis=(1, 2))]:
             cv2.polylines(canvas, [subpixels(ends)], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)

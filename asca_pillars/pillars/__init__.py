@@ -1,0 +1,1 @@
+"""What the pillar family adds to `geometry`, in NumPy: grid, pillarize, `PillarSpec`."""

@@ -159,7 +159,7 @@ class PillarGrid:
         return np.stack([self.column_centers_m[columns], self.row_centers_m[rows]], axis=-1)
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Metric centers of the head map's cells: x of its columns (W,), y of its rows (H,).
+        """Centers of the head map's cells, metres, LiDAR frame: x of its columns (W,), y of its rows (H,).
 
         Zones hold a multiple of HEAD_STRIDE columns, so the two columns of a head cell are equally deep.
         """
@@ -196,12 +196,12 @@ class PillarGrid:
 
     @cached_property
     def column_centers_m(self) -> NDArray[np.float32]:
-        """x of the columns' centers, (nx,)."""
+        """x of the columns' centers, (nx,), metres, LiDAR frame."""
         return ((self.x_edges_m[:-1] + self.x_edges_m[1:]) / 2).astype(np.float32)
 
     @cached_property
     def row_centers_m(self) -> NDArray[np.float32]:
-        """y of the rows' centers, (ny,)."""
+        """y of the rows' centers, (ny,), metres, LiDAR frame."""
         return ((self.y_edges_m[:-1] + self.y_edges_m[1:]) / 2).astype(np.float32)
 
 

@@ -21,7 +21,7 @@ _BLOCK = 16  # cells of the grid that are looked at together
 
 
 def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, _Integers]:
-    """`pillarize._sort_points`, by counting."""
+    """`pillarize._sort_points`, by counting: points (N, 4) -> indices (K,) of those inside, cells (Q,), counts (Q,)."""
     size = -(-grid.ny * grid.nx // _BLOCK) * _BLOCK
     # In one piece: glibc gives several pieces back to the system, and gets them page by page again for the next scan.
     memory = np.empty(5 * len(points) + size, np.uint32)
@@ -113,7 +113,7 @@ def fill_pillars(
     max_points: int,
     grid: PillarGrid,
 ) -> tuple[_Floats, _Integers, _Integers]:
-    """`pillarize._fill_pillars`, in one pass over the points that stay."""
+    """`pillarize._fill_pillars`, in one pass: features (M, 9), pillar indices (M,) and counts of points (P,)."""
     point_counts = np.minimum(counts[kept], max_points)
     features = np.empty((point_counts.sum(), 9), np.float32)
     pillar_index = np.empty(len(features), np.int64)

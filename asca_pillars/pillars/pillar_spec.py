@@ -28,5 +28,5 @@ class PillarSpec(DetectorSpec):
         return self.grid.head_centers_m()
 
     def pillarize(self, points: NDArray[np.float32], rng: np.random.Generator | None = None) -> Pillars:
-        """Pillars of an (N, 4) scan on this detector's grid, see `pillarize`."""
+        """Pillars of a scan (N, 4) in the LiDAR frame on this detector's grid, see `pillarize`."""
         return pillarize(points, self.grid, self.limits, rng)

@@ -16,6 +16,8 @@ from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.grid import PillarGrid
 
+KERNELS = "asca_pillars.pillars.pillar_kernels"
+
 FEATURES = ("x", "y", "z", "reflectance", "x_mean", "y_mean", "z_mean", "x_center", "y_center")
 """Channels of a point (D = 9 of the paper): position in metres, LiDAR frame; reflectance; offsets in metres
 to the mean of the pillar's kept points and to the pillar's center."""
@@ -84,7 +86,7 @@ def pillarize(
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points must have shape (N, 4), not {points.shape}")
     points = np.require(points, np.float32, ["C", "ALIGNED"])
-    kernels = load_kernels()
+    kernels = load_kernels(KERNELS)
     sort, fill = (_sort_points, _fill_pillars) if kernels is None else (kernels.sort_points, kernels.fill_pillars)
     order, cells, counts = sort(points, grid)
     kept, shuffled = _draw(points, counts, limits, rng)
@@ -142,7 +144,7 @@ def _stable_argsort(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return order
 
 
-def _fill_pillars(
+def _fill_pillars(  # noqa: PLR0917  (called with the arguments of its compiled form)
     points: NDArray[np.float32],
     order: NDArray[np.int64],
     cells: NDArray[np.int64],

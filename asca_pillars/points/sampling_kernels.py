@@ -113,7 +113,9 @@ def _farthest_points(
     best_of_row: _Integers,
     chosen: _Integers,
 ) -> int:
-    """`sorted_points`: x, y, z and squared distance to the nearest sample, in `order`. Of each column, `boxes`: what
+    """Choose sample after sample, each the farthest from those before it.
+
+    `sorted_points`: x, y, z and squared distance to the nearest sample, in `order`. Of each column, `boxes`: what
     bounds its points, low and high; `largest`: of their distances, and `best`: where.
 
     A column is looked into only if its box is nearer to the new sample than the largest distance in it; rounding keeps

@@ -1,0 +1,1 @@
+"""Simulated street scans with labels in KITTI's layout."""

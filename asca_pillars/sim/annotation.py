@@ -66,8 +66,11 @@ def label_camera_view(
 def label_all_around(
     targets: tuple[Target, ...], hits: Hits, owner: Owners, calib: Calibration, config: SceneConfig
 ) -> list[KittiObject]:
-    """Labels of all objects that return a point, nearest first; arguments as for `label_camera_view`, but `owner` of
-    all points. See the top of the file for what the fields mean where there is no camera."""
+    """Labels of all objects that return a point, nearest first.
+
+    Arguments are as for `label_camera_view`, but `owner` (N,) is of all points. See the top of the file for what the
+    fields mean where there is no camera.
+    """
     points, visible, truncated = _evidence(targets, hits, owner, calib)
     labels = []
     objects = _objects(targets, calib)

@@ -1,0 +1,1 @@
+"""Dataset, sampler and the training loop on Lightning."""

@@ -34,7 +34,7 @@ class DetectionModule(L.LightningModule):
         self.recall = RecallTally(config.model.spec.class_names)
 
     def training_step(self, batch: Batch | AscaError, _: int) -> Tensor:
-        """The loss of one batch.
+        """The loss of one batch, a scalar.
 
         Raises:
             AscaError: a frame of the batch could not be read, or a term of its loss is not finite.

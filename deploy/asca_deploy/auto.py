@@ -41,14 +41,14 @@ class Candidate:
     precision: Precision
     median_ms: float | None
     """From the points to the boxes, warm; None if it was not timed."""
-    verdict: str
+    outcome: str
     """AGREES, or why it could not be taken."""
     weights: str = "float32"
     """The bundle's own precision, float32 or int8."""
 
     def __str__(self) -> str:
         time_ms = "" if self.median_ms is None else f" {self.median_ms:.1f} ms"
-        return f"{self.provider} {arithmetic(self.weights, self.precision)}{time_ms} {self.verdict}"
+        return f"{self.provider} {arithmetic(self.weights, self.precision)}{time_ms} {self.outcome}"
 
 
 class Choice(NamedTuple, Generic[Network]):

@@ -21,10 +21,10 @@ class Canvas:
     cells of the frame before is many times faster than a new image, 64 MB for the paper's grid.
     """
 
-    def __init__(self, channels: int, grid: PillarGrid, format: CanvasFormat | None = None) -> None:
-        format = format or CanvasFormat()
-        self.image: NDArray[Any] = np.empty((1, grid.ny + 1, grid.nx + 1, channels), format.type)
-        self._empty = np.array(format.empty or [0] * channels, format.type)
+    def __init__(self, channels: int, grid: PillarGrid, stored_as: CanvasFormat | None = None) -> None:
+        stored_as = stored_as or CanvasFormat()
+        self.image: NDArray[Any] = np.empty((1, grid.ny + 1, grid.nx + 1, channels), stored_as.type)
+        self._empty = np.array(stored_as.empty or [0] * channels, stored_as.type)
         self._cells = self.image.reshape(-1, channels)
         self._cells[:] = self._empty
         self._nx = grid.nx

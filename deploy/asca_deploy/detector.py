@@ -23,6 +23,7 @@ from asca_pillars.data.input_check import InputWarning, check_input
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError, ScanError
+from asca_pillars.geometry import overlap
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.frame_report import FrameReport, ScanCounts, summed
@@ -79,7 +80,7 @@ class Detector:
     Args:
         bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the 8-bit one
             that ships.
-        provider: of the slowest network: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one at hand
+        provider: of the slowest network: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one available
             that finds in the sample scan what "cpu" finds. `self.provider` and `self.precision` say what was taken,
             `self.candidates` how each one did. The other graphs always run on onnxruntime's CPU provider.
         precision: "float32", in which the bundle was proven, or "reduced" where the provider has something faster
@@ -109,7 +110,7 @@ class Detector:
         view: View = "ahead",
     ) -> None:
         start = perf_counter()
-        load_kernels()  # here rather than in the first scan
+        load_kernels(overlap.KERNELS)  # here rather than in the first scan
         self.folder = find_bundle(bundle)
         self.threads = check_threads(threads)
         check_onnxruntime()
@@ -171,7 +172,7 @@ class Detector:
         that live as long as the iterator; see `asca_deploy.stream`.
 
         Args:
-            scans: each as for a call; read in another thread, at most one ahead of the one asked for.
+            scans: (N, 4) each, as for a call; read in another thread, at most one ahead of the one asked for.
 
         Raises:
             ScanError: a scan cannot be used; the scans before it have been yielded. Errors of `scans` itself come in
@@ -265,7 +266,7 @@ class Detector:
             return pipeline.finish(pipeline.infer(pipeline.prepare(points, laps), laps), laps)
 
         return auto.choose(
-            providers.at_hand(), open_pipeline, detect, self.bundle.spec, precision, weights=self.bundle.precision
+            providers.available(), open_pipeline, detect, self.bundle.spec, precision, weights=self.bundle.precision
         )
 
 

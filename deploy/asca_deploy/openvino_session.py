@@ -81,7 +81,10 @@ class OpenVinoSession:
         self._results = [(tuple(port.shape), port.element_type.to_dtype()) for port in model.outputs]
 
     def run(self, outputs: Sequence[str], inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        """See `graph.Session.run`; OpenVINO writes into new arrays, so that nothing is copied."""
+        """See `graph.Session.run`; OpenVINO writes into new arrays, so that nothing is copied.
+
+        Inputs and outputs are unitless and have the graph's fixed shapes, such as (1, ny + 1, nx + 1, C).
+        """
         found = [np.empty(shape, kind) for shape, kind in self._results]
         with self._lock:  # a request refuses a second caller, and one network keeps all cores busy
             for port, array in enumerate(found):
@@ -119,7 +122,7 @@ def _core() -> "openvino.Core":
 def _import_openvino() -> Any:
     """Import the package without its report to the manufacturer.
 
-    It sends one at every import, unless the package that does so cannot be imported; a vehicle reports to nobody.
+    It sends one at every import, unless the package that does so cannot be imported; a vehicle must not report.
     """
     telemetry = "openvino_telemetry"
     absent = telemetry not in sys.modules

@@ -73,10 +73,10 @@ def require(name: str, precision: str) -> None:
     """Raise ProviderError, which says what to install or to choose, unless onnxruntime has the provider."""
     provider, available = ORT_PROVIDERS[name], onnxruntime.get_available_providers()
     if provider.ort_name not in available:
-        at_hand = [other for other, entry in ORT_PROVIDERS.items() if entry.ort_name in available]
+        usable = [other for other, entry in ORT_PROVIDERS.items() if entry.ort_name in available]
         raise ProviderError(
             f"provider {name} is not in this onnxruntime {onnxruntime.__version__}, which has"
-            f" {', '.join(at_hand)}; {provider.remedy}"
+            f" {', '.join(usable)}; {provider.remedy}"
         )
     if precision not in provider.options:
         raise ProviderError(

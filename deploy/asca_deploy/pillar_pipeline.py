@@ -17,8 +17,9 @@ from asca_deploy.table_backbone import TableBackbone
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.decode import decode
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import FEATURES, PillarCounts, Pillars, pillarize
+from asca_pillars.pillars.pillarize import FEATURES, KERNELS, PillarCounts, Pillars, pillarize
 
 _NO_SPARSE_NECK = {
     "openvino": "it needs outputs of fixed shapes",
@@ -56,6 +57,7 @@ class PillarPipeline:
         precision: providers.Precision = "float32",
         threads: int = 1,
     ) -> None:
+        load_kernels(KERNELS)  # here rather than in the first scan
         self.bundle = bundle
         self.spec: PillarSpec = bundle.spec
         self._encoder = _open_encoder(folder, bundle)
@@ -74,13 +76,13 @@ class PillarPipeline:
         return PreparedPillars(placed, pillars.stats)
 
     def infer(self, prepared: PreparedPillars, laps: Laps) -> HeadAnswer:
-        """The placed pillars -> logits and residuals."""
+        """The placed pillars -> head maps (channels, H, W) of logits and residuals, or rows of the active cells."""
         answer = self.backbone.run(prepared.placed)
         laps.append(("neck+head", perf_counter()))
         return answer
 
     def finish(self, raw: HeadAnswer, laps: Laps) -> Detections:
-        """Logits and residuals -> boxes above the score threshold that survive the rotated NMS."""
+        """Head maps (channels, H, W) -> boxes, LiDAR frame, above the score threshold that the rotated NMS keeps."""
         detections = decode(raw.maps, self._anchors, self.spec.classes, self.spec.post, raw.cells)
         laps.append(("decode", perf_counter()))
         return detections
@@ -90,7 +92,7 @@ class PillarPipeline:
         return pillarize(points, self.spec.grid, self.spec.limits)
 
     def encode(self, pillars: Pillars) -> NDArray[Any]:
-        """Features (M, 9) -> pillar features (P, C), of the canvas's type. Paper section 3.2."""
+        """Features (M, 9) -> unitless pillar features (P, C), of the canvas's type. Paper section 3.2."""
         if not len(pillars.cells):
             return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
         values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three
@@ -100,7 +102,7 @@ class PillarPipeline:
 def _open_encoder(folder: Path, bundle: Bundle) -> Session:
     # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
     # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is
-    # the fastest form all the same, ten times faster than ScatterElements.
+    # still the fastest form, ten times faster than ScatterElements.
     path = folder / bundle.graphs[ENCODER].file
     inputs = {
         "features": Tensor("float32", (None, len(FEATURES))),

@@ -54,7 +54,7 @@ def require(provider: str, precision: str = "float32") -> None:
         ort_session.require(provider, precision)
 
 
-def at_hand() -> list[tuple[Provider, Precision]]:
+def available() -> list[tuple[Provider, Precision]]:
     """Every (provider, precision) that is installed; the faster precision of a provider first."""
     found: list[tuple[Provider, Precision]] = []
     for provider in PROVIDERS:

@@ -36,7 +36,7 @@ def export_bundle(
     trained_on: str = "not stated",
     command: str = "not stated",
     calibration: Sequence[NDArray[np.float32]] | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
     """Write the two graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
 
@@ -52,7 +52,7 @@ def export_bundle(
         command: the command that trained them.
         calibration: scans (N, 4) that set the ranges of an 8-bit bundle; those that are among `scans` are left out
             and counted.
-        say: told what is being done.
+        progress: told what is being done.
 
     Raises:
         ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
@@ -62,7 +62,7 @@ def export_bundle(
     config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
     if not isinstance(detector, PillarDetector):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
-    say("Exporting and proving parity")
+    progress("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         graphs.export_encoder(detector, graphs.graph_path(folder, ENCODER))
         gmac = _export_backbone(detector, graphs.graph_path(folder, BACKBONE), scans)
@@ -102,7 +102,7 @@ def export_bundle(
         bundle = dataclasses.replace(draft, parity=prove_parity(detector, pipeline, scans))
         write_bundle_manifest(folder, bundle)
         if calibration is not None:
-            bundle = quantize_bundle(folder, bundle, detector, calibration, scans, say)
+            bundle = quantize_bundle(folder, bundle, detector, calibration, scans, progress)
     return bundle
 
 

@@ -94,6 +94,7 @@ class Upsample(nn.Module):
             self.convolution.bias.copy_(fused.bias.repeat(self.stride**2))
 
     def forward(self, features: Tensor) -> Tensor:
+        """Unitless (1, C, H, W) -> (1, stride * H, stride * W, channels)."""
         upsampled = torch.relu(self.convolution(features)).permute(0, 2, 3, 1)
         if self.stride == 1:
             return upsampled

@@ -48,17 +48,17 @@ def quantize_bundle(
     detector: PillarDetector,
     calibration: Sequence[Points],
     scans: Sequence[Points],
-    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
     """Replace the graphs and the manifest in `folder` by 8-bit ones.
 
     Args:
         folder: a proven float bundle.
         detector: what it was exported from, in evaluation mode.
-        calibration: scans (N, 4) that set the ranges, at least MIN_CALIBRATION of them with points on the grid; those
-            that are among `scans` are left out, or the comparison would be with what it was fitted to.
+        calibration: scans (N, 4), LiDAR frame, that set the ranges, at least MIN_CALIBRATION of them with points on
+            the grid; those that are among `scans` are left out, or the comparison would be with what it was fitted to.
         scans: to measure on.
-        say: told what is being done.
+        progress: told what is being done.
 
     Raises:
         ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
@@ -81,7 +81,7 @@ def quantize_bundle(
     expected = [answer.maps.scores for answer in answers]
     boxes = [runtime(points) for points in scans]
     with tempfile.TemporaryDirectory() as work:
-        say("Calibrating and rounding the weights")
+        progress("Calibrating and rounding the weights")
         rounded, trial = round_backbone(detector, encoded, steps, Path(work)), Path(work) / "trial.onnx"
 
         def error_of(eight_bit: Sequence[str]) -> float:
@@ -91,7 +91,7 @@ def quantize_bundle(
             found = (backbone.run(each).maps.scores for each in placed)
             return _logit_error(expected, found, len(bundle.spec.classes))
 
-        found = _sweep(rounded.layers, error_of, say)
+        found = _sweep(rounded.layers, error_of, progress)
         eight_bit = [layer for layer in rounded.layers if layer not in found.kept_float]
         rounded.write(graphs.graph_path(folder, BACKBONE), eight_bit)
     qdq.quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
@@ -114,12 +114,12 @@ def quantize_bundle(
 
 
 def _sweep(
-    layers: Sequence[str], error_of: Callable[[Sequence[str]], float], say: Callable[[str], None]
+    layers: Sequence[str], error_of: Callable[[Sequence[str]], float], progress: Callable[[str], None]
 ) -> _Sensitivity:
     """Try every layer in floating point, and keep the most harmful ones so until the error is small enough."""
     total, alone = error_of(layers), {}
     for number, layer in enumerate(layers, start=1):
-        say(f"Sensitivity of layer {number} of {len(layers)}")
+        progress(f"Sensitivity of layer {number} of {len(layers)}")
         alone[layer] = error_of([other for other in layers if other != layer])
     kept: list[str] = []
     for layer in sorted(layers, key=alone.__getitem__):

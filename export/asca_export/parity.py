@@ -41,7 +41,7 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
     Args:
         detector: in evaluation mode.
         runtime: opened on the bundle that was exported from it.
-        scans: (N, 4) each.
+        scans: (N, 4) each, LiDAR frame.
 
     Raises:
         ExportError: they differ; names the first stage that does, and the scan.

@@ -51,7 +51,8 @@ def quantize_backbone(template: Path, out: Path, layers: Collection[str], parame
     Args:
         template: `FastBackbone` in ONNX, its activations and canvas in steps.
         layers: some of `quantize.layer_names`.
-        parameters: by name; the weights of `layers` are rounded.
+        parameters: by name, unitless and of the module's shapes, such as (out, in, 3, 3); the weights of `layers` are
+            rounded.
     """
     model = onnx.shape_inference.infer_shapes(onnx.load(template))
     for tensor in model.graph.initializer:

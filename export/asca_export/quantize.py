@@ -36,7 +36,7 @@ _TINY = 1e-6
 
 
 def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
-    """Steps of a canvas that holds the features of all these scans, (P, C) each, and zero exactly."""
+    """Steps of a canvas that holds the unitless features of all these scans, (P, C) each, and zero exactly."""
     lows, highs = zip(*((features.min(axis=0), features.max(axis=0)) for features in pillar_features), strict=True)
     low, high = np.minimum(np.min(lows, axis=0), 0.0), np.maximum(np.max(highs, axis=0), 0.0)
     scale = np.maximum((high - low) / STEPS, _TINY).astype(np.float32)
@@ -99,7 +99,7 @@ def input_moments(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]],
 
     Args:
         backbone: scaled to steps.
-        canvases: (1, ny + 1, nx + 1, C) each.
+        canvases: (1, ny + 1, nx + 1, C) each, unitless.
     """
     empty = {name: _center(pass_.input) for name, pass_ in _passes(backbone, _empty_canvas(steps))}
     generator = torch.Generator().manual_seed(0)

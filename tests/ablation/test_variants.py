@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -34,7 +35,7 @@ def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
 def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.CaptureFixture[str]) -> None:
     data = write_dataset(tmp_path / "data", 14, val_frames=8)
     out = tmp_path / "out"
-    options = {"override": ["train.learning_rate=0.002"], "seeds": "0", "variants": "baseline,asp_k2"}
+    options: dict[str, Any] = {"override": ["train.learning_rate=0.002"], "seeds": "0", "variants": "baseline,asp_k2"}
     ablate(config, data=data, out=out, jobs=2, **options)
     text = (out / "results.md").read_text()
     assert "6 frames for training, 8 for validation" in text and "2 runs" in text

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def texts(root: Path) -> dict[str, Path]:
+def texts(root: Path) -> dict[str, Any]:
     """The labels of all three frames, and as predictions the labels themselves."""
     labels = root / "training" / "label_2"
     for frame_id in KittiSplit(root).frame_ids:
@@ -100,7 +101,7 @@ def texts(root: Path) -> dict[str, Path]:
     return {"predictions": root.parent / "det", "labels": labels}
 
 
-def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     report = evaluate(**texts, out=tmp_path / "out", json_path=tmp_path / "deep" / "results.json", gallery=None)
     assert json.loads((tmp_path / "deep" / "results.json").read_text()) == report
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.md", "curves.png"}
@@ -113,7 +114,7 @@ def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Path], capsys: pyt
 
 
 def test_a_missing_prediction_file_is_said_everywhere(
-    tmp_path: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (texts["predictions"] / "000001.txt").unlink()
     report = evaluate(**texts, out=tmp_path / "out")
@@ -125,7 +126,7 @@ def test_a_missing_prediction_file_is_said_everywhere(
     assert sentence in (tmp_path / "out" / "report.md").read_text()
 
 
-def test_the_base_install_is_enough_for_everything_but_the_curves(tmp_path: Path, texts: dict[str, Path]) -> None:
+def test_the_base_install_is_enough_for_everything_but_the_curves(tmp_path: Path, texts: dict[str, Any]) -> None:
     shutil.copytree(texts["labels"], tmp_path / "gt")
     command = [sys.executable, "-c", BASE_INSTALL]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
@@ -135,7 +136,7 @@ def test_the_base_install_is_enough_for_everything_but_the_curves(tmp_path: Path
 
 
 def test_predictions_with_a_dataset_are_scored_on_its_split_and_drawn(
-    tmp_path: Path, root: Path, texts: dict[str, Path]
+    tmp_path: Path, root: Path, texts: dict[str, Any]
 ) -> None:
     (texts["predictions"] / "000002.txt").write_text("")
     report = evaluate(predictions=texts["predictions"], data=root, out=tmp_path / "out", gallery=None, score=0.95)
@@ -211,7 +212,7 @@ def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
-def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
+def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
     det, gt = texts["predictions"], texts["labels"]
     assert refusal(tmp_path) == "nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR"
     assert refusal(tmp_path, predictions=det) == (
@@ -236,7 +237,7 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
     assert not (tmp_path / "out").exists()
 
 
-def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
+def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
     theirs = tmp_path / "out" / "predictions"
     shutil.copytree(texts["predictions"], theirs)
     assert refusal(tmp_path, data=root) == (
@@ -246,11 +247,11 @@ def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Pat
 
 
 def test_waymos_metric_of_labels_against_themselves(
-    tmp_path: Path, root: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, root: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With scans at both levels, without them at LEVEL_2; every class and range that has objects gets 100."""
     (texts["predictions"] / "000000.txt").unlink()
-    arguments = {"predictions": texts["predictions"], "out": tmp_path / "out", "protocol": "waymo"}
+    arguments: dict[str, Any] = {"predictions": texts["predictions"], "out": tmp_path / "out", "protocol": "waymo"}
     report = evaluate(**arguments, data=root, json_path=tmp_path / "waymo.json")
     assert json.loads((tmp_path / "waymo.json").read_text()) == report
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"waymo.json", "waymo.md"}
@@ -275,7 +276,7 @@ def test_waymos_metric_of_the_shipped_bundle(tmp_path: Path, root: Path) -> None
     assert again["results"] == report["results"]
 
 
-def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, texts: dict[str, Path]) -> None:
+def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
     waymo = {**texts, "protocol": "waymo"}
     assert refusal(tmp_path, **waymo, score=0.5) == (
         "--score 0.5 belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
@@ -285,7 +286,7 @@ def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, te
 
 
 def test_a_class_that_kitti_does_not_know_is_left_out_and_named(
-    tmp_path: Path, texts: dict[str, Path], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     expected = evaluate(**texts, out=tmp_path / "before")
     capsys.readouterr()
@@ -304,7 +305,7 @@ def test_a_class_that_kitti_does_not_know_is_left_out_and_named(
     assert forklift["objects"] == 3 and forklift["AP"] == pytest.approx(100)
 
 
-def test_classes_that_are_all_unknown_are_refused(tmp_path: Path, texts: dict[str, Path]) -> None:
+def test_classes_that_are_all_unknown_are_refused(tmp_path: Path, texts: dict[str, Any]) -> None:
     for folder in texts.values():
         for name in CLASS_NAMES:
             rename(folder, name, "Forklift")
@@ -319,7 +320,7 @@ def rename(folder: Path, name: str, other: str) -> None:
         path.write_text(path.read_text().replace(f"{name} ", f"{other} "))
 
 
-def test_labels_against_themselves_reach_the_cap(tmp_path: Path, texts: dict[str, Path]) -> None:
+def test_labels_against_themselves_reach_the_cap(tmp_path: Path, texts: dict[str, Any]) -> None:
     report = evaluate(**texts, out=tmp_path / "out")
     for name, objects in (("Car", 6), ("Pedestrian", 3), ("Cyclist", 3)):
         for metric in ("bbox", "bev", "3d", "aos"):

@@ -103,6 +103,6 @@ def test_reflectance_is_lost_in_part_or_is_one_value() -> None:
         assert np.array_equal(points[:, :3], bright[:, :3])
         same += np.array_equal(points, bright)
         constant += np.ptp(points[:, 3]) == 0
-        some += (points[:, 3] == 0).any() and np.isin(points[:, 3], [0, *bright[:, 3]]).all()
+        some += bool((points[:, 3] == 0).any() and np.isin(points[:, 3], [0, *bright[:, 3]]).all())
     assert same == pytest.approx(100, abs=25) and constant == pytest.approx(50, abs=20)
     assert some == pytest.approx(50, abs=20)

@@ -3,8 +3,10 @@
 import importlib.util
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -38,7 +40,7 @@ EXPECTED_INPUT = ExpectedInput(
 def encoder_graph(uses_counts: bool) -> onnx.ModelProto:
     """max over a pillar's points of relu(W f + b), as ScatterND(max)."""
     rng = np.random.default_rng(1)
-    weights = {
+    weights: dict[str, NDArray[Any]] = {
         "weight": rng.normal(0, 0.5, (len(FEATURES), CHANNELS)).astype(np.float32),
         "bias": rng.normal(0, 0.1, CHANNELS).astype(np.float32),
         "channels": np.array([CHANNELS], np.int64),
@@ -183,7 +185,7 @@ def _model(
     nodes: list[onnx.NodeProto],
     inputs: list[onnx.ValueInfoProto],
     outputs: list[onnx.ValueInfoProto],
-    weights: dict[str, NDArray[np.generic]],
+    weights: Mapping[str, NDArray[Any]],
 ) -> onnx.ModelProto:
     initializers = [numpy_helper.from_array(value, name) for name, value in weights.items()]
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, initializers)

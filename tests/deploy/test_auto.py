@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector, auto
+from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider
 from asca_pillars.errors import BundleError, ProviderError
 from asca_pillars.geometry.anchors import KITTI_CLASSES
 from asca_pillars.geometry.detections import Detections
@@ -47,9 +48,11 @@ def rescored(index: int, score: float) -> Detections:
 def with_a_fourth(score: float) -> Detections:
     extra = BOXES[:1] + np.array([20, 0, 0, 0, 0, 0, 0], np.float32)
     return Detections(
-        np.concatenate([BOXES, extra]), np.append(FOUND.scores, np.float32(score)), np.append(FOUND.labels, 2),
+        np.concatenate([BOXES, extra]),
+        np.append(FOUND.scores, np.float32(score)),
+        np.append(FOUND.labels, 2),
         FOUND.class_names,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(
@@ -95,6 +98,11 @@ def test_without_a_clear_box_nothing_is_proven() -> None:
         assert "unproven" in str(auto.disagreement(nothing, nothing, THRESHOLDS))
 
 
+def way(name: str) -> tuple[Provider, Precision]:
+    """cpu_float32 -> its provider and precision."""
+    return next((p, q) for p in PROVIDERS for q in PRECISIONS if f"{p}_{q}" == name)
+
+
 class Machine:
     """Networks of stub providers: what each finds, and how long that takes by a clock of their own."""
 
@@ -103,11 +111,11 @@ class Machine:
         seconds: float
 
     def __init__(self, **networks: tuple[Detections | Exception, float]) -> None:
-        self.networks = {tuple(name.split("_")): self.Network(*network) for name, network in networks.items()}
-        self.opened: list[tuple[str, str]] = []
+        self.networks = {way(name): self.Network(*network) for name, network in networks.items()}
+        self.opened: list[tuple[Provider, Precision]] = []
         self.now = 100.0
 
-    def open(self, provider: str, precision: str) -> Network:
+    def open(self, provider: Provider, precision: Precision) -> Network:
         self.opened.append((provider, precision))
         network = self.networks[provider, precision]
         if isinstance(network.found, ProviderError):
@@ -120,13 +128,13 @@ class Machine:
             raise network.found
         return network.found
 
-    def choose(self, precision: str | None = None) -> auto.Choice[Network]:
+    def choose(self, precision: Precision | None = None) -> auto.Choice[Network]:
         names = list(self.networks)
         return auto.choose(names, self.open, self.detect, THRESHOLDS, precision, lambda: self.now)
 
 
-def verdicts(choice: auto.Choice[Machine.Network]) -> dict[str, str]:
-    return {f"{item.provider}_{item.precision}": item.verdict for item in choice.candidates}
+def outcomes(choice: auto.Choice[Machine.Network]) -> dict[str, str]:
+    return {f"{item.provider}_{item.precision}": item.outcome for item in choice.candidates}
 
 
 def test_the_fastest_that_agrees_is_taken() -> None:
@@ -143,7 +151,7 @@ def test_the_fastest_that_agrees_is_taken() -> None:
     assert choice.network is machine.networks["cuda", "float32"]
     times_ms = {f"{item.provider}_{item.precision}": item.median_ms for item in choice.candidates}
     assert times_ms["cuda_float32"] == pytest.approx(3) and times_ms["cpu_float32"] == pytest.approx(70)
-    found = verdicts(choice)
+    found = outcomes(choice)
     assert found["cpu_float32"] == found["cuda_float32"] == found["openvino_reduced"] == auto.AGREES
     assert "misses a Pedestrian" in found["cuda_reduced"]
     assert "ask for it by name" in found["tensorrt_reduced"] and ("tensorrt", "reduced") not in machine.opened
@@ -155,7 +163,7 @@ def test_the_fastest_that_agrees_is_taken() -> None:
 def test_the_stock_cpu_stays_where_nothing_is_faster() -> None:
     machine = Machine(cpu_float32=(FOUND, 0.02), openvino_float32=(FOUND, 0.03), cuda_float32=(MemoryError(), 0.0))
     assert machine.choose().provider == "cpu"
-    assert verdicts(machine.choose())["cuda_float32"] == "does not run: MemoryError"
+    assert outcomes(machine.choose())["cuda_float32"] == "does not run: MemoryError"
     assert Machine(cpu_float32=(FOUND, 0.02)).choose().provider == "cpu"
 
 
@@ -169,7 +177,7 @@ def test_candidates_come_to_an_end() -> None:
     machine = Machine(cpu_float32=(FOUND, 0.3), openvino_reduced=(FOUND, 0.25), openvino_float32=(FOUND, 0.001))
     choice = machine.choose()
     assert choice.precision == "reduced"
-    assert verdicts(choice)["openvino_float32"] == "left out after 2 s"
+    assert outcomes(choice)["openvino_float32"] == "left out after 2 s"
 
 
 def test_a_precision_that_was_asked_for() -> None:

@@ -31,7 +31,7 @@ def test_more_points_are_the_scan_and_noisy_copies(scan: Points) -> None:
     assert more.shape == (5000, 4)
     rows = {tuple(point) for point in more.tolist()}
     assert {tuple(point) for point in scan.tolist()} <= rows and len(rows) > 4900
-    assert np.isin(more[:, 3], scan[:, 3]).all()  # reflectances are nobody's noise
+    assert np.isin(more[:, 3], scan[:, 3]).all()  # reflectances get no noise
     with pytest.raises(ValueError, match="without points"):
         resample(scan[:0], 10)
 

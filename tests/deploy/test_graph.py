@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.manifest import load_bundle
+from asca_deploy.providers import Provider
 from asca_pillars.errors import BundleError
 from tests.deploy.conftest import needs_openvino, sign
 
@@ -34,7 +35,7 @@ def rename(model: onnx.ModelProto, old: str, new: str) -> None:
 
 
 @by_provider
-def test_unknown_input(bundle_copy: Path, provider: str) -> None:
+def test_unknown_input(bundle_copy: Path, provider: Provider) -> None:
     respoil(bundle_copy, "backbone.onnx", lambda model: rename(model, "canvas", "image"))
     with pytest.raises(BundleError, match=r"backbone\.onnx has an unknown input `image`, the runtime knows canvas"):
         Detector(bundle_copy, provider=provider)
@@ -44,7 +45,7 @@ def test_unknown_input(bundle_copy: Path, provider: str) -> None:
 
 
 @by_provider
-def test_missing_output(bundle_copy: Path, provider: str) -> None:
+def test_missing_output(bundle_copy: Path, provider: Provider) -> None:
     respoil(bundle_copy, "backbone.onnx", lambda model: rename(model, "directions", "yaw_bins"))
     with pytest.raises(BundleError, match=r"backbone\.onnx has no output `directions`, only .*yaw_bins"):
         Detector(bundle_copy, provider=provider)
@@ -52,7 +53,7 @@ def test_missing_output(bundle_copy: Path, provider: str) -> None:
 
 @by_provider
 def test_outputs_are_found_by_name_not_by_order(
-    bundle_copy: Path, tiny_bundle: Path, scan: NDArray[np.float32], provider: str
+    bundle_copy: Path, tiny_bundle: Path, scan: NDArray[np.float32], provider: Provider
 ) -> None:
     def turn_round(model: onnx.ModelProto) -> None:
         outputs = list(model.graph.output)[::-1]
@@ -85,7 +86,7 @@ def test_graphs_of_another_model(bundle_copy: Path, field: str, value: float, me
 
 
 @by_provider
-def test_fewer_classes_than_the_head(bundle_copy: Path, provider: str) -> None:
+def test_fewer_classes_than_the_head(bundle_copy: Path, provider: Provider) -> None:
     good = load_bundle(bundle_copy)
     sign(bundle_copy, replace(good, spec=replace(good.spec, classes=good.spec.classes[:1])))
     with pytest.raises(BundleError, match=r"output `scores` is .*\(1, 12, 28, 6\).*needs .*\(1, 12, 28, 2\)"):

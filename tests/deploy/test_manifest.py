@@ -278,10 +278,30 @@ WITHOUT_EFFECT_ON_BOXES = (
     "provenance",
     "backbone_gmac",
 )
-HOSTILE = (
-    None, True, False, -1, 0, 1, 3, 0.5, -1e308, 1e308, 2**63, 10**400, "", "0", "x" * 100_000, "\x1b[31m\n", "int8",
-    [], [None], {}, {"a": {}}, [[[]]],
-)  # fmt: skip
+HOSTILE: tuple[Any, ...] = (
+    None,
+    True,
+    False,
+    -1,
+    0,
+    1,
+    3,
+    0.5,
+    -1e308,
+    1e308,
+    2**63,
+    10**400,
+    "",
+    "0",
+    "x" * 100_000,
+    "\x1b[31m\n",
+    "int8",
+    [],
+    [None],
+    {},
+    {"a": {}},
+    [[[]]],
+)
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:

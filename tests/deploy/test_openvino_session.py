@@ -67,10 +67,10 @@ def test_reduced_finds_the_same_boxes() -> None:
     (expected, boxes, detector), (found, same_boxes, _) = maps_and_boxes(None), maps_and_boxes("reduced")
     assert auto.disagreement(boxes, same_boxes, detector.spec) is None
     for ours, theirs in zip(found, expected, strict=True):
-        error, largest = np.abs(ours - theirs), np.abs(theirs).max()
-        assert error.max() > 1e-3, "computed in float32 all the same"
+        difference, largest = np.abs(ours - theirs), np.abs(theirs).max()
+        assert difference.max() > 1e-3, "computed in float32"
         # OpenVINO rounds the biases too, and where there is no point their errors add up; no box comes from there.
-        assert np.median(error) < 0.02 * largest and error.max() < 0.25 * largest
+        assert np.median(difference) < 0.02 * largest and difference.max() < 0.25 * largest
 
 
 @pytest.fixture

@@ -1,10 +1,12 @@
+import importlib.util
 from pathlib import Path
+from typing import Any
 
 import onnxruntime
 import pytest
 
 from asca_deploy import Detector, openvino_session, providers
-from asca_deploy.providers import at_hand, require
+from asca_deploy.providers import Precision, Provider, available, require
 from asca_pillars.errors import BundleError, ProviderError
 
 CPU = "CPUExecutionProvider"
@@ -17,7 +19,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> 
     """What onnxruntime has, whether OpenVINO is installed, and whether the CPU has bfloat16."""
     available, openvino, bfloat16 = request.param
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [*available, "AzureExecutionProvider"])
-    monkeypatch.setattr(openvino_session.importlib.util, "find_spec", lambda _: object() if openvino else None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: object() if openvino else None)
     monkeypatch.setattr(openvino_session, "_has_bfloat16", lambda: bfloat16)
     monkeypatch.setattr(openvino_session, "_device_name", lambda: "Example 9000")
     monkeypatch.delenv("NVIDIA_TF32_OVERRIDE", raising=False)
@@ -48,8 +50,8 @@ GPU = ([TENSORRT, CUDA, CPU], True, True)
     indirect=["machine"],
 )
 @pytest.mark.usefixtures("machine")
-def test_what_is_at_hand(found: list[tuple[str, str]]) -> None:
-    assert at_hand() == found
+def test_what_is_available(found: list[tuple[str, str]]) -> None:
+    assert available() == found
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def test_what_is_at_hand(found: list[tuple[str, str]]) -> None:
     indirect=["machine"],
 )
 @pytest.mark.usefixtures("machine")
-def test_what_cannot_be_had_says_what_to_do(provider: str, precision: str, remedy: str, tiny_bundle: Path) -> None:
+def test_what_cannot_be_had_says_what_to_do(provider: Any, precision: Any, remedy: str, tiny_bundle: Path) -> None:
     with pytest.raises(ProviderError, match=remedy) as caught:
         require(provider, precision)
     assert "\n" not in str(caught.value)
@@ -161,7 +163,7 @@ def test_a_provider_that_does_not_start_is_an_error(stub: StubSession) -> None:
     ],
 )
 def test_options_by_precision_and_who_takes_the_rest(
-    stub: StubSession, provider: str, precision: str, chain: list[tuple[str, dict[str, str]]]
+    stub: StubSession, provider: Provider, precision: Precision, chain: list[tuple[str, dict[str, str]]]
 ) -> None:
     providers.open_session(GRAPH, provider, precision, threads=2)
     assert stub.opened == [chain]

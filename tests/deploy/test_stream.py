@@ -150,7 +150,7 @@ def test_a_call_between_two_scans_of_a_stream_disturbs_neither(tiny_bundle: Path
 
 def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     detector, scans = Detector(tiny_bundle), [make_scan(seed, 50 + 20 * seed) for seed in range(5)]
-    images = set()
+    images: set[int] = set()
     backbone = detector.pipeline.backbone
     neck_and_head = backbone.neck_and_head
     monkeypatch.setattr(backbone, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image))
@@ -163,7 +163,7 @@ def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: 
 
 def test_stop_iteration_out_of_a_stage_is_an_error_and_no_end() -> None:
     def prepare(scan: int) -> int:
-        raise StopIteration
+        raise StopIteration(scan)
 
     with pytest.raises(RuntimeError):
-        list(overlapped([1, 2], prepare, infer=abs, finish=abs))
+        list(overlapped([1, 2], prepare, infer=lambda ready: ready, finish=lambda found: found))

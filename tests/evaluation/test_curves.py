@@ -19,7 +19,7 @@ def results(precision: list[float]) -> KittiResults:
 
 def blue(path: Path) -> np.ndarray:
     """Columns of the pixels in the color of the moderate difficulty, in the left half and below the middle."""
-    image = cv2.imread(str(path))
+    image = np.asarray(cv2.imread(str(path)))
     assert image.shape[1] > 700 and image.shape[0] > 600
     lower_left = image[image.shape[0] // 2 :, : image.shape[1] // 2].astype(int)
     return np.nonzero(np.abs(lower_left - (178, 114, 0)).max(axis=-1) < 40)[1]
@@ -36,4 +36,4 @@ def test_a_curve_ends_at_the_highest_recall_reached(tmp_path: Path) -> None:
 
 def test_curves_without_samples_and_classes_without_curves(tmp_path: Path) -> None:
     write_curves(tmp_path / "empty.png", results([]), "a title that is far too long for the picture " * 9)
-    assert cv2.imread(str(tmp_path / "empty.png")) is not None
+    assert np.asarray(cv2.imread(str(tmp_path / "empty.png"))) is not None

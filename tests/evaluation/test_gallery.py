@@ -71,7 +71,9 @@ def test_misses_and_false_detections_have_their_colors(root: Path) -> None:
     index = (folder / "index.md").read_text()
     assert index.startswith("# made up: worst frames\n")
     assert "| [000001](001_000001.png) | 4 | 0 |\n| [000003](002_000003.png) | 1 | 2 |\n" in index
-    colors = [[pixels(cv2.imread(str(folder / name)), color) for color in (RED, MAGENTA, GREEN)] for name in names]
+    colors = [
+        [pixels(np.asarray(cv2.imread(str(folder / name))), color) for color in (RED, MAGENTA, GREEN)] for name in names
+    ]
     assert [[count > 100 for count in row] for row in colors] == [
         [True, False, False],
         [True, True, True],
@@ -81,11 +83,11 @@ def test_misses_and_false_detections_have_their_colors(root: Path) -> None:
 
 def test_the_image_stands_below_where_there_is_one(root: Path) -> None:
     worst = worst_frames(judge(root), 1)
-    alone = cv2.imread(str(draw(root, worst) / "001_000001.png"))
+    alone = np.asarray(cv2.imread(str(draw(root, worst) / "001_000001.png")))
     path = KittiSplit(root).image_path("000001")
     path.parent.mkdir()
     cv2.imwrite(str(path), np.full((375, 1242, 3), 90, np.uint8))
-    both = cv2.imread(str(draw(root, worst) / "001_000001.png"))
+    both = np.asarray(cv2.imread(str(draw(root, worst) / "001_000001.png")))
     height = round(375 * alone.shape[1] / 1242)
     assert both.shape[0] == alone.shape[0] + height
     below = both[-height:]
@@ -100,5 +102,5 @@ def test_objects_without_a_box_in_3d_are_not_drawn(root: Path) -> None:
     detection.write_text("Car -1 -1 -10 100.00 100.00 200.00 200.00 -1 -1 -1 -1000 -1000 -1000 -10 0.9\n")
     worst = worst_frames(judge(root), 1)
     assert (worst[0].missed.sum(), worst[0].false_positive.sum()) == (4, 1) and len(read_labels(label)) == 5
-    image = cv2.imread(str(draw(root, worst) / "001_000001.png"))
+    image = np.asarray(cv2.imread(str(draw(root, worst) / "001_000001.png")))
     assert pixels(image, MAGENTA) == 0 < pixels(image, RED)

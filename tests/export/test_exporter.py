@@ -17,20 +17,22 @@ from asca_export import graphs, reissue
 from asca_export.exporter import export_bundle
 from asca_export.fast_forms import FastBackbone
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
+from asca_pillars.config import CpaReading
 from asca_pillars.data.expected_input import ExpectedInput, measure_expected_input
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillars.pillar_spec import PillarSpec
-from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.export.tiny import SCANS, tiny_checkpoint, tiny_detector
 from tests.scenes import SPEC
 
 READINGS = ("none", "paper", "channel", "point")
 
 
 @pytest.mark.parametrize("cpa", READINGS)
-def test_bundle_is_the_same_detector(tmp_path: Path, cpa: str) -> None:
+def test_bundle_is_the_same_detector(tmp_path: Path, cpa: CpaReading) -> None:
     checkpoint = tiny_checkpoint(cpa)
     bundle = export_bundle(checkpoint, tmp_path / "bundle", SCANS, trained_on="nothing", command="none")
     assert load_bundle(tmp_path / "bundle") == bundle
@@ -44,7 +46,9 @@ def test_bundle_is_the_same_detector(tmp_path: Path, cpa: str) -> None:
 def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
     """Features of 1e5 differ by more than 1e-3 from rounding alone, and the network that follows divides it away."""
     checkpoint = tiny_checkpoint("none")
-    encode, first = checkpoint.detector.encode, checkpoint.detector.neck.blocks[0][0]
+    assert isinstance(checkpoint.detector, PillarDetector)
+    encode, first = checkpoint.detector.encode, checkpoint.detector.neck.get_submodule("blocks.0.0")
+    assert isinstance(first, torch.nn.Conv2d)
     with torch.no_grad():
         encode.norm.weight.mul_(1e5)
         encode.norm.bias.mul_(1e5)
@@ -86,9 +90,9 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
     checkpoint = tiny_checkpoint("channel")
     export_bundle(checkpoint, tmp_path / "bundle", SCANS)
     before = {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()}
-    other = tiny_checkpoint("channel").detector
+    other = tiny_detector("channel")
     with torch.no_grad():
-        other.head.boxes.bias.add_(0.01)
+        other.head.get_parameter("boxes.bias").add_(0.01)
     export_backbone = graphs.export_backbone
     wrong = FastBackbone(other)
     monkeypatch.setattr(graphs, "export_backbone", lambda _, grid, path: export_backbone(wrong, grid, path))
@@ -152,7 +156,7 @@ def test_boxes_that_differ_are_noticed() -> None:
 
 
 def test_ties_are_no_differences() -> None:
-    """Two overlapping anchors of equal score: which one survives is nobody's fault."""
+    """Two overlapping anchors of equal score: which one survives is arbitrary."""
     maps = _maps(0)
     maps.scores[:] = -20
     left, right = maps.scores.copy(), maps.scores.copy()
@@ -162,7 +166,7 @@ def test_ties_are_no_differences() -> None:
 
 
 @pytest.mark.parametrize("cpa", READINGS)
-def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: str) -> None:
+def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: CpaReading) -> None:
     root = os.environ.get("ASCA_KITTI_MINI")
     if not root:
         pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")

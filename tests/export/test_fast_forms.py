@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from asca_export import graphs
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone, Upsample
-from tests.export.tiny import tiny_checkpoint
+from tests.export.tiny import tiny_detector
 
 
 def padded(image: torch.Tensor) -> torch.Tensor:
@@ -19,7 +19,7 @@ def padded(image: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def test_neck_and_head() -> None:
-    detector = tiny_checkpoint("none").detector
+    detector = tiny_detector("none")
     image = torch.rand(1, 16, detector.grid.ny, detector.grid.nx) - 0.3
     expected = detector.head(detector.neck(image))
     for ours, theirs in zip(FastBackbone(detector)(padded(image)), expected, strict=True):
@@ -28,7 +28,7 @@ def test_neck_and_head() -> None:
 
 @torch.no_grad()
 def test_a_canvas_in_steps_of_its_own_with_padding_that_stands_for_zero() -> None:
-    detector = tiny_checkpoint("none").detector
+    detector = tiny_detector("none")
     steps = CanvasSteps(torch.rand(16) / 10 + 0.01, torch.randint(0, 256, (16,)).float())
     counted = torch.randint(0, 256, (1, 16, detector.grid.ny, detector.grid.nx)).float()
     image = steps.scale[:, None, None] * (counted - steps.empty[:, None, None])
@@ -54,15 +54,15 @@ def test_overlapping_outputs_are_no_depth_to_space() -> None:
 
 
 def test_the_detector_stays_as_it_was() -> None:
-    detector = tiny_checkpoint("none").detector
+    detector = tiny_detector("none")
     before = {name: value.clone() for name, value in detector.state_dict().items()}
     FastBackbone(detector, CanvasSteps(torch.full((16,), 0.1), torch.full((16,), 9.0)))
     assert all(torch.equal(before[name], value) for name, value in detector.state_dict().items())
-    assert detector.neck.blocks[0][0].padding == (1, 1)
+    assert detector.neck.get_submodule("blocks.0.0").padding == (1, 1)
 
 
 def test_multiply_accumulates_are_those_of_the_shapes(tmp_path: Path) -> None:
-    detector = tiny_checkpoint("none").detector
+    detector = tiny_detector("none")
     graphs.export_backbone(FastBackbone(detector), detector.grid, tmp_path / "backbone.onnx")
     cells = detector.grid.ny * detector.grid.nx
     blocks = [  # (cells of the output, inputs, outputs, convolutions): one strided and one plain convolution each

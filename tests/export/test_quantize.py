@@ -13,9 +13,9 @@ from asca_deploy.canvas_backbone import Canvas
 from asca_export import quantize
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone
 from asca_export.quantize import WEIGHT_STEPS, canvas_steps, input_moments, layer_names, round_weights, scale_to_steps
-from tests.export.tiny import tiny_checkpoint
+from tests.export.tiny import tiny_detector
 
-GRID = tiny_checkpoint("none").detector.grid
+GRID = tiny_detector("none").grid
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def canvases(features: list, steps: CanvasSteps) -> list[np.ndarray]:
 @pytest.fixture
 def backbone(steps: CanvasSteps, canvases: list) -> FastBackbone:
     """Scaled to steps."""
-    made = FastBackbone(tiny_checkpoint("none").detector, steps).eval()
+    made = FastBackbone(tiny_detector("none"), steps).eval()
     scale_to_steps(made, canvases, steps)
     return made
 
@@ -69,7 +69,7 @@ def test_canvas_steps_hold_every_feature_and_zero_exactly(seed: int) -> None:
 
 @torch.no_grad()
 def test_counting_steps_changes_no_result(backbone: FastBackbone, steps: CanvasSteps, canvases: list) -> None:
-    plain = FastBackbone(tiny_checkpoint("none").detector, steps).eval()
+    plain = FastBackbone(tiny_detector("none"), steps).eval()
     for canvas in canvases:
         image = torch.from_numpy(canvas) * STEP_VALUE
         for ours, theirs in zip(backbone(image), plain(image), strict=True):
@@ -101,11 +101,11 @@ def test_rounded_weights_lie_on_the_grid_and_empty_space_keeps_its_values(
     rounded = copy.deepcopy(backbone)
     round_weights(rounded, layer_names(backbone), moments)
     for name in layer_names(backbone):
-        weight = rounded.get_submodule(name).weight
+        weight = rounded.get_parameter(f"{name}.weight")
         by_output = weight.T if name == "head" else weight.flatten(1)
-        before = backbone.get_submodule(name).weight
-        before = before.T if name == "head" else before.flatten(1)
-        units = by_output / before.abs().amax(dim=1, keepdim=True) * WEIGHT_STEPS
+        before = backbone.get_parameter(f"{name}.weight")
+        before_by_output = before.T if name == "head" else before.flatten(1)
+        units = by_output / before_by_output.abs().amax(dim=1, keepdim=True) * WEIGHT_STEPS
         torch.testing.assert_close(units, units.round(), atol=1e-3, rtol=0)
         # Were an output's largest weight smaller, the writer of the graph would round its weights to another grid.
         torch.testing.assert_close(units.abs().amax(dim=1), torch.full((len(units),), float(WEIGHT_STEPS)))

@@ -5,9 +5,9 @@ from typing import Any
 
 import torch
 
-from asca_pillars.config import Config, NetworkConfig, PillarModel
+from asca_pillars.config import Config, CpaReading, NetworkConfig, PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from tests.scenes import SPEC, make_scene
 
@@ -15,11 +15,24 @@ NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_c
 SCANS = [make_scene(seed)[0] for seed in range(8)]
 
 
-def tiny_checkpoint(cpa: str, spec: PillarSpec = SPEC, **network: Any) -> Checkpoint:
+def tiny_checkpoint(cpa: CpaReading, spec: PillarSpec = SPEC, **network: Any) -> Checkpoint:
+    """Its weights are those of `tiny_detector`."""
+    model = _tiny_model(cpa, spec, **network)
+    return Checkpoint(Config(name="tiny", model=model), _with_random_weights(model), 0)
+
+
+def tiny_detector(cpa: CpaReading, spec: PillarSpec = SPEC, **network: Any) -> PillarDetector:
+    return _with_random_weights(_tiny_model(cpa, spec, **network))
+
+
+def _tiny_model(cpa: CpaReading, spec: PillarSpec, **network: Any) -> PillarModel:
+    return PillarModel(spec=spec, network=dataclasses.replace(NETWORK, cpa=cpa, **network))
+
+
+def _with_random_weights(model: PillarModel) -> PillarDetector:
     """Fresh random weights, with statistics and scores that differ from place to place."""
     torch.manual_seed(1)
-    config = Config(name="tiny", model=PillarModel(spec=spec, network=dataclasses.replace(NETWORK, cpa=cpa, **network)))
-    detector = build_pillar_detector(config.model)
+    detector = build_pillar_detector(model)
     with torch.no_grad():
         for name, buffer in detector.named_buffers():
             if name.endswith("running_mean"):
@@ -28,4 +41,4 @@ def tiny_checkpoint(cpa: str, spec: PillarSpec = SPEC, **network: Any) -> Checkp
                 buffer.uniform_(0.2, 1.0)
         for head in (detector.head.scores, detector.head.boxes, detector.head.directions):
             head.weight.normal_(0, 0.3)
-    return Checkpoint(config, detector.eval(), 0)
+    return detector.eval()

@@ -168,9 +168,14 @@ def test_kitti_classes() -> None:
 )
 def test_impossible_classes_are_refused(settings: dict[str, object], named: str) -> None:
     possible: dict[str, object] = {
-        "name": "Van", "length_m": 5.0, "width_m": 1.9, "height_m": 2.2, "z_m": -0.8,
-        "positive_iou": 0.6, "negative_iou": 0.45,
-    }  # fmt: skip
+        "name": "Van",
+        "length_m": 5.0,
+        "width_m": 1.9,
+        "height_m": 2.2,
+        "z_m": -0.8,
+        "positive_iou": 0.6,
+        "negative_iou": 0.45,
+    }
     ClassSpec(**possible)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=named):
         ClassSpec(**(possible | settings))  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 import copy
 import json
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,8 +35,8 @@ def test_names_and_distances() -> None:
         (np.zeros(3, bool), []),
     ],
 )
-def test_parts(index: object, names: list[str]) -> None:
-    part = THREE[index]  # type: ignore[index]
+def test_parts(index: Any, names: list[str]) -> None:
+    part = THREE[index]
     assert part.names == names
     assert part.boxes.shape == (len(names), 7)
     assert part.class_names == THREE.class_names
@@ -66,9 +67,16 @@ def test_iteration_gives_each_detection() -> None:
 def test_plain_values() -> None:
     first = THREE.to_dicts()[0]
     assert first == {
-        "class": "Car", "score": 0.9, "x_m": 3.0, "y_m": -4.0, "z_m": 0.0,
-        "length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "yaw_rad": 0.0,
-    }  # fmt: skip
+        "class": "Car",
+        "score": 0.9,
+        "x_m": 3.0,
+        "y_m": -4.0,
+        "z_m": 0.0,
+        "length_m": 4.0,
+        "width_m": 2.0,
+        "height_m": 1.5,
+        "yaw_rad": 0.0,
+    }
     assert json.loads(THREE.to_json()) == THREE.to_dicts()
 
 

@@ -1,7 +1,6 @@
 """The compiled forms against the NumPy forms, bit for bit, and the results that no form may change."""
 
 import dataclasses
-import sys
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -12,12 +11,14 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from asca_pillars.geometry import compiling as kernels
 from asca_pillars.geometry import overlap
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.geometry.overlap import rotated_nms
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillarize import KERNELS as PILLAR_KERNELS
 from asca_pillars.pillars.pillarize import PillarLimits, Pillars, pillarize
 
 # Rectangular, off center, with a positive minimum, and columns of one to three depths.
@@ -34,8 +35,8 @@ DRAWN = 57, 4111435180, 2859312739, 1432910283
 def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
     """The function's result where numba is not installed."""
     with (
-        patch("asca_pillars.pillars.pillarize.load_kernels", lambda: None),
-        patch("asca_pillars.geometry.overlap.load_kernels", lambda: None),
+        patch("asca_pillars.pillars.pillarize.load_kernels", lambda _: None),
+        patch("asca_pillars.geometry.overlap.load_kernels", lambda _: None),
     ):
         return function(*arguments)
 
@@ -81,10 +82,10 @@ def test_pillars_are_the_same(
     seed: int, count: int, spread_m: float, odd: float, grid: PillarGrid, limits: PillarLimits, training: bool
 ) -> None:
     points = cloud(seed, count, spread_m, grid, odd)
-    drawn = [np.random.default_rng(seed) if training else None for _ in range(2)]
-    assert_same_bits(pillarize(points, grid, limits, drawn[0]), by_numpy(pillarize, points, grid, limits, drawn[1]))
-    if training:  # both leave the generator where the next scan finds it
-        assert drawn[0].random() == drawn[1].random()
+    first, second = np.random.default_rng(seed), np.random.default_rng(seed)
+    compiled = pillarize(points, grid, limits, first if training else None)
+    assert_same_bits(compiled, by_numpy(pillarize, points, grid, limits, second if training else None))
+    assert first.random() == second.random()  # both leave the generator where the next scan finds it
 
 
 @pytest.mark.parametrize("grid", [*GRIDS, PillarGrid()], ids=lambda grid: f"{grid.nx}x{grid.ny}")
@@ -115,7 +116,8 @@ def test_memory_that_numba_does_not_know_is_copied() -> None:
     expected = pillarize(points, GRIDS[2], LIMITS[1])
     frozen = np.frombuffer(points.tobytes(), np.float32).reshape(-1, 4)  # read-only
     skewed = np.frombuffer(b"?" + points.tobytes(), np.float32, offset=1).reshape(-1, 4)  # not aligned
-    for other in (frozen, skewed, np.asfortranarray(points), points.astype(">f4"), points.astype(np.float64)):
+    others: list[NDArray[Any]] = [frozen, skewed, np.asfortranarray(points), points.astype(">f4"), points.astype(float)]
+    for other in others:
         assert_same_bits(pillarize(other, GRIDS[2], LIMITS[1]), expected)
 
 
@@ -130,7 +132,7 @@ def test_the_draw_is_what_it_always_was(form: Callable[..., Pillars]) -> None:
     kept = np.round(pillars.features[:, 3] * 3000).astype(np.int32)
     trained = form(points, GRIDS[2], PillarLimits(20, 3), np.random.default_rng(5))
     kept_in_training = np.round(trained.features[:, 3] * 3000).astype(np.int32)
-    assert (len(kept), *map(zlib.crc32, (kept, pillars.cells, kept_in_training))) == DRAWN
+    assert (len(kept), *(zlib.crc32(part.tobytes()) for part in (kept, pillars.cells, kept_in_training))) == DRAWN
 
 
 def boxes_around(seed: int, count: int, spread_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -190,10 +192,14 @@ def test_compiled_without_a_cache_where_none_can_be_written(monkeypatch: pytest.
     assert double(21) == 42
 
 
+@pytest.mark.parametrize("name", [overlap.KERNELS, PILLAR_KERNELS])
+def test_the_compiled_forms_exist(name: str) -> None:
+    assert load_kernels(name) is not None, "or every comparison above compares NumPy with itself"
+
+
 def test_nothing_is_compiled_at_use() -> None:
-    compiled = load_kernels()
-    assert compiled is not None
-    module = sys.modules[compiled.suppress.__module__]
+    module = load_kernels(overlap.KERNELS)
+    assert module is not None
     with pytest.raises(TypeError, match="No matching definition"):
         module._suppress(
             np.zeros((1, 7), np.float32), 0.5, 1, np.empty((1, 3)), np.empty((1, 5)), np.empty(1, np.int64)

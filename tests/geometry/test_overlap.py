@@ -20,10 +20,10 @@ from asca_pillars.geometry.overlap import (
 )
 
 # Places up to 70 m away, sizes from a thin plate to a lorry.
-CENTRES = st.tuples(st.floats(-70, 70), st.floats(-70, 70), st.floats(-2, 1))
+CENTERS = st.tuples(st.floats(-70, 70), st.floats(-70, 70), st.floats(-2, 1))
 SIZES = st.tuples(*[st.sampled_from([1e-3, 0.6, 1.6, 4.0, 20.0]) | st.floats(0.01, 20)] * 3)
 YAWS = st.floats(-7, 7) | st.sampled_from([k * math.pi / 4 for k in range(-4, 5)] + [1e-320, 1e-9])
-BOXES = st.builds(lambda c, s, yaw: np.array([*c, *s, yaw]), CENTRES, SIZES, YAWS)
+BOXES = st.builds(lambda c, s, yaw: np.array([*c, *s, yaw]), CENTERS, SIZES, YAWS)
 
 
 def moved(box: np.ndarray, dx: float = 0, dy: float = 0, dz: float = 0, turn: float = 0) -> np.ndarray:
@@ -139,14 +139,14 @@ def random_boxes(seed: int, count: int, spread_m: float) -> np.ndarray:
 
 def test_rows_are_a_and_columns_are_b() -> None:
     a, b = random_boxes(0, 7, 8.0), random_boxes(1, 5, 8.0)
-    for measure, twin in (
+    for measure, reference in (
         (bev_intersection, intersection_twin),
         (bev_iou, bev_iou_twin),
         (iou_3d, iou_3d_twin),
     ):
         result = measure(a, b)
         assert result.shape == (7, 5) and result.dtype == np.float64
-        expected = [[twin(x, y) for y in b.astype(np.float64)] for x in a.astype(np.float64)]
+        expected = [[reference(x, y) for y in b.astype(np.float64)] for x in a.astype(np.float64)]
         np.testing.assert_allclose(result, expected, atol=1e-6)
         assert (result > 0).any() and (result == 0).any()
 

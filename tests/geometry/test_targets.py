@@ -206,7 +206,7 @@ def test_no_boxes() -> None:
 
 
 def test_thresholds_come_from_the_class() -> None:
-    """The neighbours of the hand-made case, at IoU 0.667 and 0.429, under other thresholds."""
+    """The neighbors of the hand-made case, at IoU 0.667 and 0.429, under other thresholds."""
     strict = dataclasses.replace(KITTI_CLASSES[PEDESTRIAN], positive_iou=0.7, negative_iou=0.5)
     classes = (KITTI_CLASSES[0], strict, KITTI_CLASSES[2])
     boxes = np.array([[8.48, 1.12, -0.9, 0.8, 0.6, 1.73, 0.0]], np.float32)

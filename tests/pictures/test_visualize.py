@@ -166,7 +166,7 @@ def test_no_boxes_give_a_copy():
 def test_png_round_trip(tmp_path):
     image = draw_bev(CORNERS, detections([10, 0, -1, 4, 2, 2, 0]), AHEAD, width_px=200)
     write_png(tmp_path / "new" / "a.png", image)
-    assert np.array_equal(cv2.imread(str(tmp_path / "new" / "a.png")), image)
+    assert np.array_equal(np.asarray(cv2.imread(str(tmp_path / "new" / "a.png"))), image)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.png"]
 
 

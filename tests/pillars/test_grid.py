@@ -97,7 +97,7 @@ def test_a_pillars_center_lies_in_the_pillar(grid: PillarGrid) -> None:
     np.testing.assert_array_equal(grid.cells(np.hstack([centers, z])), cells)
 
 
-def cells_twin(grid: PillarGrid, points: np.ndarray) -> list[int]:
+def cells_by_search(grid: PillarGrid, points: np.ndarray) -> list[int]:
     """`cells`, one point at a time, by searching the borders."""
     x_edges, y_edges = grid.x_edges_m.astype(np.float32), grid.y_edges_m.astype(np.float32)
     low, high = np.float32(grid.z_range_m[0]), np.float32(grid.z_range_m[1])
@@ -124,7 +124,7 @@ def test_cells_equal_a_search_of_the_borders(grid: PillarGrid, seed: int) -> Non
     points[rng.integers(0, 150, 6), rng.integers(0, 3, 6)] = rng.choice([np.nan, np.inf, -np.inf], 6)
     cells = grid.cells(points)
     assert cells.dtype == np.int64
-    assert cells.tolist() == cells_twin(grid, points)
+    assert cells.tolist() == cells_by_search(grid, points)
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -230,8 +230,8 @@ def test_advice_on_y_works(start_m: float, length_m: float, v_y_m: float) -> Non
 
 
 def test_a_grid_is_a_value() -> None:
-    twin = dataclasses.replace(SMALL)
-    assert twin == SMALL and hash(twin) == hash(SMALL)
+    same = dataclasses.replace(SMALL)
+    assert same == SMALL and hash(same) == hash(SMALL)
     np.testing.assert_array_equal(copy.deepcopy(SMALL).x_edges_m, SMALL.x_edges_m)
     with pytest.raises(dataclasses.FrozenInstanceError):
         SMALL.zones = 2  # type: ignore[misc]

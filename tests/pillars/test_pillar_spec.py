@@ -69,7 +69,7 @@ def test_classes_must_exist_and_differ() -> None:
         {"grid": {"x_range": [0, 69.12]}},
         {"limits": {"max_pilars": 10}},
         {"post": {"nms": 0.1}},
-        {"classes": [{**vars(KITTI_CLASSES[0]), "colour": "red"}]},
+        {"classes": [{**vars(KITTI_CLASSES[0]), "color": "red"}]},
     ],
 )
 def test_typos_are_refused_at_every_level(typo: dict[str, object]) -> None:

@@ -22,7 +22,7 @@ def cloud(seed: int, count: int, spread_m: float = 12.0) -> np.ndarray:
     return np.column_stack([xyz, rng.random(count)]).astype(np.float32)
 
 
-def pillars_twin(points: np.ndarray, grid: PillarGrid) -> dict[int, list[int]]:
+def pillars_by_loop(points: np.ndarray, grid: PillarGrid) -> dict[int, list[int]]:
     """Indices of the points of each pillar, by cell, without limits."""
     pillars: dict[int, list[int]] = {}
     for index, cell in enumerate(grid.cells(points)):
@@ -53,12 +53,12 @@ def assert_consistent(pillars: Pillars, points: np.ndarray, grid: PillarGrid) ->
 def test_equals_a_dictionary_of_lists(seed: int, count: int, spread_m: float) -> None:
     points = cloud(seed, count, spread_m)
     pillars = pillarize(points, GRID, NO_LIMITS)
-    twin = pillars_twin(points, GRID)
-    assert pillars.cells.tolist() == list(twin)
-    assert pillars.point_counts.tolist() == [len(indices) for indices in twin.values()]
-    order = [index for indices in twin.values() for index in indices]  # the scan's order within a pillar
+    expected = pillars_by_loop(points, GRID)
+    assert pillars.cells.tolist() == list(expected)
+    assert pillars.point_counts.tolist() == [len(indices) for indices in expected.values()]
+    order = [index for indices in expected.values() for index in indices]  # the scan's order within a pillar
     np.testing.assert_array_equal(pillars.features[:, :4], points[order].reshape(-1, 4))
-    assert pillars.stats == PillarCounts(count, count - len(order), 0, len(twin), 0)
+    assert pillars.stats == PillarCounts(count, count - len(order), 0, len(expected), 0)
     assert_consistent(pillars, points, GRID)
 
 
@@ -81,7 +81,7 @@ def test_large_grids_sort_beyond_16_bits() -> None:
     assert grid.nx * grid.ny > 1 << 16
     points = cloud(1, 5000, 30.0)
     pillars = pillarize(points, grid, NO_LIMITS)
-    assert pillars.cells.tolist() == list(pillars_twin(points, grid))
+    assert pillars.cells.tolist() == list(pillars_by_loop(points, grid))
     assert pillars.cells.max() > 1 << 16
 
 
@@ -93,14 +93,14 @@ def test_limits_keep_a_subset(seed: int, max_pillars: int, max_points: int, trai
     pillars = pillarize(points, GRID, limits, np.random.default_rng(seed) if training else None)
     assert_consistent(pillars, points, GRID)
 
-    twin = pillars_twin(points, GRID)
-    assert pillars.stats.pillars == min(len(twin), max_pillars)
-    assert pillars.stats.pillars_over_limit == len(twin) - pillars.stats.pillars
+    expected = pillars_by_loop(points, GRID)
+    assert pillars.stats.pillars == min(len(expected), max_pillars)
+    assert pillars.stats.pillars_over_limit == len(expected) - pillars.stats.pillars
     kept = np.round(pillars.features[:, 3] * 400).astype(int)
     for pillar, cell in enumerate(pillars.cells.tolist()):
         indices = kept[pillars.pillar_index == pillar].tolist()
-        assert len(indices) == min(len(twin[cell]), max_points)
-        assert set(indices) <= set(twin[cell])
+        assert len(indices) == min(len(expected[cell]), max_points)
+        assert set(indices) <= set(expected[cell])
         assert indices == sorted(indices)
 
 

@@ -187,9 +187,17 @@ def test_nothing_stands_in_anything_else() -> None:
 
 def test_the_shares_of_the_configuration_are_kept() -> None:
     people_only = SceneConfig(
-        cars=0, beyond=0, vans=0, trucks=0, trams=0, misc=0, cyclists=0, sitting=0, empty_share=0,
+        cars=0,
+        beyond=0,
+        vans=0,
+        trucks=0,
+        trams=0,
+        misc=0,
+        cyclists=0,
+        sitting=0,
+        empty_share=0,
         pedestrian_uniform_heading=1,
-    )  # fmt: skip
+    )
     yaws, count = [], 0
     for index in range(60):
         scene = draw_scene(people_only, np.random.default_rng(index))

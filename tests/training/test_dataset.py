@@ -16,7 +16,7 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.models.pillar.pillar_preparation import PillarPreparation, PreparedPillars
+from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, PreparedPillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
@@ -58,7 +58,7 @@ def test_types_that_are_classes_neighbors_and_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("classes", "expected"),
     [
-        (("Pedestrian",), [0, IGNORED]),  # without cars, a van is nobody's neighbor
+        (("Pedestrian",), [0, IGNORED]),  # without cars, a van is no class's neighbor
         (("Cyclist", "Car"), [1, IGNORED]),
         (("Car", "Van"), [0, 1]),  # a class of its own is no neighbor
     ],
@@ -199,6 +199,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
     all_samples = samples(tmp_path)
     chosen = [all_samples[i] for i in order]
     batch = collated(chosen)
+    assert isinstance(batch.inputs, LabeledPillars)
     pillar_batch, target_batch = batch.inputs
     assert batch.frame_ids == [sample.frame.frame_id for sample in chosen]
     assert all(boxes is sample.frame.boxes for boxes, sample in zip(batch.boxes, chosen, strict=True))
@@ -233,6 +234,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
 
 def test_a_batch_moves_as_a_whole(tmp_path: Path) -> None:
     batch = collated(samples(tmp_path))
+    assert isinstance(batch.inputs, LabeledPillars)
     frame_pillars = list(batch.inputs.pillars.frame_pillars)
     assert batch.to("meta") is batch
     *tensors, found, _ = batch.inputs.pillars

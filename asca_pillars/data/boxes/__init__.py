@@ -1,0 +1,1 @@
+"""Labelled boxes in the LiDAR frame, without a camera."""

@@ -1,0 +1,1 @@
+"""Published datasets as one layout whose scans stay where they are."""

@@ -1,5 +1,7 @@
-"""What an import reads of any source, and the dataset that it writes of it (`data.boxes.box_split`): nothing is copied
-that can be referred to."""
+"""What an import reads of any source, and the dataset that it writes of it (`data.boxes.box_split`).
+
+Nothing is copied that can be referred to.
+"""
 
 import math
 from collections import Counter

@@ -13,7 +13,9 @@ _TILE_M = 5.0
 
 
 def cluster_boxes(obstacles: NDArray[np.float64], ground: Ground) -> NDArray[np.float32]:
-    """Steps 3 and 4: DBSCAN of obstacle points (N, 3), and the minimum-area rectangle of each cluster as a box.
+    """Steps 3 and 4: DBSCAN of obstacle points (N, 3), and the minimum-area rectangle of each cluster as a box (K, 7).
+
+    Points and boxes are in metres and radians, LiDAR frame.
 
     Clustered are the cells in which points lie, weighted by their number: some thousand instead of ten thousands. A
     cluster larger than any vehicle is a row of houses, hedges and parked cars; its rectangle would take the street
@@ -29,7 +31,7 @@ def cluster_boxes(obstacles: NDArray[np.float64], ground: Ground) -> NDArray[np.
     middles = (index + 0.5) * _CELL_M
     labels = DBSCAN(eps=CLUSTER_EPS_M, min_samples=CLUSTER_MIN_POINTS).fit(middles, sample_weight=count).labels_
     labels = labels[inverse.ravel()]
-    clustered = labels >= 0  # lone points stay out here; their cells are blocked all the same
+    clustered = labels >= 0  # lone points stay out here; their cells are blocked too
     obstacles, labels = obstacles[clustered], labels[clustered]
     order = np.argsort(labels, kind="stable")
     obstacles, labels = obstacles[order], labels[order]

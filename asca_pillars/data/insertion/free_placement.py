@@ -29,7 +29,7 @@ class Scene:
 
     Attributes:
         frame: as it was.
-        obstacles: (K, 7) boxes that another one must not touch.
+        obstacles: (K, 7) boxes that another one must not touch, metres and radians, LiDAR frame.
         inserted: objects so far, with all their points.
     """
 
@@ -94,14 +94,14 @@ class Scene:
 
 
 class Rays:
-    """The straight ways from the sensor to points (N, >=3), looked at again and again while places are tried."""
+    """The straight ways from the sensor to points (N, >=3), LiDAR frame, for many tests while places are tried."""
 
     def __init__(self, points: _Floats) -> None:
         self._ends = np.ascontiguousarray(points[:, :3].T, dtype=np.float64)
         self._reach = np.hypot(self._ends[0], self._ends[1]) * (1 + 1e-5) + 1e-3
 
     def entering(self, boxes: _Floats) -> NDArray[np.bool_]:
-        """Which of them touch one of boxes (M, 7), their ends included: (N,)."""
+        """Mask (N,) of those that touch one of boxes (M, 7), LiDAR frame, their ends included."""
         px, py, _ = self._ends
         hits = np.zeros(len(px), bool)
         for x, y, z, length, width, height, yaw in boxes.tolist():
@@ -123,12 +123,15 @@ class Rays:
 
 
 def rays_entering(points: _Floats, boxes: _Floats) -> NDArray[np.bool_]:
-    """Which straight ways from the sensor to points (N, >=3) touch one of boxes (M, 7), their ends included: (N,)."""
+    """Mask (N,) of the straight lines from the sensor to points (N, >=3) that touch one of boxes (M, 7), ends included.
+
+    All in the LiDAR frame.
+    """
     return Rays(points).entering(boxes)
 
 
 def is_clear(box: _Floats, obstacles: _Floats, ranges: Ranges) -> bool:
-    """Whether a box (7,) stands within the ranges and touches none of the others (K, 7)."""
+    """Whether a box (7,) stands within the ranges and touches none of the others (K, 7), all in the LiDAR frame."""
     reach = (np.hypot(obstacles[:, 3], obstacles[:, 4]) + math.hypot(box[3], box[4])) / 2
     near = obstacles[np.hypot(obstacles[:, 0] - box[0], obstacles[:, 1] - box[1]) <= reach]
     if not ranges.hold_centers(box[None])[0]:

@@ -1,6 +1,6 @@
 """Where an object may be put into a scan: seen ground minus what stands on it (section 3.5, steps 2 to 4).
 
-Ground that is seen: along one azimuth the beams of a spinning LiDAR land ring after ring. Between two neighbouring
+Ground that is seen: along one azimuth the beams of a spinning LiDAR land ring after ring. Between two neighboring
 landings the beam to the farther one passed low over the ground, so nothing tall stands there, although a gap of metres
 separates the returns. A gap longer than that argument carries, an obstacle in it, a step or a slope ends the free
 ground. Ground behind an obstacle is not seen and therefore not free, nor is anything beside the camera's view.
@@ -45,7 +45,7 @@ class FreeSpace:
 
     @cached_property
     def cells(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Middles (2, F) of the free cells, x and y, and their distances (F,) from the sensor."""
+        """Centers (2, F) of the free cells, x and y, and their distances (F,) from the sensor, metres, LiDAR frame."""
         if self.ground is None:
             return np.zeros((2, 0)), np.zeros(0)
         xy = self.ground.origin_m[:, None] + (np.array(np.nonzero(self.free)) + 0.5) * CELL_M
@@ -63,7 +63,7 @@ class FreeSpace:
 
 
 def find_free_space(points: _Floats) -> FreeSpace:
-    """Steps 2 to 4 on the points (N, >=3) of one scan."""
+    """Steps 2 to 4 on the points (N, >=3) of one scan, metres, LiDAR frame."""
     nothing = FreeSpace(None, np.zeros((0, 0), bool), np.zeros((0, 7), np.float32))
     ground = fit_ground(points)
     if ground is None:

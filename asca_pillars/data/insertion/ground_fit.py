@@ -80,7 +80,7 @@ def fit_plane(points: _Floats) -> NDArray[np.float64] | None:
 
 
 def fit_ground(points: _Floats) -> Ground | None:
-    """The surface under points (N, >=3), or None where no ground is to be seen."""
+    """The surface under points (N, >=3), metres, LiDAR frame, or None where no ground is to be seen."""
     points = points[(np.abs(points[:, :2]) < REACH_M).all(axis=1)]
     plane = fit_plane(points)
     if plane is None:

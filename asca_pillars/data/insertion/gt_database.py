@@ -66,17 +66,17 @@ class ObjectDatabase:
 
     @property
     def labels(self) -> NDArray[np.int64]:
-        """(M,) class of each object."""
+        """(M,) class index of each object."""
         return self._arrays["labels"]
 
     @property
     def frames(self) -> NDArray[np.int64]:
-        """(M,) number of the frame in the list that each object comes from."""
+        """(M,) index, in the list, of the frame that each object comes from."""
         return self._arrays["frames"]
 
     @property
     def point_counts(self) -> NDArray[np.int64]:
-        """(M,) points of each object."""
+        """(M,) counts of the points of each object."""
         return np.diff(self._arrays["first"])
 
     @cached_property

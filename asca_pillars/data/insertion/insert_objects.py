@@ -61,7 +61,7 @@ class Inserter:
 
     @cached_property
     def candidates(self) -> tuple[NDArray[np.int64], ...]:
-        """Objects of each class that may be inserted, as numbers in the database."""
+        """Objects of each class that may be inserted: indices (K,) into the database, one array per class."""
         enough = self.database.point_counts >= self.settings.min_points
         return tuple(np.flatnonzero(enough & (self.database.labels == label)) for label in range(len(self.shares)))
 

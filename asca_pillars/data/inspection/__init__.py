@@ -1,0 +1,1 @@
+"""What a dataset contains and how it suits a configuration."""

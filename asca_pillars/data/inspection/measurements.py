@@ -27,7 +27,7 @@ class MatchOutcome(IntEnum):
     OVERLAPPED = 1
     """An anchor overlaps it by positive_iou."""
     FORCED = 2
-    """None does; the nearest ones are to find it all the same, and fit it badly."""
+    """None does; the nearest ones are matched to it nevertheless, and fit it badly."""
     MISSED = 3
     """No anchor is to find it."""
 
@@ -93,7 +93,7 @@ def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: Da
 
 
 def match(frame: LabeledFrame, spec: PillarSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The `MatchOutcome` of each box (M,), and the number of positive anchors of each class (C,)."""
+    """The `MatchOutcome` of each box (M,), and counts (C,) of the positive anchors of each class."""
     # Rows in the place of the labels tell which boxes the grid holds.
     kept = within_ranges(replace(frame, labels=np.arange(len(frame.boxes))), spec.ranges).labels
     boxes, labels = frame.boxes[kept], frame.labels[kept]
@@ -110,7 +110,7 @@ def match(frame: LabeledFrame, spec: PillarSpec) -> tuple[NDArray[np.int64], NDA
 
 
 def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: PillarSpec) -> ScanMeasure:
-    """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4)."""
+    """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4), in the LiDAR frame."""
     finite = stored[np.isfinite(stored).all(axis=1)]
     ground = ground_z_m(finite)
     cells = spec.grid.cells(seen)

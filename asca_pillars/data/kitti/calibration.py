@@ -51,7 +51,7 @@ class Calibration:
 
     @cached_property
     def lidar_from_rect_matrix(self) -> NDArray[np.float64]:
-        """(4, 4): the exact inverse; the printed rotations are orthonormal to seven digits only."""
+        """(4, 4), LiDAR from rectified camera: exactly inverse; printed rotations are orthonormal to 7 digits only."""
         return np.linalg.inv(self.rect_from_lidar_matrix).astype(np.float64)
 
     def rect_from_lidar(self, points_xyz: NDArray[np.floating]) -> NDArray[np.float64]:

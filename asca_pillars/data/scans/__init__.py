@@ -1,0 +1,1 @@
+"""Scan files of every format, read as points (N, 4)."""

@@ -44,7 +44,7 @@ def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
     below the name of the folder that was given (a/1.bin and b/1.bin), or keep their suffix (1.bin and 1.npy).
 
     Raises:
-        ScanError: a path without scans, or two scans whose results would have the same name all the same.
+        ScanError: a path without scans, or two scans whose results would have the same name even then.
     """
     found: dict[Path, tuple[Path, Path]] = {}  # resolved path -> (scan, the folder that was given)
     for given in map(Path, paths):

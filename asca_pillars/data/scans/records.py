@@ -26,6 +26,7 @@ class Field:
 
     @property
     def size_bytes(self) -> int:
+        """Of the whole field in one point."""
         return self.dtype.itemsize * self.count
 
 

@@ -14,7 +14,7 @@ ReflectanceScale = Literal["auto"] | float
 
 # A few values above a scale are specks or retroreflectors; of a scale that is too small there are always more.
 _SHARE_ABOVE = 0.001
-_SLACK = 2.0  # nobody stores 0..255 of which hardly anything reaches 2; values just above 1 are common
+_SLACK = 2.0  # a scan stored in 0..255 has many values above 2; values just above 1 are common
 
 
 class Scaled(NamedTuple):
@@ -86,7 +86,7 @@ def decide_scale(
 
 
 def ambiguity(values: NDArray[np.generic], scale: float) -> str | None:
-    """A sentence if reflectances taken as 0..255 may as well be 0..100."""
+    """A sentence if reflectances (N,) taken as 0..255 may as well be 0..100."""
     if scale != 255 or _many_above(values, 100):
         return None
     return (
@@ -96,7 +96,10 @@ def ambiguity(values: NDArray[np.generic], scale: float) -> str | None:
 
 
 def common_scale(samples: Sequence[tuple[NDArray[np.generic], np.dtype[np.generic] | None]]) -> float:
-    """One scale for the scans of a folder: the largest that any of a sample of them, (values, dtype), is stored in."""
+    """One scale for the scans of a folder: the largest that any of a sample of them is stored in.
+
+    Each sample is a scan's reflectances (N,), and the type that its file declares for them.
+    """
     return max((decide_scale(values, dtype)[0] for values, dtype in samples), default=1.0)
 
 

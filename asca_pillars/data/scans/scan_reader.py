@@ -127,7 +127,7 @@ def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
     """Write points (N, 4), N > 0, as KITTI's `.bin`: little-endian float32 x, y, z, reflectance.
 
     Raises:
-        ScanError: there are no points (`.bin` has no header: nobody could tell the file from a lost one), or
+        ScanError: there are no points (`.bin` has no header, so that an empty file cannot be told from a lost one), or
             the suffix is another.
     """
     if points.ndim != 2 or points.shape[1] != 4:

@@ -1,0 +1,1 @@
+"""KITTI's official protocol: average precision and orientation similarity."""

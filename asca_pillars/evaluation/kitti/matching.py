@@ -105,11 +105,11 @@ def assign(pairs: Pairs, best: _Indices, candidates: _Mask) -> _Mask:
 
     Args:
         pairs: P pairs.
-        best: (P,) order of the pairs: by ground truth, and for each of them the preferred detections first.
-        candidates: (P, T) which pairs may be matched, in each of T separate assignments.
+        best: (P,) indices of the pairs in order: by ground truth, for each of them the preferred detections first.
+        candidates: (P, T) mask of the pairs that may be matched, in each of T separate assignments.
 
     Returns:
-        (P, T) which pairs are matched.
+        (P, T) mask of the pairs that are matched.
     """
     found = np.zeros_like(candidates)
     _, detection = np.unique(pairs.detection, return_inverse=True)

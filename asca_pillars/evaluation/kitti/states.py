@@ -45,13 +45,13 @@ LIMITS: Mapping[str, Limits] = {
 
 
 def is_type(objects: FrameObjects, name: str) -> NDArray[np.bool_]:
-    """(N,) which objects are of the named type, compared without case."""
+    """(N,) mask of the objects of the named type, compared without case."""
     mask: NDArray[np.bool_] = objects.folded_types == name.casefold()
     return mask
 
 
 def is_neighbor(objects: FrameObjects, class_name: str) -> NDArray[np.bool_]:
-    """(N,) which objects are ignored beside the class: Van for Car, Person_sitting for Pedestrian."""
+    """(N,) mask of the objects that are ignored beside the class: Van for Car, Person_sitting for Pedestrian."""
     neighbor = NEIGHBORS.get(class_name.casefold())
     return np.zeros(len(objects), dtype=bool) if neighbor is None else is_type(objects, neighbor)
 

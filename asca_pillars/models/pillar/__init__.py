@@ -1,0 +1,1 @@
+"""The network of the pillar family and its loss, in PyTorch."""

@@ -35,7 +35,7 @@ class PaperAttention(nn.Module):
         self.restore = nn.Parameter(torch.empty(channels, max_pillars).uniform_(-bound, bound))
 
     def forward(self, features: Tensor) -> Tensor:
-        """(P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
+        """Unitless features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
         pillars = features.shape[0]
         by_channel = features.T  # F of the paper, (C, P)
         query = by_channel @ self.query[:pillars] + self.bias["query"]  # (C, d)
@@ -66,7 +66,7 @@ class ChannelAttention(nn.Module):
         self.temperature = nn.Parameter(torch.ones(1))
 
     def forward(self, features: Tensor) -> Tensor:
-        """(P, C) -> (P, C) for the pillars of one frame."""
+        """Unitless features (P, C) -> (P, C) for the pillars of one frame."""
         device = features.device.type
         if torch.is_autocast_enabled(device):  # differences of large sums: bfloat16 would leave little of them
             with torch.autocast(device, enabled=False):
@@ -102,8 +102,8 @@ class PointAttention(nn.Module):
         """(M, C) point features -> (M, C); points attend to the points of their own pillar only.
 
         Args:
-            features: (M, C), rows of one pillar adjacent.
-            pillar_index: (M,) pillar of each row, ascending.
+            features: (M, C), unitless, rows of one pillar adjacent.
+            pillar_index: (M,) index of each row's pillar, ascending.
             point_counts: (P,) rows of each pillar.
         """
         pillars, channels = point_counts.shape[0], features.shape[1]

@@ -23,7 +23,7 @@ def _(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
 
 
 def pillar_max(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-    """Largest value of each channel among the points of each pillar: (M, C) -> (P, C).
+    """Largest value of each channel among the points of each pillar: unitless features (M, C) -> (P, C).
 
     Points lie flat, without padding, so nothing but real points can win. While a graph is exported the reduction is
     one named operator, because the exporter knows no segment reduction (asca_export.graphs translates it).
@@ -61,11 +61,11 @@ class PillarEncoder(nn.Module):
         point_counts: Tensor,
         frame_pillars: Sequence[int] | None = None,
     ) -> Tensor:
-        """Point features (M, 9) -> pillar features (P, C).
+        """Point features (M, 9) -> pillar features (P, C), which are unitless.
 
         Args:
-            features: (M, 9) decorated points, see `geometry.pillarize.FEATURES`.
-            pillar_index: (M,) pillar of each point, ascending.
+            features: (M, 9) decorated points, see `pillars.pillarize.FEATURES`.
+            pillar_index: (M,) index of each point's pillar, ascending.
             point_counts: (P,) points of each pillar.
             frame_pillars: pillars of each frame of a batch, summing to P; None is one frame.
         """

@@ -35,7 +35,7 @@ class LossTerms(NamedTuple):
 
     @property
     def total(self) -> Tensor:
-        """Eq. (15)."""
+        """Eq. (15), the scalar that training minimizes."""
         return self.box + self.classification + self.direction
 
 
@@ -86,7 +86,10 @@ def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
 
 
 def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Tensor:
-    """Eq. (14), summed: binary focal loss (arXiv 1708.02002) where `state` is 1 or 0, nothing where it is -1."""
+    """Eq. (14), summed: binary focal loss (arXiv 1708.02002) where `state` is 1 or 0, nothing where it is -1.
+
+    Both are (B, H, W, A); the loss is a scalar.
+    """
     target = (state == 1).to(logits.dtype)
     cross_entropy = F.binary_cross_entropy_with_logits(logits, target, reduction="none")
     miss = torch.where(state == 1, torch.sigmoid(-logits), torch.sigmoid(logits))
@@ -95,7 +98,7 @@ def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Ten
 
 
 def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
-    """Eq. (13), summed: smooth L1 of six residuals and of the sine of the yaw difference.
+    """Eq. (13), summed over residuals (K, 7): smooth L1 of six of them and of the sine of the yaw difference.
 
     The sine makes a box and the same box turned by half a circle equal; the direction bins tell them apart.
     """

@@ -48,7 +48,7 @@ class RPNNeck(RPNLayers):
     """The neck of Table 1, everywhere on the map; its three levels are concatenated."""
 
     def forward(self, canvas: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, out_channels, H / 2, W / 2); 384 channels with Table 1's widths."""
+        """Unitless (B, C, H, W) -> (B, out_channels, H / 2, W / 2); 384 channels with Table 1's widths."""
         maps = []
         for block, deblock in zip(self.blocks, self.deblocks, strict=True):
             canvas = block(canvas)

@@ -59,7 +59,10 @@ class PillarDetector(nn.Module):
         self.head = head
 
     def forward(self, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Pillars of B frames -> head maps, or rows of the active head cells of a sparse neck, see `SSDHead`."""
+        """Pillars of B frames -> head maps (B, channels, H, W) of logits and residuals.
+
+        With a sparse neck: rows (M, channels) of the active head cells, see `SSDHead`.
+        """
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
@@ -73,17 +76,20 @@ class PillarDetector(nn.Module):
         return maps
 
     def predict(self, batch: LabeledPillars) -> PillarOutputs:
-        """Head maps of B labelled frames, and the cells that they are of."""
+        """Head maps (B, channels, H, W) of logits and residuals of B labelled frames, and their cells."""
         return PillarOutputs(self(batch.pillars), batch.pillars.neck)
 
     def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
-        """The terms of eq. (15) by name, see `detection_loss`; anchors at inactive head cells take no part."""
+        """The terms of eq. (15) by name, scalars, from head maps (B, channels, H, W), see `detection_loss`.
+
+        Anchors at inactive head cells take no part.
+        """
         neck, targets = outputs.neck, batch.targets
         seen = targets if neck is None else targets_at(targets, neck.head_cells)
         return detection_loss(outputs.maps, seen, self.loss_weights)._asdict()
 
     def detect(self, outputs: PillarOutputs, spec: DetectorSpec) -> list[Detections]:
-        """Boxes in the head maps of each frame, with the thresholds of `spec`."""
+        """Boxes in head maps (B, channels, H, W) for each frame, LiDAR frame, with the thresholds of `spec`."""
         arrays = [part.float().cpu().numpy() for part in outputs.maps]
         neck = outputs.neck
         if neck is None:

@@ -36,8 +36,10 @@ def _frame(length: float) -> _Frame:
 
 
 def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -> Primitives:
-    """A bicycle: wheels, frame, handlebar, saddle; mostly mudguards, a rack, lamps and reflectors, which grow by
-    `footprint_m`, the width of a laser's beam there."""
+    """A bicycle: wheels, frame, handlebar, saddle; mostly mudguards, a rack, lamps and reflectors.
+
+    They grow by `footprint_m`, the width of a laser's beam there.
+    """
     frame = _frame(length)
     paint = float(np.exp(rng.uniform(np.log(0.03), np.log(0.5))))
     parts = [_wheels(rng, frame), _tubes(rng, frame, paint)]
@@ -127,8 +129,10 @@ def _tubes(rng: np.random.Generator, frame: _Frame, paint: float) -> Primitives:
 def cyclist_body(
     rng: np.random.Generator, height: float, width: float, length: float, footprint_m: float = 0.0
 ) -> Primitives:
-    """A bicycle and its rider, upright to bent over; `height` is that of the head above the ground. `footprint_m` as
-    for `bicycle`."""
+    """A bicycle and its rider, upright to bent over.
+
+    `height` is that of the head above the ground, `footprint_m` as for `bicycle`.
+    """
     neck = np.array([-0.28 + rng.uniform(0.05, 0.42), 0.0, height - 0.27])
     crown = draw_cloth(rng, 1)[0]  # hair or a helmet
     head = ellipsoids(

@@ -18,7 +18,7 @@ def draw_cloth(rng: np.random.Generator, n: int, dark_share: float = 0.1) -> Flo
 
 
 def draw_skin(rng: np.random.Generator) -> Floats:
-    """(3,) surface of bare skin."""
+    """(3,) reflectance, gloss, density of bare skin."""
     return np.array([rng.uniform(0.3, 0.55), 0.2, 0.0])
 
 

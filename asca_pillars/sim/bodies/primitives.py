@@ -38,7 +38,7 @@ class Surface:
 
     @property
     def row(self) -> Floats:
-        """(3,) as triangles carry it."""
+        """(3,) reflectance, gloss, transparency, as triangles carry it."""
         return np.array([self.reflectance, self.gloss, self.transparency])
 
 
@@ -54,6 +54,7 @@ class Primitives:
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
+        """All primitives of the parts, in their order."""
         if not parts:
             return cls(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
         return cls(
@@ -83,8 +84,10 @@ def _only_triangles(triangles: Floats, surface: Floats) -> Primitives:
 
 
 def quads(corners: npt.ArrayLike, surface: Surface | Floats) -> Primitives:
-    """Flat quadrilaterals: corners (...,4,3) in order around each, one surface for all or a table (...,3) of each
-    one's reflectance, gloss, transparency."""
+    """Flat quadrilaterals: corners (...,4,3) in order around each, metres.
+
+    One surface for all, or a table (...,3) of each one's reflectance, gloss, transparency.
+    """
     corners = np.asarray(corners, float).reshape(-1, 4, 3)
     table = surface.row if isinstance(surface, Surface) else surface
     table = np.broadcast_to(table, (len(corners), 3)) if table.ndim == 1 else table.reshape(-1, 3)
@@ -92,8 +95,11 @@ def quads(corners: npt.ArrayLike, surface: Surface | Floats) -> Primitives:
 
 
 def cuboids(rows: npt.ArrayLike) -> Primitives:
-    """Boxes without a bottom: rows (N,10) of x, y, bottom z, length, width, height, yaw and a surface's
-    reflectance, gloss, transparency. 10 triangles each."""
+    """Boxes without a bottom, 10 triangles each.
+
+    Rows (N,10) are x, y, bottom z, length, width, height, in metres, yaw in radians, and a surface's reflectance,
+    gloss, transparency.
+    """
     rows = np.asarray(rows, float).reshape(-1, 10)
     half = rows[:, 3:5] / 2
     sign = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
@@ -109,9 +115,11 @@ def cuboids(rows: npt.ArrayLike) -> Primitives:
 
 
 def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
-    """Round posts: rows (N,9) of x, y, bottom z, height, radius at the foot, radius at the top, reflectance, and how
-    far the top leans along x and y per metre of height; these two may be left out (N,7). 2 * `sides` triangles each,
-    open at both ends (a lid is thinner than a laser's footprint)."""
+    """Round posts of 2 * `sides` triangles each, open at both ends (a lid is thinner than a laser's footprint).
+
+    Rows (N,9) are x, y, bottom z, height, radius at the foot, radius at the top, in metres, reflectance, and how far
+    the top leans along x and y per metre of height; these two may be left out (N,7).
+    """
     rows = np.atleast_2d(np.asarray(rows, float))
     lean = rows[:, 7:9] if rows.shape[1] == 9 else np.zeros((len(rows), 2))
     angle = np.arange(sides) * (2 * np.pi / sides)
@@ -136,8 +144,10 @@ def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
 def ellipsoids(
     centers: npt.ArrayLike, radii: npt.ArrayLike, surface: Floats, axes: npt.ArrayLike | None = None
 ) -> Primitives:
-    """Ellipsoids: centers (E,3), radii (E,3) along the rows of `axes` (E,3,3; default: x, y, z),
-    surface (E,3) of reflectance, gloss, density per metre (0 is solid)."""
+    """Ellipsoids: centers (E,3), radii (E,3) along the rows of `axes` (E,3,3; default: x, y, z), metres.
+
+    Surface (E,3) is reflectance, gloss, density per metre (0 is solid).
+    """
     centers = np.asarray(centers, float).reshape(-1, 3)
     radii = np.asarray(radii, float).reshape(-1, 3)
     turned = np.broadcast_to(np.eye(3), (len(centers), 3, 3)) if axes is None else np.asarray(axes, float)
@@ -149,7 +159,7 @@ def ellipsoids(
 def limbs(
     start: npt.ArrayLike, end: npt.ArrayLike, radii: npt.ArrayLike, surface: Floats, side: tuple[float, float, float]
 ) -> Primitives:
-    """Long ellipsoids from `start` to `end` (N,3), with radii (N,2): along `side` and across it."""
+    """Long ellipsoids from `start` to `end` (N,3), with radii (N,2): along `side` and across it; all in metres."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     radii = np.asarray(radii, float)
     along = end - start

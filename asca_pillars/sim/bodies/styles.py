@@ -74,8 +74,11 @@ class Paint:
 
 
 def draw_paint(rng: np.random.Generator, dark_share: float = 0.5) -> Paint:
-    """Paint: dark lacquers shine where they are met head on and send hardly anything back elsewhere; pale ones with
-    a matte pigment send back a good deal from any side, others scatter hardly anything where rays only graze them."""
+    """Paint, dark or pale.
+
+    Dark lacquers shine where they are met head on and send hardly anything back elsewhere; pale ones with a matte
+    pigment send back a good deal from any side, others scatter hardly anything where rays only graze them.
+    """
     if rng.random() < dark_share:
         value, gloss = float(np.exp(rng.uniform(np.log(0.012), np.log(0.035)))), float(rng.uniform(0.5, 1.8))
     else:

@@ -165,8 +165,10 @@ def _panels(grid: Floats) -> Floats:
 
 
 def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
-    """Left half of the nose (x = 0) or the tail (x = 1) inside its section (7,3): corners (4,4,3), low and high by
-    turns."""
+    """Left half of the nose (x = 0) or the tail (x = 1) inside its section (7,3).
+
+    Returns corners (4,4,3), low and high by turns.
+    """
     levels = outline[[0, 1, 3]]  # sill, waist, edge
     share = np.array([1.0, 0.6, 0.0])[:, None]
     y = share * levels[:, 1]

@@ -1,0 +1,1 @@
+"""What every firing of the sensor hits."""

@@ -54,7 +54,10 @@ def extent_of(m: Floats, ux: float, uy: float) -> Extent:
 
 @numba.njit(**PLAIN)
 def ellipsoid_window(center: Floats, m: Floats, distance: float, rays: Rays) -> Window:
-    """The window of an ellipsoid; empty for one beside the wedge of columns that are cast."""
+    """The window of an ellipsoid |m p| = 1, m (3,3), around a center (3,) that is `distance` metres away.
+
+    It is empty for one beside the wedge of columns that are cast.
+    """
     cx, cy, cz = center[0], center[1], center[2]
     ux, uy = cx / max(distance, 1e-9), cy / max(distance, 1e-9)
     extent = extent_of(m, ux, uy)
@@ -93,7 +96,7 @@ def leaf_chance(leaves: Leaves, k: int, j: int, salt: int, key: int) -> float:
 
 @numba.njit(inline="always", **PLAIN)
 def solid_cosine(m: Floats, x: float, y: float, z: float, dx: float, dy: float, dz: float, stretch: float) -> float:
-    """Cosine of the incidence of a ray (dx, dy, dz) at a place (x, y, z) of the unit frame, on the surface."""
+    """Cosine of the incidence of a ray (dx, dy, dz) at a place (x, y, z) of the unit frame, of |m p| = 1, m (3,3)."""
     nx = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
     ny = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
     nz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
@@ -112,7 +115,10 @@ def cast_ellipsoids(
     nearest: NearestHits,
     key: int,
 ) -> None:
-    """Keep the nearest hit of ellipsoids (E); count what each object alone would stop."""
+    """Keep the nearest hit of E ellipsoids; count what each object alone would stop.
+
+    Centers (E,3), unit_from_world (E,3,3) and surface (E,3) are as in `Primitives`: metres, LiDAR frame.
+    """
     # Taken out of their tuples once: numba counts references at every access.
     slopes, stretch, origins, phase_counts = rays.slope, rays.stretch, rays.origin_z_m, rays.phase_counts
     cos_phase, sin_phase, cos_azimuth, sin_azimuth = rays.cos_phase, rays.sin_phase, rays.cos_azimuth, rays.sin_azimuth

@@ -19,8 +19,10 @@ ASPHALT, PAVEMENT, VERGE, MARKING, RAIL, BALLAST = range(6)
 
 
 class Street(NamedTuple):
-    """What the ground of a street looks like: metres, slopes and radians, in road coordinates (`world.ground`). What
-    is 0 is absent."""
+    """What the ground of a street looks like: metres, slopes and radians, in road coordinates (`world.ground`).
+
+    What is 0 is absent.
+    """
 
     yaw_rad: float
     bend_per_m: float
@@ -64,8 +66,10 @@ def heights(points: Floats, street: Street, relief: Floats, z_m: float) -> Float
 
 @numba.njit(cache=True, inline="always")
 def road_distances(x: float, y: float, street: Street) -> tuple[float, float, float, float, float]:
-    """Road coordinates u, v, then how far outside the main road (either carriageway), the crossing road and both
-    (negative inside)."""
+    """Road coordinates u, v, then how far outside the main road, the crossing road and both (negative inside), metres.
+
+    The main road is either carriageway.
+    """
     cos, sin = street.cos_yaw, street.sin_yaw
     u = x * cos + y * sin
     v = y * cos - x * sin - street.offset_m - 0.5 * street.bend_per_m * u * u
@@ -97,7 +101,10 @@ def on_rail(from_middle: float, tracks: float) -> bool:
 
 @numba.njit(cache=True, inline="always")
 def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float) -> float:
-    """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them."""
+    """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them.
+
+    All in metres, LiDAR frame; relief (R, R) holds heights above z_m, as in `Ground`.
+    """
     cells = relief.shape[0] - 1
     row = min(max((x + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
     col = min(max((y + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
@@ -154,7 +161,10 @@ def ground_material(x: float, y: float, street: Street) -> int:
 
 @numba.njit(cache=True)
 def highest_within(relief: Floats) -> Floats:
-    """Highest relief (metres) within each multiple of RELIEF_STEP_M of the car; rays may start below it."""
+    """Highest (R - 1,) of relief (R, R), metres, within each multiple of RELIEF_STEP_M of the car.
+
+    Rays may start below it.
+    """
     half = relief.shape[0] // 2
     highest = np.full(2 * half, relief[half, half])
     for i in range(relief.shape[0]):

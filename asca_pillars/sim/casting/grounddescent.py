@@ -30,8 +30,11 @@ GRASS_SALT = 900_000_000
 
 
 class Descent(NamedTuple):
-    """A ray over the ground, and where it was on its way down: above at `near_m`, and at `reach_m` below (or beyond
-    its limit); `clear_m` is the last place at which it, and all before, was CLEAR_M above the ground."""
+    """A ray over the ground, and where it was on its way down.
+
+    It was above at `near_m`, and at `reach_m` below (or beyond its limit); `clear_m` is the last place at which it,
+    and all before, was CLEAR_M above the ground.
+    """
 
     near_m: float
     above_m: float
@@ -51,13 +54,16 @@ class GroundRay(NamedTuple):
 
 @numba.njit(cache=True, inline="always")
 def gap_at(ray: GroundRay, reach: float, street: Street, relief: Floats, z_m: float) -> float:
-    """Height of a ray above the ground at a horizontal distance."""
+    """Height in metres of a ray above the ground, relief (R, R), at a horizontal distance."""
     return ray.up + ray.slope * reach - ground_height(reach * ray.dx, reach * ray.dy, street, relief, z_m)
 
 
 @numba.njit(cache=True)
 def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: float) -> float:
-    """How far a ray of this height and slope stays above everything, in whatever direction."""
+    """How many metres a ray of this height and slope stays above everything, in whatever direction.
+
+    `highest` (rings,) is the highest relief in each ring of cells around the car.
+    """
     start, ring = START_M, 0
     while ring + 1 < len(highest) and up + slope * start > z_m + highest[ring] + rise:
         # Up to the far edge of this ring of cells the ray stays above everything.
@@ -80,7 +86,7 @@ def descend(
     relief: Floats,
     z_m: float,
 ) -> Descent:
-    """Walk down a ray until it is below the ground or beyond `limit`.
+    """Walk down a ray until it is below the ground, relief (R, R), or beyond `limit`, metres.
 
     A neighboring ray was high above everything up to `clear`, and met the ground at `expected` (0: nowhere): this one
     begins there, and looks there first once it is low.
@@ -112,8 +118,10 @@ def descend(
 
 @numba.njit(cache=True)
 def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: float) -> tuple[float, float]:
-    """Where a ray meets the ground between above it and below, and what is left between them there: false position,
-    halving the weight of an end that stays."""
+    """Distance at which a ray meets the ground, relief (R, R), between above it and below, and the gap left, metres.
+
+    False position, halving the weight of an end that stays.
+    """
     near, above, reach, gap = way.near_m, way.above_m, way.reach_m, way.gap_m
     left = gap
     for _ in range(10):
@@ -132,7 +140,7 @@ def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: f
 
 @numba.njit(cache=True)
 def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relief: Floats, z_m: float) -> float:
-    """Cosine of the angle at which a ray meets the ground of this height there."""
+    """Cosine of the angle at which a ray meets the ground, relief (R, R), of this height in metres there."""
     x, y, step = reach * ray.dx, reach * ray.dy, 0.05
     gx = (ground_height(x + step, y, street, relief, z_m) - height) / step
     gy = (ground_height(x, y + step, street, relief, z_m) - height) / step
@@ -145,7 +153,10 @@ def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relie
 def cast_ground(
     street: Street, relief: Floats, materials: Floats, z_m: float, rays: Rays, nearest: NearestHits, key: int
 ) -> None:
-    """Walk every ray down to the ground and keep the hit where nothing was nearer; street as in `Ground`."""
+    """Walk every ray down to the ground and keep the hit where nothing was nearer.
+
+    Street, relief (R, R), materials (6,), which are reflectances, and z_m in metres are as in `Ground`.
+    """
     # Taken out of their tuples once: numba counts references at every access.
     slopes, origins, cos_phase, sin_phase = rays.slope, rays.origin_z_m, rays.cos_phase, rays.sin_phase
     cos_azimuth, sin_azimuth, is_cast = rays.cos_azimuth, rays.sin_azimuth, rays.cast

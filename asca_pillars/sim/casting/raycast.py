@@ -38,8 +38,11 @@ class Hits(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """What is cast at: primitives, each with its owner (object index or BACKGROUND, objects in one run each) and a
-    salt, the number that tells its chance (glass, foliage) from that of the others."""
+    """What is cast at: primitives, each with its owner and a salt.
+
+    The owner is an object's index or BACKGROUND; objects are in one run each. The salt is the number that tells a
+    primitive's chance (glass, foliage) from that of the others.
+    """
 
     primitives: Primitives
     tri_owner: Ints  # (T,)

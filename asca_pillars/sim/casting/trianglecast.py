@@ -51,12 +51,13 @@ def nearest_on_edge(ax: float, ay: float, bx: float, by: float) -> float:
 
 @numba.njit(inline="always", **PLAIN)
 def wrap(angle: float) -> float:
+    """The same angle in [-pi, pi), radians."""
     return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
 
 
 @numba.njit(**PLAIN)
 def triangle_window(corner: Floats, rays: Rays) -> Window:
-    """The window of a triangle (3,3); empty for one beside the wedge of columns that are cast."""
+    """The window of a triangle (3,3), metres; empty for one beside the wedge of columns that are cast."""
     ax, ay, bx, by, cx, cy = corner[0, 0], corner[0, 1], corner[1, 0], corner[1, 1], corner[2, 0], corner[2, 1]
     if rays.wedge_slope > 0.0:
         wedge = rays.wedge_slope
@@ -80,7 +81,7 @@ def triangle_window(corner: Floats, rays: Rays) -> Window:
 
 @numba.njit(**PLAIN)
 def plane_of(corner: Floats) -> Plane:
-    """The plane of a triangle (3,3), its normal of length 1; all 0 for a triangle without an area."""
+    """The plane of a triangle (3,3), metres, its normal of length 1; all 0 for a triangle without an area."""
     ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     vx, vy, vz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx

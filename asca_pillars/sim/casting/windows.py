@@ -19,8 +19,10 @@ WHOLE_TURN = 2 * np.pi - 1e-9
 
 
 class Window(NamedTuple):
-    """Rings [first_ring, last_ring) and azimuths [low_counts, low_counts + width_counts] of the encoder, low_counts
-    within one revolution from 0, that can meet a body."""
+    """Rings [first_ring, last_ring) and azimuths [low_counts, low_counts + width_counts] that can meet a body.
+
+    Azimuths are in counts of the encoder, low_counts within one revolution from 0.
+    """
 
     first_ring: int
     last_ring: int
@@ -46,7 +48,7 @@ def ray_chance(key: int, ring: int, column: int, salt: int) -> float:
 
 @numba.njit(**PLAIN)
 def ring_below(slope: Floats, limit: float) -> int:
-    """First ring whose slope (they fall) is not above `limit`."""
+    """The index of the first ring whose slope is not above `limit`; slopes (K,) fall."""
     first, last = 0, len(slope)
     while first < last:
         middle = (first + last) // 2
@@ -76,7 +78,10 @@ def window_of(z_low: float, z_high: float, near: float, far: float, low: float, 
 
 @numba.njit(inline="always", **PLAIN)
 def columns_of(window: Window, phase_counts: float, first_column: Ints, columns: int) -> tuple[int, int]:
-    """Columns [first, last) of a ring that lie in a window; `last` may exceed the number of columns."""
+    """Indices [first, last) of a ring's columns that lie in a window; `last` may exceed the number of columns.
+
+    `first_column` (counts + 1,) is as in `Rays`.
+    """
     counts = len(first_column) - 1
     start = window.low_counts - phase_counts
     if start < 0.0:
@@ -93,8 +98,10 @@ def columns_of(window: Window, phase_counts: float, first_column: Ints, columns:
 def keep(
     nearest: NearestHits, k: int, j: int, reach: float, who: int, incidence: float, normal: float, gloss: float
 ) -> None:
-    """Note a hit that is nearer than what ray (k, j) has met so far, of a surface with this reflectance at normal
-    incidence."""
+    """Note a hit that is nearer than what ray (k, j) has met so far.
+
+    The surface has reflectance `normal` at normal incidence.
+    """
     nearest.rho_m[k, j] = reach
     nearest.owner[k, j] = who
     nearest.cosine[k, j] = incidence

@@ -48,7 +48,7 @@ def ground_mask(points: _Floats) -> NDArray[np.bool_]:
 
 
 def fit_plane(points: _Floats) -> NDArray[np.float64] | None:
-    """RANSAC plane (3,) a, b, c of z = a x + b y + c through points (N, >=3); None if no draw is level enough.
+    """RANSAC plane (3,) a, b, c of z = a x + b y + c, metres, through points (N, >=3); None if no draw is level enough.
 
     The draws are seeded: the same points give the same plane.
     """

@@ -56,9 +56,9 @@ def record_objects(
     """Records of the objects of CLASSES that have returns.
 
     Args:
-        points: (N, 4) of the scan.
+        points: (N, 4) of the scan, LiDAR frame.
         objects: M labels with a 3D box.
-        boxes: (M, 7) of these.
+        boxes: (M, 7) of these, LiDAR frame.
         found: what a detector finds in the scan, if one was asked.
     """
     inside = points_in_boxes(points, boxes)

@@ -149,7 +149,7 @@ def fit_cars(cars: NDArray[np.float64], span_m: tuple[float, float]) -> CarFit |
 
 
 def ring_counts(points: NDArray[np.floating[Any]], sensor: Sensor) -> _Counts:
-    """Returns (rings,) of each ring of a whole revolution (N, >=3), from the top.
+    """How many returns each ring has, counts (rings,) from the top, of a whole revolution (N, >=3).
 
     KITTI's files hold ring after ring, each from azimuth 0 on, counter-clockwise: where the azimuth falls back, the
     next ring begins. In files of another order a return belongs to the ring of `sensor` whose beam passes nearest.

@@ -1,4 +1,4 @@
-"""How often a detector fires at what nobody labelled: clusters as large as a person, tall thin ones, bright ones."""
+"""How often a detector fires at what is not labelled: clusters as large as a person, tall thin ones, bright ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,6 +58,7 @@ class FiringRow:
 
     @property
     def per_frame(self) -> float:
+        """Clusters of this kind in one frame, on average."""
         return self.clusters / self.frames
 
 
@@ -67,9 +68,9 @@ def find_clusters(
     """Clusters of at least _MIN_POINTS returns above the ground that touch no labelled box, widened a little.
 
     Args:
-        points: (N, 4).
-        ignored: (N,) points in DontCare areas, where nobody says what stands there.
-        labelled: (M, 7) boxes of everything that has a label.
+        points: (N, 4), LiDAR frame.
+        ignored: (N,) mask of points in DontCare areas, whose objects are not labelled.
+        labelled: (M, 7) boxes of everything that has a label, LiDAR frame.
         found: what the detector finds.
     """
     ground = fit_ground(points)

@@ -1,0 +1,1 @@
+"""What the sensor measures of each hit."""

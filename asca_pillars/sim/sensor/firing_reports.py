@@ -31,7 +31,7 @@ class Met(NamedTuple):
     cosine: npt.NDArray[np.float32]
     reflectance: npt.NDArray[np.float32]
     owner: npt.NDArray[np.int32]
-    hidden: npt.NDArray[np.bool_]  # firings that the own car stops
+    hidden: npt.NDArray[np.bool_]  # firings that the ego vehicle blocks
 
 
 class Lasers(NamedTuple):
@@ -94,8 +94,9 @@ def echo_of(
     slopes: Floats,
     receiver: Receiver,
 ) -> Echo:
-    """The echo of a firing, which may lean over an edge to a neighboring firing's surface.
+    """The echo of firing (k, j), which may lean over an edge to a neighboring firing's surface.
 
+    rho in metres, cosine and reflectance are (K, C), as in `Met`; stretch and slopes (K,), as in `Lasers`.
     `lean` in 0..1 says to which neighbor and how far, `fate` in 0..1 what becomes of two echoes: none, one between
     both, or the stronger of them.
     """
@@ -138,7 +139,7 @@ def fade_of(slant: float, near_fade: float, receiver: Receiver) -> float:
 def report_firings(
     met: Met, lasers: Lasers, receiver: Receiver, key: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """Points (N,4), their owners (N,) and rings (N,), ring by ring."""
+    """Points (N, 4) in the LiDAR frame, the indices of their owners (N,) and of their rings (N,), ring by ring."""
     rho, cosine, reflectance, owners, hidden = met.rho_m, met.cosine, met.reflectance, met.owner, met.hidden
     slopes, stretch, origins, cos_phase, sin_phase, biases, gains, sigmas, faints, near_fades, cosines, sines = lasers
     rings, columns = rho.shape

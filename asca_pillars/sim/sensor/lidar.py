@@ -94,6 +94,7 @@ class Lidar:
 
     @property
     def rings(self) -> int:
+        """Number of lasers."""
         return len(self.elevation_deg)
 
     @property
@@ -121,7 +122,7 @@ class Firings:
     first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
     cast: npt.NDArray[np.bool_]  # (C,) columns that are fired at all
     counted: npt.NDArray[np.bool_]  # (C,) columns whose firings tell how much of an object is hidden
-    hidden: npt.NDArray[np.bool_]  # (K,C) firings that the own car stops
+    hidden: npt.NDArray[np.bool_]  # (K,C) firings that the ego vehicle blocks
     range_sigma_m: float
     loss_share: float
     zero_power: float
@@ -129,6 +130,7 @@ class Firings:
 
     @property
     def lost_power(self) -> float:
+        """The received power below which a firing returns nothing in this scan."""
         return self.zero_power * self.lidar.lost_share_of_zero_power
 
 
@@ -177,7 +179,7 @@ def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool, coun
 
 
 def _hidden(lidar: Lidar, azimuth_rad: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """(K,C) firings that the own car stops."""
+    """(K,C) firings that the ego vehicle blocks."""
     if not lidar.ego_first_ring:
         return np.zeros((lidar.rings, len(azimuth_rad)), bool)
     sector = (azimuth_rad / (2 * np.pi) * len(lidar.ego_first_ring)).astype(int)

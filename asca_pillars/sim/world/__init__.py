@@ -1,0 +1,1 @@
+"""Streets, and the objects placed on them."""

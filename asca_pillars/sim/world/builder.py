@@ -31,10 +31,11 @@ class Stretch:
 
     @property
     def middle_m(self) -> float:
+        """Its middle along the road."""
         return self.start_m + self.length_m / 2
 
     def along(self, step_m: float) -> Floats:
-        """Middles of as many pieces of `step_m` as fit."""
+        """Middles (N,) of as many pieces of `step_m` as fit, metres."""
         return np.asarray(np.arange(self.start_m + step_m / 2, self.start_m + self.length_m - 0.45 * step_m, step_m))
 
 
@@ -105,11 +106,14 @@ class Builder:
         radius: float,
         reflectance: float,
         cross: bool = False,
+        *,
         taper: float = 1.0,
         lean: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """A round post whose radius at the top is `taper` times that at the foot, leaning by `lean` metres per metre
-        of height along x and y."""
+        """A round post whose radius at the top is `taper` times that at the foot.
+
+        It leans by `lean` metres per metre of height along x and y.
+        """
         x, y, _ = self.to_lidar(along, across, cross)
         self._posts.append((x, y, z, height, radius, taper * radius, reflectance, *lean))
 
@@ -129,10 +133,13 @@ class Builder:
         reflectance: float,
         density_per_m: Floats,
         cross: bool = False,
+        *,
         turned: bool = True,
     ) -> None:
-        """Leaves (N): ellipsoids of radii (N,3) around z above the ground, each turned at random or, for hedges,
-        along the road."""
+        """N clouds of leaves: ellipsoids of radii (N, 3), metres, around z (N,) above the ground.
+
+        Each is turned at random or, for hedges, along the road.
+        """
         rows = np.empty((len(along), 9))
         rows[:, :2] = self.ground.places(along, across, cross)
         rows[:, 2], rows[:, 3:6] = z, radii

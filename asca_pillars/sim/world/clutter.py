@@ -1,5 +1,7 @@
-"""Things on pavements, verges and in yards, much of it the size of a person, a bicycle or a car: what a detector must
-not take for one. Nothing here has the shape of a labelled class."""
+"""Things on pavements, verges and in yards, much of it the size of a person, a bicycle or a car.
+
+A detector must not take them for one. Nothing here has the shape of a labelled class.
+"""
 
 from collections.abc import Callable
 

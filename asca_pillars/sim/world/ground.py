@@ -36,14 +36,17 @@ class Ground:
 
     @property
     def half_width_m(self) -> float:
+        """Half the width of the main road."""
         return self.street.half_width_m
 
     @property
     def pavement_m(self) -> float:
+        """Width of the pavements."""
         return self.street.pavement_m
 
     @property
     def cross_u_m(self) -> float:
+        """Where the crossing road meets the main road, along it."""
         return self.street.cross_u_m
 
     @property
@@ -132,8 +135,11 @@ def draw_relief(
     street: Street | None = None,
     bump_m: float = 0.0,
 ) -> Floats:
-    """Hills: a plane of `slope` (x, y) that levels out far away, long waves that are level under the car, and bumps
-    of standard deviation `bump_m` beyond the pavements of `street`. Metres, (R,R)."""
+    """Heights (R,R) of hills, metres.
+
+    They are a plane of `slope` (x, y) that levels out far away, long waves that are level under the car, and bumps of
+    standard deviation `bump_m` beyond the pavements of `street`.
+    """
     axis = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
     x, y = np.meshgrid(axis, axis, indexing="ij")
     # A slope lasts as far as one sees the street; KITTI's far ground lies as high, on average, as that near the car.

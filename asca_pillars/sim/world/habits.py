@@ -52,7 +52,11 @@ class Habits:
         )
 
     def vehicle(self, size: Floats, way: float) -> Candidate:
-        """A car, van, truck or trailer: parked, in a yard, half hidden aside, on the crossing road, or on its way."""
+        """A car, van, truck or trailer: parked, in a yard, half hidden aside, on the crossing road, or on its way.
+
+        Its size (3,) is length, width and height in metres; `way` is 1 ahead of the sensor and -1 behind it, here and
+        below.
+        """
         rng, config = self.rng, self.config
         if size[0] < 6.0 and rng.random() < config.half_hidden:
             return self._half_hidden(way)
@@ -67,13 +71,13 @@ class Habits:
         return self._moving(size, way)
 
     def tram(self, size: Floats, way: float) -> Candidate:
-        """On its track, or beside the road."""
+        """A tram of size (3,) in metres on its track, or beside the road."""
         rails = self.ground.rails_v_m
         v = self.ground.half_width_m + 3.0 if rails is None else rails
         return Candidate(self.ground.to_lidar(way * self.rng.uniform(8.0, 74.0), v, self.rng.choice([0.0, np.pi])))
 
     def pedestrian(self, size: Floats, way: float) -> Candidate:
-        """Alone or in company; along the street, across the line of sight, or anyhow."""
+        """A person of size (3,), metres, alone or in company; along the street, across the line of sight, or anyhow."""
         rng, config, ground = self.rng, self.config, self.ground
         half, pavement = ground.half_width_m, ground.pavement_m
         if self.people and rng.random() < config.in_company:
@@ -122,7 +126,7 @@ class Habits:
         return float(of.u + along * cos - across * sin), float(of.v + along * sin + across * cos), of.heading + turn
 
     def sitting(self, size: Floats, way: float) -> Candidate:
-        """On a bench or a chair beside the street, or at somebody's table."""
+        """A person of size (3,) in metres on a bench or a chair beside the street, or at somebody's table."""
         rng, ground = self.rng, self.ground
         if self.people and rng.random() < 0.4:
             other = self.people[int(rng.integers(len(self.people)))]
@@ -133,7 +137,7 @@ class Habits:
         return self._at(self.people, u, v, rng.uniform(-np.pi, np.pi))
 
     def cyclist(self, size: Floats, way: float) -> Candidate:
-        """On the road or beside it, along or across it, some in company."""
+        """A cyclist of size (3,) in metres on the road or beside it, along or across it, some in company."""
         rng, config, half = self.rng, self.config, self.ground.half_width_m
         if self.riders and rng.random() < config.riding_together:  # side by side, or one behind the other
             u, v, heading, _ = self.riders[int(rng.integers(len(self.riders)))]

@@ -1,5 +1,7 @@
-"""Beacons, striped boards, masts: upright and often retroreflective, and of a person's size in all but shape. Most of
-what KITTI's detectors take for people is one of them."""
+"""Beacons, striped boards, masts: upright and often retroreflective, and of a person's size in all but shape.
+
+Most of what KITTI's detectors take for people is one of them.
+"""
 
 import numpy as np
 
@@ -97,8 +99,10 @@ def mast(builder: Builder, along: float, across: float) -> None:
 
 
 def covered_thing(builder: Builder, along: float, across: float) -> None:
-    """Something under a sheet, in a sack or wound with plants: a pump, a statue, stacked chairs, a parasol; some of it
-    tied to a pole."""
+    """Something under a sheet, in a sack or wound with plants: a pump, a statue, stacked chairs, a parasol.
+
+    Some of it is tied to a pole.
+    """
     rng = builder.rng
     wide, tall = float(rng.uniform(0.14, 0.34)), float(rng.uniform(0.9, 1.9))
     if not builder.claim(along, across, 2.2 * wide, 2.2 * wide):

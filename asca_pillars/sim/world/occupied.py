@@ -11,8 +11,10 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass
 class Occupied:
-    """Footprints that are taken: rows x, y, length, width, yaw, and by how much it may overlap others that may overlap.
-    Grows as things are placed."""
+    """Footprints that are taken; they grow in number as things are placed.
+
+    Rows are x, y, length, width, yaw, and by how much it may overlap others that may overlap.
+    """
 
     rows: Floats = field(default_factory=lambda: np.zeros((2048, 6)))
     count: int = 0
@@ -20,8 +22,10 @@ class Occupied:
     def take(
         self, x: float, y: float, length: float, width: float, yaw: float, margin_m: float = 0.0, overlap_m: float = 0.0
     ) -> bool:
-        """Take a footprint if it is free with a margin around it; whether it was. Two footprints may overlap by the
-        lesser `overlap_m` of theirs."""
+        """Take a footprint if it is free with a margin around it; whether it was.
+
+        Two footprints may overlap by the lesser `overlap_m` of theirs.
+        """
         row = np.array([x, y, length + 2 * margin_m, width + 2 * margin_m, yaw, overlap_m])
         if not _is_free(row, self.rows, self.count) or self.count == len(self.rows):
             return False

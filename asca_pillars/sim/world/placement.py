@@ -20,8 +20,10 @@ PEDESTRIANS_OVERLAP_M = 0.15  # boxes of people who walk side by side share that
 
 @dataclass(frozen=True)
 class Target:
-    """A labelled object: KITTI type and label box (x, y, z, length, width, height, yaw). The body stands on the
-    ground, `lift_m` below the bottom of the box."""
+    """A labelled object: KITTI type and label box (x, y, z, length, width, height, yaw).
+
+    The body stands on the ground, `lift_m` below the bottom of the box.
+    """
 
     type: str
     box: Floats

@@ -144,8 +144,11 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
 
 
 def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: float) -> Bodies:
-    """Primitives of a scene. Objects whose azimuth is beyond `within_rad` of straight ahead are left out;
-    the chance of the others does not change by that."""
+    """Primitives of a scene.
+
+    Objects whose azimuth is beyond `within_rad` of straight ahead are left out; the chance of the others does not
+    change by that.
+    """
     parts, owners, salts, blob_owners, blob_salts = [scene.background], [], [], [], []
     background = scene.background
     owners.append(np.full(len(background.triangles), BACKGROUND))

@@ -11,8 +11,10 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SizeStatistics:
-    """Label sizes in metres, each (length, width, height), and the correlations length-width, length-height,
-    width-height."""
+    """Label sizes in metres, each (length, width, height), and their correlations.
+
+    Correlations are length-width, length-height, width-height.
+    """
 
     mean: tuple[float, float, float]
     deviation: tuple[float, float, float]
@@ -61,7 +63,7 @@ MOTORCYCLE_SHARE = 0.2  # of Misc, whose smallest quarter is two-wheelers
 
 
 def draw_size(rng: np.random.Generator, name: str) -> Floats:
-    """Length, width, height of a label box, metres."""
+    """(3,) length, width, height of a label box, metres."""
     if name == "Misc" and rng.random() < MOTORCYCLE_SHARE:
         return rng.uniform((1.7, 0.60, 1.45), (2.3, 0.90, 1.85))
     if name == "Car" and rng.random() < MICROCAR_SHARE:

@@ -71,7 +71,7 @@ def benchmark(
 
     Args:
         detector: a fresh one, so that its first scan shows the cold start.
-        scans: (N, 4) each, as for the detector.
+        scans: (N, 4) each, LiDAR frame, as for the detector.
 
     Raises:
         ValueError: there is no scan or no round.

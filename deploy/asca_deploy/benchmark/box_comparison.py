@@ -40,7 +40,7 @@ class Comparison:
 def compare(
     runs: Mapping[str, Run], scans: Sequence[NDArray[np.float32]], rounds: int = 10, track: Track = silently
 ) -> Comparison:
-    """Time several detectors in alternation; see `alternate`."""
+    """Time several detectors in alternation on scans (N, 4), LiDAR frame; see `alternate`."""
     times_ms = alternate(runs, scans, rounds, track)
     medians = {name: np.median(times, axis=1) for name, times in times_ms.items()}
     first = next(iter(medians.values()))
@@ -69,7 +69,7 @@ def alternate(
             median. Every other round goes through the detectors backwards.
 
     Returns:
-        By name (rounds, frames), milliseconds; divide medians over the frames of the same round for ratios that a
+        By name (rounds, frames), in ms; divide medians over the frames of the same round for ratios that a
         busy machine does not spoil.
 
     Raises:

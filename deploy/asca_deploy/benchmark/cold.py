@@ -62,7 +62,7 @@ def cold_start(
     repeats: int = 5,
     track: Track = silently,
 ) -> ColdStart:
-    """Start new processes that do with `scan` (N, 4) what `detector` would.
+    """Start new processes that do with `scan` (N, 4), LiDAR frame, what `detector` would.
 
     Raises:
         AscaError: a process failed; says how.

@@ -53,7 +53,7 @@ def measure_matrix(
 
     Args:
         bundles: folders by name. The first one's default on the CPU is the reference and the first row.
-        scans: (N, 4) each.
+        scans: (N, 4) each, LiDAR frame.
         mounting: of their sensor.
     """
     opened: dict[Way, Detector | str] = {}

@@ -33,7 +33,7 @@ def measure_scaling(
     rounds: int = 10,
     track: Track = silently,
 ) -> tuple[ScalingRow, ...]:
-    """Time the detector on `scan` (N, 4) with fewer and more points; the sizes take turns."""
+    """Time the detector on `scan` (N, 4), LiDAR frame, with fewer and more points; the sizes take turns."""
     scans = [resample(scan, count) for count in counts]
     for points in scans:
         detector(points)

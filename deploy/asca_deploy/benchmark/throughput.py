@@ -32,7 +32,7 @@ class Throughput:
 def measure_throughput(
     detector: Detector, scans: Sequence[NDArray[np.float32]], rounds: int = 10, track: Track = silently
 ) -> Throughput:
-    """Time passes over `scans`, (N, 4) each, one by one and streamed in turn."""
+    """Time passes over `scans`, (N, 4) each, LiDAR frame, one by one and streamed in turn."""
     frames = list(islice(cycle(scans), max(FRAMES, len(scans))))
     single_ms: list[float] = []
     stream_ms: list[float] = []

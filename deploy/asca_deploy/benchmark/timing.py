@@ -30,7 +30,7 @@ class Percentiles:
 
     @classmethod
     def of(cls, times_ms: list[float] | NDArray[np.float64]) -> "Percentiles":
-        """Of times in any shape."""
+        """Of times, such as (rounds, frames), over all of them."""
         return cls(*(float(np.percentile(times_ms, q)) for q in (50, 95, 0)))
 
 
@@ -44,12 +44,12 @@ class Spread:
 
     @classmethod
     def of(cls, ratios: list[float] | NDArray[np.float64]) -> "Spread":
-        """Of one ratio per round."""
+        """Of unitless ratios (rounds,)."""
         return cls(*(float(np.percentile(ratios, q)) for q in (50, 25, 75)))
 
 
 def run_frame(detector: Detector, scan: NDArray[Any]) -> FrameReport:
-    """Run one scan and return its report."""
+    """Run one scan (N, 4), LiDAR frame, and return its report."""
     return detector(scan).report
 
 

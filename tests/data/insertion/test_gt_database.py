@@ -36,7 +36,7 @@ def rename(split: KittiSplit, frame_id: str, index: int, name: str) -> None:
 
 
 def test_it_holds_every_labelled_object_with_its_points(split: KittiSplit, tmp_path: Path) -> None:
-    rename(split, "000001", 0, "Van")  # no class, but a neighbour of one: not in it
+    rename(split, "000001", 0, "Van")  # no class, but a neighbor of one: not in it
     rename(split, "000002", 0, "Truck")
     database = prepare(split, tmp_path / "prepared")
     frames = [read_frame(split, frame_id, TYPES, min_points=0) for frame_id in split.frame_ids]

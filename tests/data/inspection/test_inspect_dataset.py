@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,15 +50,15 @@ def data(clean: Path, tmp_path: Path) -> Path:
     return shutil.copytree(clean, tmp_path / "data")
 
 
-def with_data(**changes: int | bool) -> Config:
+def with_data(**changes: Any) -> Config:
     return dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, **changes))
 
 
-def with_detector(**changes: object) -> Config:
+def with_detector(**changes: Any) -> Config:
     return dataclasses.replace(CONFIG, model=PillarModel(spec=dataclasses.replace(SPEC, **changes)))
 
 
-def with_grid(**changes: object) -> Config:
+def with_grid(**changes: Any) -> Config:
     return with_detector(grid=dataclasses.replace(GRID, **changes))
 
 
@@ -70,7 +71,7 @@ def found(root: Path, config: Config = CONFIG) -> list[Finding]:
     return findings(inspected(root, config), config.model.spec, config.data.min_points)
 
 
-def change_scans(root: Path, change: Callable[[Points], None], every: int = 1) -> None:
+def change_scans(root: Path, change: Callable[[Points], object], every: int = 1) -> None:
     for path in sorted((root / "training" / "velodyne").iterdir())[::every]:
         points = stored_points(path)
         change(points)
@@ -292,7 +293,7 @@ def test_points_that_are_not_numbers_and_scans_that_see_nothing(data: Path) -> N
 
 
 def refusal(root: Path, config: Config, tmp_path: Path) -> str:
-    """The line that `asca inspect` fails with; the JSON is written all the same."""
+    """The line that `asca inspect` fails with; the JSON is written anyway."""
     path = tmp_path / "config.yaml"
     path.write_text(yaml.safe_dump(to_dict(config)))
     with pytest.raises(DatasetError) as error:

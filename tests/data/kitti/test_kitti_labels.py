@@ -69,7 +69,8 @@ cents = st.integers
     heading=cents(-314, 314),
 )
 def test_label_box_label_is_exact_to_its_two_decimals(tilt, offset, size, place, heading):
-    calib = make_calibration(*tilt, offset_m=offset)
+    roll, pitch, yaw = tilt
+    calib = make_calibration(roll, pitch, yaw, offset_m=offset)
     values = [v / 100 for v in (*size, *place, heading)]
     item = make_object(**dict(zip(BOX_FIELDS, values, strict=True)))
     [back] = objects_from_boxes(boxes_from_objects([item], calib), ["Car"], calib)

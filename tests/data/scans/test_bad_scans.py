@@ -2,6 +2,7 @@
 
 import struct
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,19 +127,20 @@ def test_one_bright_point_does_not_darken_a_scan(tmp_path):
 
 @pytest.mark.parametrize("scale", [1, 255, 65535])
 def test_scales_are_found_and_reported(tmp_path, scale):
-    scan = read(tmp_path, "a.bin", (STREET * np.float32([1, 1, 1, scale])).tobytes())
+    scan = read(tmp_path, "a.bin", (STREET * np.array([1, 1, 1, scale], np.float32)).tobytes())
     np.testing.assert_allclose(scan.points, STREET, atol=1e-6)
     assert scan.notes.reflectance_scale == scale
     assert scan.notes.remarks == ()
 
 
 def test_a_scale_of_100_is_doubted_and_can_be_stated(tmp_path):
-    (tmp_path / "a.bin").write_bytes((STREET * np.float32([1, 1, 1, 100])).tobytes())
+    (tmp_path / "a.bin").write_bytes((STREET * np.array([1, 1, 1, 100], np.float32)).tobytes())
     assert "0..100" in read_scan(tmp_path / "a.bin").notes.remarks[0]
     scan = read_scan(tmp_path / "a.bin", reflectance_scale=100)
     np.testing.assert_allclose(scan.points, STREET, atol=1e-6)
     assert scan.notes.remarks == ()
-    for wrong in (0, -1, float("nan"), "bright"):
+    wrongs: tuple[Any, ...] = (0, -1, float("nan"), "bright")
+    for wrong in wrongs:
         with pytest.raises(ScanError, match="reflectance_scale"):
             read_scan(tmp_path / "a.bin", reflectance_scale=wrong)
 
@@ -146,7 +148,7 @@ def test_a_scale_of_100_is_doubted_and_can_be_stated(tmp_path):
 def test_a_folder_has_one_scale(tmp_path):
     """A dark scan, nothing above 1 of 255, among brighter ones."""
     for number, brightness in enumerate([255, 255, 1, 255]):
-        points = STREET * np.float32([1, 1, 1, brightness])
+        points = STREET * np.array([1, 1, 1, brightness], np.float32)
         (tmp_path / f"{number}.bin").write_bytes(points.tobytes())
     paths = sorted(tmp_path.iterdir())
     assert read_scan(paths[2]).notes.reflectance_scale == 1
@@ -183,7 +185,7 @@ def test_columns_can_be_stated(tmp_path):
     assert len(read_scan(tmp_path / "a.bin", columns=4).points) == 5000
     (tmp_path / "b.bin").write_bytes(np.ascontiguousarray(STREET[:, :3]).tobytes())
     scan = read_scan(tmp_path / "b.bin", columns=3)
-    np.testing.assert_array_equal(scan.points, STREET * np.float32([1, 1, 1, 0]))
+    np.testing.assert_array_equal(scan.points, STREET * np.array([1, 1, 1, 0], np.float32))
     assert scan.notes.reflectance_scale is None
     for wrong, words in ((7, "7 columns"), (2, "3 to 16"), (17, "3 to 16")):
         with pytest.raises(ScanError, match=words):

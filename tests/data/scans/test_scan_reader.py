@@ -1,14 +1,16 @@
 """Every scan format, written here byte by byte, and what damaged files say."""
 
 import struct
+from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES
 from asca_pillars.data.scans.pcd import lzf_decompress
-from asca_pillars.data.scans.scan_reader import SCAN_SUFFIXES, Scan, read_scan, write_scan
+from asca_pillars.data.scans.scan_reader import Scan, read_scan, write_scan
 from asca_pillars.errors import ScanError
 
 POINTS = np.array([[1.5, -2.25, 0.5, 0.25], [70.125, 39.5, -3, 1.0], [0, 0, 0, 0], [-5.0, 8.0, 1.0, 0.5]], np.float32)
@@ -38,14 +40,14 @@ def pcd(encoding: str, points=POINTS, *, field="intensity", kind="F4") -> bytes:
         return header + "".join(rows).encode()
     if encoding == "binary":
         return header + records.tobytes()
-    columns = b"".join(records[name].tobytes() for name in records.dtype.names)
+    columns = b"".join(records[name].tobytes() for name in records.dtype.names or ())
     packed = literal_lzf(columns)
     return header + struct.pack("<2I", len(packed), len(columns)) + packed
 
 
 def ply(encoding: str, points=POINTS, *, kind="float") -> bytes:
     """A PLY whose vertices stand between a plain element and faces, after an element with a list."""
-    order = ">" if encoding == "binary_big_endian" else "<"
+    order: Literal["<", ">"] = ">" if encoding == "binary_big_endian" else "<"
     header = (
         f"ply\nformat {encoding} 1.0\ncomment made by a test\n"
         "element camera 2\nproperty double focus\nproperty uchar flag\n"
@@ -131,11 +133,11 @@ def test_a_file_with_wrong_bytes_is_a_scan_or_a_scan_error(tmp_path_factory, nam
     "content",
     {
         "b.npy": npy(POINTS * [1, 1, 1, 200]),
-        "f.pcd": pcd("ascii", POINTS * np.float32([1, 1, 1, 200]), kind="F4", field="reflectance"),
-        "u.pcd": pcd("binary", POINTS * np.float32([1, 1, 1, 200]), kind="U1", field="i"),
-        "c.pcd": pcd("binary_compressed", POINTS * np.float32([1, 1, 1, 200]), kind="U2"),
-        "a.ply": ply("ascii", POINTS * np.float32([1, 1, 1, 200]), kind="uchar"),
-        "b.ply": ply("binary_big_endian", POINTS * np.float32([1, 1, 1, 200]), kind="ushort"),
+        "f.pcd": pcd("ascii", POINTS * np.array([1, 1, 1, 200], np.float32), kind="F4", field="reflectance"),
+        "u.pcd": pcd("binary", POINTS * np.array([1, 1, 1, 200], np.float32), kind="U1", field="i"),
+        "c.pcd": pcd("binary_compressed", POINTS * np.array([1, 1, 1, 200], np.float32), kind="U2"),
+        "a.ply": ply("ascii", POINTS * np.array([1, 1, 1, 200], np.float32), kind="uchar"),
+        "b.ply": ply("binary_big_endian", POINTS * np.array([1, 1, 1, 200], np.float32), kind="ushort"),
     }.items(),
     ids=lambda item: item[0],
 )
@@ -144,7 +146,7 @@ def test_reflectance_of_0_to_255_comes_to_0_to_1(tmp_path, content):
 
 
 def test_integers_are_of_0_to_255_even_in_a_dark_scan(tmp_path):
-    dark = POINTS * np.float32([1, 1, 1, 0]) + np.float32([0, 0, 0, 1])
+    dark = POINTS * np.array([1, 1, 1, 0], np.float32) + np.array([0, 0, 0, 1], np.float32)
     for name, content in (
         ("a.pcd", pcd("ascii", dark, kind="U1")),
         ("b.ply", ply("ascii", dark, kind="uchar")),

@@ -30,8 +30,8 @@ class Thing(NamedTuple):
     score: float
 
 
-class Twin(NamedTuple):
-    """The twin of `evaluation.kitti.Curve`."""
+class ReferenceCurve(NamedTuple):
+    """What `evaluation.kitti.Curve` should be."""
 
     precision: list[float]
     counted: int
@@ -44,7 +44,7 @@ class Twin(NamedTuple):
 
 def brute_force(
     truth: list[FrameObjects], detections: list[FrameObjects], class_names: tuple[str, ...], band: Band = None
-) -> dict[tuple[str, str, str], Twin]:
+) -> dict[tuple[str, str, str], ReferenceCurve]:
     """Every curve that the official tool would compute, by (class name, metric, difficulty)."""
     frames = [(things(gt), things(det)) for gt, det in zip(truth, detections, strict=True)]
     everything = [thing for _, found in frames for thing in found]
@@ -83,15 +83,20 @@ def things(frame: FrameObjects) -> list[Thing]:
     ]
 
 
-def curve(frames: list, name: str, metric: str, difficulty: str, band: Band) -> tuple[Twin, Twin]:
+def curve(frames: list, name: str, metric: str, difficulty: str, band: Band) -> tuple[ReferenceCurve, ReferenceCurve]:
     counted = sum(truth_state(gt, name, difficulty, band) == "counted" for truths, _ in frames for gt in truths)
     scores = []
     for truths, found in frames:
         scores += match(truths, found, name, metric, difficulty, band, None)[0]
     thresholds = pick_thresholds(scores, counted)
-    tp, fp, fn, similarity = [], [], [], []
+    tp: list[int] = []
+    fp: list[int] = []
+    fn: list[int] = []
+    similarity: list[float] = []
     for threshold in thresholds:
-        tp.append(0), fp.append(0), fn.append(0), similarity.append(0.0)
+        for counts in (tp, fp, fn):
+            counts.append(0)
+        similarity.append(0.0)
         for truths, found in frames:
             matched, false, missed, similar = match(truths, found, name, metric, difficulty, band, threshold)
             tp[-1] += len(matched)
@@ -99,7 +104,7 @@ def curve(frames: list, name: str, metric: str, difficulty: str, band: Band) -> 
             fn[-1] += missed
             similarity[-1] += similar
     rest = (counted, len(scores), thresholds, tp, fp, fn)
-    return Twin(envelope(tp, tp, fp), *rest), Twin(envelope(similarity, tp, fp), *rest)
+    return ReferenceCurve(envelope(tp, tp, fp), *rest), ReferenceCurve(envelope(similarity, tp, fp), *rest)
 
 
 def envelope(gains: list, tp: list[int], fp: list[int]) -> list[float]:

@@ -83,17 +83,21 @@ def test_equals_plain_loops(
     found = [without(frame, missing, np.random.default_rng(seed)) for frame in found]
     evaluation = evaluate(truth, found, CLASSES, bands_m=[] if band is None else [band])
     curves = (evaluation.overall if band is None else evaluation.bands[band]).curves
-    twins = brute_force(truth, found, CLASSES, band)
-    assert curves.keys() == twins.keys()
-    for key, twin in twins.items():
+    references = brute_force(truth, found, CLASSES, band)
+    assert curves.keys() == references.keys()
+    for key, reference in references.items():
         curve = curves[key]
         assert (curve.counted, curve.matched, curve.thresholds.tolist()) == (
-            twin.counted,
-            twin.matched,
-            twin.thresholds,
+            reference.counted,
+            reference.matched,
+            reference.thresholds,
         )
-        assert [curve.tp.tolist(), curve.fp.tolist(), curve.fn.tolist()] == [twin.tp, twin.fp, twin.fn], key
-        np.testing.assert_allclose(curve.precision, twin.precision, rtol=0, atol=1e-12)
+        assert [curve.tp.tolist(), curve.fp.tolist(), curve.fn.tolist()] == [
+            reference.tp,
+            reference.fp,
+            reference.fn,
+        ], key
+        np.testing.assert_allclose(curve.precision, reference.precision, rtol=0, atol=1e-12)
 
 
 def without(frame: FrameObjects, missing: str, rng: np.random.Generator) -> FrameObjects:

@@ -119,7 +119,7 @@ def test_precision_by_hand() -> None:
 
 
 def test_aos_goes_by_alpha() -> None:
-    turned = {"alpha": CAR.alpha + np.pi / 2, "rotation_y": CAR.rotation_y}
+    turned: dict[str, Any] = {"alpha": CAR.alpha + np.pi / 2, "rotation_y": CAR.rotation_y}
     curve = results([CAR], [hit(**turned)]).curve("Car", "aos", "easy")
     assert curve is not None and curve.precision[0] == pytest.approx(0.5)
     curve = results([CAR], [hit(rotation_y=CAR.rotation_y + np.pi / 2)]).curve("Car", "aos", "easy")

@@ -107,8 +107,8 @@ def test_the_first_pass_goes_by_score_and_the_second_by_overlap() -> None:
 
 def test_of_equals_the_first_of_the_file_matches() -> None:
     for first, second in ((0.0, np.pi), (np.pi, 0.0)):
-        twins = [hit(alpha=CAR.alpha + first), hit(alpha=CAR.alpha + second)]
-        curve = results([CAR], twins).curve("Car", "aos", "easy")
+        pair = [hit(alpha=CAR.alpha + first), hit(alpha=CAR.alpha + second)]
+        curve = results([CAR], pair).curve("Car", "aos", "easy")
         assert curve is not None and curve.precision[0] == pytest.approx(0.5 if first == 0 else 0.0, abs=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Recall and precision at a fixed score: hand-made frames for every rule, a slow twin, and published intervals."""
+"""Recall and precision at a fixed score: hand-made frames for every rule, a slow reference, and published intervals."""
 
 import math
 from dataclasses import replace
@@ -274,7 +274,9 @@ def naive(
         taken: set[int] = set()
         near = [band[0] <= math.hypot(o.x_m, o.z_m) < band[1] for o in candidates]
         totals[1] += sum(c and n for c, n in zip(counted, near, strict=True))
-        reported = sorted((d for d in seen if d.type == name and d.score >= score), key=lambda d: -d.score)
+        reported = sorted(
+            (d for d in seen if d.type == name and (d.score or 0) >= score), key=lambda d: -(d.score or 0)
+        )
         for detection in reported:
             inside = band[0] <= math.hypot(detection.x_m, detection.z_m) < band[1]
             overlap = (iou_3d if metric == "3d" else bev_iou)(camera_boxes([detection]), camera_boxes(candidates))

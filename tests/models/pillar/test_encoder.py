@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from asca_pillars.config import CpaReading
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
 from asca_pillars.pillars.pillarize import PillarLimits
 
@@ -35,7 +36,7 @@ def test_pillar_max_of_negative_features_is_not_lifted_to_zero() -> None:
 
 
 @pytest.mark.parametrize("cpa", READINGS)
-def test_a_batch_is_its_frames(cpa: str) -> None:
+def test_a_batch_is_its_frames(cpa: CpaReading) -> None:
     encoder = PillarEncoder(16, cpa, LIMITS).eval()
     first, second = _frame(12), _frame(30)
     together = encoder(
@@ -49,7 +50,7 @@ def test_a_batch_is_its_frames(cpa: str) -> None:
 
 
 @pytest.mark.parametrize("cpa", READINGS)
-def test_point_order_within_a_pillar_does_not_matter(cpa: str) -> None:
+def test_point_order_within_a_pillar_does_not_matter(cpa: CpaReading) -> None:
     encoder = PillarEncoder(16, cpa, LIMITS).eval()
     features, pillar_index, point_counts = _frame(12)
     order = torch.cat([torch.flip(rows, (0,)) for rows in torch.arange(len(features)).split(point_counts.tolist())])
@@ -59,7 +60,7 @@ def test_point_order_within_a_pillar_does_not_matter(cpa: str) -> None:
 
 
 @pytest.mark.parametrize("cpa", READINGS)
-def test_gradient_reaches_every_parameter(cpa: str) -> None:
+def test_gradient_reaches_every_parameter(cpa: CpaReading) -> None:
     encoder = PillarEncoder(16, cpa, LIMITS)
     encoder(*_frame(40)).square().sum().backward()
     for name, parameter in encoder.named_parameters():
@@ -67,8 +68,8 @@ def test_gradient_reaches_every_parameter(cpa: str) -> None:
 
 
 def test_parameter_counts() -> None:
-    def count(cpa: str) -> int:
-        return sum(p.numel() for p in PillarEncoder(64, cpa, PillarLimits()).parameters())
+    def count(cpa: CpaReading) -> int:
+        return sum(int(p.numel()) for p in PillarEncoder(64, cpa, PillarLimits()).parameters())
 
     pfn = 9 * 64 + 2 * 64  # linear without bias, scale and shift of the normalization
     assert count("none") == pfn

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import NetworkConfig, PillarModel
+from asca_pillars.config import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.models.pillar.neck import RPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
@@ -15,7 +15,7 @@ from asca_pillars.pillars.pillar_spec import PillarSpec
 SPEC = PillarSpec(grid=PillarGrid(x_range_m=(4.8, 20.16), y_range_m=(-7.68, 12.8), v_max_m=0.32, zones=3))
 
 
-def _detector(cpa: str = "channel") -> PillarDetector:
+def _detector(cpa: CpaReading = "channel") -> PillarDetector:
     torch.manual_seed(0)
     return build_pillar_detector(PillarModel(spec=SPEC, network=NetworkConfig(cpa=cpa))).eval()
 
@@ -92,7 +92,7 @@ def test_a_pillar_excites_the_feature_cell_whose_anchor_stands_over_it(row: int,
     with torch.no_grad():
         for name, parameter in neck.named_parameters():
             parameter.fill_(0.0 if name.endswith("bias") else 1.0)
-        kernel = neck.blocks[0][0].weight
+        kernel = neck.get_parameter("blocks.0.0.weight")
         kernel.copy_(torch.tensor([[0.1, 0.2, 0.1], [0.2, 1.0, 1.0], [0.1, 1.0, 1.0]]))
     canvas = torch.zeros(1, 1, SPEC.grid.ny, SPEC.grid.nx)
     canvas[0, 0, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2] = 1.0

@@ -61,9 +61,13 @@ def test_placing_turns_and_moves_every_kind_of_primitive() -> None:
     parts = [
         cuboids([(1.0, 0.5, 0.0, 2.0, 1.0, 1.5, 0.3, 0.5, 0.0, 0.0)]),
         prisms([(0.0, 1.0, 0.0, 2.0, 0.2, 0.1, 0.4)]),
-        ellipsoids([(0.3, -0.2, 1.0)], [(0.9, 0.4, 0.2)], np.array([[0.4, 0.0, 1.0]]),
-                   np.linalg.qr(rng.normal(size=(3, 3)))[0][None]),
-    ]  # fmt: skip
+        ellipsoids(
+            [(0.3, -0.2, 1.0)],
+            [(0.9, 0.4, 0.2)],
+            np.array([[0.4, 0.0, 1.0]]),
+            np.linalg.qr(rng.normal(size=(3, 3)))[0][None],
+        ),
+    ]
     body = Primitives.join(parts)
     placed = body.placed(3.0, -2.0, 0.5, 0.7)
     cos, sin = np.cos(0.7), np.sin(0.7)

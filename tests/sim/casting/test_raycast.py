@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives, Surface, cuboids, ellipsoids, prisms, quads
-from asca_pillars.sim.bodies.styles import SALOON
+from asca_pillars.sim.bodies.profiles import SALOON
 from asca_pillars.sim.bodies.vehicles import car_body
 from asca_pillars.sim.casting.groundcast import GROUND
 from asca_pillars.sim.casting.raycast import NOTHING, Bodies, cast
@@ -16,8 +16,11 @@ def bodies(primitives: Primitives, owner: int = BACKGROUND) -> Bodies:
     triangles, blobs = len(primitives.triangles), len(primitives.centers)
     return Bodies(
         primitives,
-        np.full(triangles, owner), np.arange(triangles), np.full(blobs, owner), triangles + np.arange(blobs),
-    )  # fmt: skip
+        np.full(triangles, owner),
+        np.arange(triangles),
+        np.full(blobs, owner),
+        triangles + np.arange(blobs),
+    )
 
 
 def directions(firings: Firings) -> np.ndarray:
@@ -170,7 +173,7 @@ def test_hidden_and_lone_rays_are_counted_per_object(firings: Firings) -> None:
     wall = quads([[(10, 5, -3), (10, 0, -3), (10, 0, 3), (10, 5, 3)]], Surface(0.5))
     both = Bodies(
         Primitives.join([wall, board]), np.array([-1, -1, 0, 0]), np.arange(4), np.zeros(0, int), np.zeros(0, int)
-    )  # fmt: skip
+    )
     hits = cast(both, 1, None, firings, seed=0)
     assert hits.alone[0] > 300
     assert hits.visible[0] / hits.alone[0] == pytest.approx(0.5, abs=0.02)

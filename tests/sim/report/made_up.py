@@ -75,7 +75,11 @@ def _car_points(range_m: float) -> int:
 def _block(rng: np.random.Generator, box: list[float], count: int) -> NDArray[np.float64]:
     """Points (count, 4) in the upper part of a box."""
     x, y, z, _, _, height, _ = box
-    return np.column_stack([
-        rng.uniform(x - 0.2, x + 0.2, count), rng.uniform(y - 0.2, y + 0.2, count),
-        rng.uniform(z, z + height / 2 - 0.05, count), rng.choice([0.0, 0.1, 0.6], count),
-    ])  # fmt: skip
+    return np.column_stack(
+        [
+            rng.uniform(x - 0.2, x + 0.2, count),
+            rng.uniform(y - 0.2, y + 0.2, count),
+            rng.uniform(z, z + height / 2 - 0.05, count),
+            rng.choice([0.0, 0.1, 0.6], count),
+        ]
+    )

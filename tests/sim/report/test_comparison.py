@@ -31,7 +31,7 @@ def test_a_set_is_like_itself(measured: Measured) -> None:
     comparison = compare(measured, measured.statistics)
     assert len(comparison.rows) > 60
     for item in comparison.rows:
-        # The share of a heading that nobody has is 0 on both sides, and their ratio is not a number.
+        # The share of a heading that no object has is 0 on both sides, and their ratio is not a number.
         nothing = item.measure == "ratio" and item.real == item.simulated == 0
         assert nothing or item.value == pytest.approx(1 if item.measure == "ratio" else 0, abs=1e-6), item
     assert sum(item.within is True for item in comparison.rows) == 4 + 4 + 4 + 5 and not comparison.missed

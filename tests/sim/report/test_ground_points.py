@@ -12,7 +12,9 @@ def test_the_ground_of_a_made_up_scan_is_found(slope: float) -> None:
     points, truth = rings(np.random.default_rng(0), slope)
     found = ground_mask(points)
     assert np.mean(found == truth) > 0.97
-    np.testing.assert_allclose(fit_plane(points[truth]), [slope, 0, GROUND_Z_M], atol=1e-3)
+    plane = fit_plane(points[truth])
+    assert plane is not None
+    np.testing.assert_allclose(plane, [slope, 0, GROUND_Z_M], atol=1e-3)
 
 
 def test_a_hill_is_followed_and_a_roof_is_not() -> None:

@@ -1,4 +1,4 @@
-"""Clusters that nobody labelled, and whether a detector fires at them."""
+"""Clusters without a label, and whether a detector fires at them."""
 
 import numpy as np
 import pytest

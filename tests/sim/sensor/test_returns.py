@@ -11,11 +11,24 @@ from asca_pillars.sim.sensor.returns import Returns, measure
 
 # Nothing but what a test switches on.
 QUIET = Lidar(
-    ego_first_ring=(), ego_beyond_ring=(), range_sigma_m=(0.0, 0.0), ring_bias_sigma_m=0.0, beam_split_share=0.0,
-    loss_share=(0.0, 0.0), ring_gain=(), ring_gain_sigma=0.0, response=1.0, dark_offset=0.0, fade_m=0.0, near_fade=0.0,
-    reflectance_sigma=(0.0, 0.0), reflectance_sigma_share=0.0, weak_laser_sigma=0.0, faint_reflectance=(0.0, 0.0),
+    ego_first_ring=(),
+    ego_beyond_ring=(),
+    range_sigma_m=(0.0, 0.0),
+    ring_bias_sigma_m=0.0,
+    beam_split_share=0.0,
+    loss_share=(0.0, 0.0),
+    ring_gain=(),
+    ring_gain_sigma=0.0,
+    response=1.0,
+    dark_offset=0.0,
+    fade_m=0.0,
+    near_fade=0.0,
+    reflectance_sigma=(0.0, 0.0),
+    reflectance_sigma_share=0.0,
+    weak_laser_sigma=0.0,
+    faint_reflectance=(0.0, 0.0),
     zero_share=0.0,
-)  # fmt: skip
+)
 
 
 def scan(lidar: Lidar, rho_m: float | np.ndarray, reflectance: float = 0.405, seed: int = 0) -> tuple[Returns, Firings]:
@@ -25,7 +38,7 @@ def scan(lidar: Lidar, rho_m: float | np.ndarray, reflectance: float = 0.405, se
     rho = np.broadcast_to(np.asarray(rho_m, float), shape)
     none = np.zeros(0, np.int64)
     owner = np.where(rho == rho.min(), 0, -1)
-    hits = Hits(rho, np.ones(shape), np.full(shape, reflectance), owner, none, none)
+    hits = Hits(rho, np.ones(shape, np.float32), np.full(shape, reflectance, np.float32), owner, none, none)
     return measure(hits, firings, np.random.default_rng(seed)), firings
 
 

@@ -34,12 +34,12 @@ def visible_share(builder: Builder, target: Target, seed: int) -> float:
 
 
 def test_a_half_hidden_car_is_seen_in_part() -> None:
-    shares = []
+    found = []
     for seed in range(12):
         builder, target = scene_with_car(seed, SceneConfig())
         hide_partly(builder, [target])
-        shares.append(visible_share(builder, target, seed))
-    shares = np.array(shares)
+        found.append(visible_share(builder, target, seed))
+    shares = np.array(found)
     assert (shares > 0.05).mean() > 0.8
     assert ((shares > 0.05) & (shares < 0.95)).mean() > 0.4
 

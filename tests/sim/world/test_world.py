@@ -41,9 +41,11 @@ def scan(primitives: Primitives, ground: Ground | None = None) -> tuple[Hits, np
     triangles, ellipsoids = len(primitives.triangles), len(primitives.centers)
     bodies = Bodies(
         primitives,
-        np.full(triangles, BACKGROUND), np.arange(triangles),
-        np.full(ellipsoids, BACKGROUND), triangles + np.arange(ellipsoids),
-    )  # fmt: skip
+        np.full(triangles, BACKGROUND),
+        np.arange(triangles),
+        np.full(ellipsoids, BACKGROUND),
+        triangles + np.arange(ellipsoids),
+    )
     hits = cast(bodies, 0, ground, firings, 5)
     ring, column = np.nonzero(hits.owner == BACKGROUND)
     rho, azimuth = hits.rho_m[ring, column], firings.azimuth_rad[column] + firings.phase_rad[ring]

@@ -1,0 +1,89 @@
+"""One name, one file; and imports go one way."""
+
+import ast
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = (ROOT / "asca_pillars", ROOT / "deploy" / "asca_deploy", ROOT / "export" / "asca_export")
+SHARED_NAMES = {"__init__.py", "conftest.py"}
+LAYERS = (  # what is in one of them imports from those before it
+    {"errors"},
+    {"files", "schema", "system", "yaml_text"},
+    {"geometry"},
+    {"pillars", "points", "tables"},
+    {"config"},
+    {"data"},
+    {"asca_deploy", "models", "pictures"},
+    {"evaluation", "second_stage"},
+    {"ablation", "asca_export", "sim", "training"},
+    {"commands"},
+    {"asca_pillars"},  # its names, imported when they are first used
+    {"cli"},
+)
+LAYER_OF = {room: number for number, layer in enumerate(LAYERS) for room in layer}
+WHEN_CALLED = {("geometry/detections.py", "data"), ("geometry/detections.py", "pictures")}
+"""Detections write themselves as KITTI text and as pictures, and import that when they do."""
+NEEDS_TORCH = {"asca_export", "commands", "models", "second_stage", "training"}
+
+
+def imports(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def room_of(module: str) -> str:
+    """asca_pillars.data.frames -> data, asca_deploy.bundle -> asca_deploy; what is not ours: its first part."""
+    package, _, rest = module.partition(".")
+    room = rest.partition(".")[0]
+    return room if package == "asca_pillars" and room in LAYER_OF else package
+
+
+def upward(path: Path, package: Path) -> list[str]:
+    place = path.relative_to(package).as_posix()
+    own = room_of(".".join((package.name, *path.relative_to(package).with_suffix("").parts)))
+    rooms = {room_of(module) for module in imports(path)} - {own}
+    wrong = [room for room in rooms & set(LAYER_OF) if LAYER_OF[room] >= LAYER_OF[own]]
+    wrong += [room for room in rooms & {"torch", "lightning"} if own not in NEEDS_TORCH]
+    return [f"{place} ({own}) imports {room}" for room in wrong if (place, room) not in WHEN_CALLED]
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
+def test_imports_go_one_way(package: Path) -> None:
+    files = sorted(package.rglob("*.py"))
+    assert len(files) > 5
+    assert [line for path in files for line in upward(path, package)] == []
+
+
+def test_every_folder_and_module_has_a_layer() -> None:
+    names = {path.stem for path in PACKAGES[0].iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert names - {"__init__"} <= set(LAYER_OF)
+
+
+@pytest.mark.parametrize(
+    ("place", "line"),
+    [
+        ("data/made_up.py", "from asca_pillars.models.build import build_model"),
+        ("geometry/made_up.py", "from asca_pillars.pillars import grid"),
+        ("pillars/made_up.py", "def late():\n    import torch.nn"),
+        ("models/made_up.py", "import asca_deploy.detector"),
+    ],
+)
+def test_a_wrong_import_is_found(tmp_path: Path, place: str, line: str) -> None:
+    path = tmp_path / "asca_pillars" / place
+    path.parent.mkdir(parents=True)
+    path.write_text(f"import numpy\nfrom asca_pillars.errors import AscaError\n{line}\n")
+    assert len(upward(path, tmp_path / "asca_pillars")) == 1
+
+
+def test_no_two_files_have_one_name() -> None:
+    folders = (*PACKAGES, ROOT / "tests", ROOT / "benchmarks")
+    names = Counter(path.name for folder in folders for path in folder.rglob("*.py"))
+    assert {name for name, count in names.items() if count > 1} <= SHARED_NAMES
