@@ -60,7 +60,11 @@ class PillarDetector(nn.Module):
         self.head = head
 
     def forward(self, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Pillars of B frames -> head maps, or rows of the active head cells of a sparse neck, see `SSDHead`."""
+        """Pillars of B frames -> head maps, or rows of the active head cells of a sparse neck, see `SSDHead`.
+
+        Raises:
+            ValueError: the batch was made without the placements of `self.preparation`, which this detector needs.
+        """
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
@@ -103,6 +107,8 @@ class PillarDetector(nn.Module):
 
         See `pillars.map_pooling`; without a pooled map pillars and cells are the same.
         """
+        if self.grid.pools != (batch.pooling is not None) or isinstance(self.neck, RPNNeck) != (batch.neck is None):
+            raise ValueError("the batch was placed for another map or neck; use `preparation.place` of this detector")
         if batch.pooling is None:
             return pillar_features, batch.cells, batch.frame_pillars
         cells, pillars, counts = batch.pooling
