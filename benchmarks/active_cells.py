@@ -19,6 +19,7 @@ from asca_pillars.data.frames import read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.targets import assign_targets
+from asca_pillars.pillars.map_pooling import map_cells
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.system import cpu_model
 from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, NeckTables
@@ -41,7 +42,7 @@ def main(
     print(f"{cpu_model()}, {len(frames)} frames of {folder.name}, grid of {config}\n")
     rows = []
     for rule in get_args(MaskRule):
-        builder = NeckTableBuilder(spec.grid.ny, spec.grid.nx, rule)
+        builder = NeckTableBuilder(*spec.grid.map_shape, rule)
         counts = [_count(spec, builder, frame.points, frame.boxes, frame.labels) for frame in frames]
         positives, active, objects, lost, cells, time_ms = np.array([each[:6] for each in counts]).sum(axis=0)
         levels = np.mean([each[6] for each in counts], axis=0)
@@ -69,14 +70,16 @@ def _count(
     labels: NDArray[np.int64],
 ) -> tuple[int, int, int, int, int, float, list[float]]:
     """Positive anchors, those active, objects, those without any, head cells, milliseconds, active share by level."""
-    cells = spec.pillarize(points).cells
+    pillars = spec.pillarize(points)
+    pooled = map_cells(pillars.cells, spec.grid)
+    cells = pillars.cells if pooled is None else pooled.cells
     targets = assign_targets(spec.anchors, spec.classes, boxes, labels)
     tables, time_ms = _timed(builder, cells)
     active = np.isin(targets.positives // spec.anchors.shape[2], tables.head_cells)
     matched = set(targets.matched.tolist())
     kept = set(targets.matched[active].tolist())
-    map_cells = spec.anchors.shape[0] * spec.anchors.shape[1]
-    shares = [len(level.cells) / (map_cells >> (2 * number)) for number, level in enumerate(tables.levels)]
+    head_cells = spec.anchors.shape[0] * spec.anchors.shape[1]
+    shares = [len(level.cells) / (head_cells >> (2 * number)) for number, level in enumerate(tables.levels)]
     counts = len(active), int(active.sum()), len(matched), len(matched - kept), len(tables.head_cells)
     return *counts, time_ms, shares
 

@@ -57,7 +57,7 @@ def random_weights(config: str, points: NDArray[np.float32]) -> Checkpoint:
         norm.momentum = 1.0  # the running statistics become those of this scan
     with torch.no_grad():
         pillars = resolved.model.spec.pillarize(points)
-        network(batch_pillars([pillars], [network.preparation.tables(pillars)]))
+        network(batch_pillars([pillars], [network.preparation.place(pillars)]))
     return Checkpoint(resolved, network.eval(), 0)
 
 

@@ -33,7 +33,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.models.pillar.pillar_preparation import Placement, batch_pillars
 from asca_pillars.system import cpu_model
 from asca_pillars.tables.neck_tables import NeckTableBuilder, table_inputs
 from benchmarks.host_path import CAMERA_VIEW
@@ -72,7 +72,7 @@ class _Forms:
         network, self.spec = replace(model.network, neck="sparse"), model.spec
         self.sparse = build_pillar_detector(replace(model, network=network)).eval()
         self.sparse.load_state_dict(dense.detector.state_dict())
-        self.tables = NeckTableBuilder(self.spec.grid.ny, self.spec.grid.nx, network.active_cells)
+        self.tables = NeckTableBuilder(*self.spec.grid.map_shape, network.active_cells)
         sample = self._sample(points)
         self.steps = canvas_steps([sample.features.numpy()])
         channels, grid = network.pillar_channels, self.spec.grid
@@ -107,7 +107,7 @@ class _Forms:
 
     def _sample(self, points: NDArray[np.float32]) -> SparseSample:
         pillars = self.spec.pillarize(points)
-        batch = batch_pillars([pillars], [self.tables.build(pillars.cells)])
+        batch = batch_pillars([pillars], [Placement(None, self.tables.build(pillars.cells))])
         assert batch.neck is not None
         with torch.inference_mode():
             features = self.sparse.encode(batch.features, batch.pillar_index, batch.point_counts)

@@ -87,6 +87,17 @@ def test_there_are_configs() -> None:
     assert {"asca_pointpillars_kitti", "pointpillars_kitti"} <= names == set(shipped_configs())
 
 
+def test_the_model_for_simulated_streets_has_the_papers_width_and_a_sparse_neck() -> None:
+    config = load_config("asca_sim")
+    assert config.model.network == NetworkConfig(neck="sparse", active_cells="fine")
+    assert config.model.spec.grid.zones == 1 and config.train.ema == 0.999 and config.train.schedule == "one_cycle"
+    assert [(spec.positive_iou, spec.negative_iou) for spec in config.model.spec.classes] == [
+        (0.6, 0.45),
+        (0.35, 0.2),
+        (0.35, 0.2),
+    ]
+
+
 def test_the_baseline_is_pointpillars() -> None:
     """DESIGN 4.1: K = 1 and V_max = 0.16 m are PointPillars, 432 x 496 pillars without attention."""
     config = load_config(next(path for path in CONFIGS if path.stem == "pointpillars_kitti"))

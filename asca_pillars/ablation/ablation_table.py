@@ -19,7 +19,15 @@ TABLES = {
     "Readings of the correlative point attention": (
         *("asp_k3", "asp_k3_cpa_paper", "asp_k3_cpa_channel", "asp_k3_cpa_point"),
     ),
+    "Map and neck": (
+        *("cpa_channel", "asp_k3_cpa_channel", "asp_k3_pooled_cpa_channel"),
+        *("cpa_channel_sub", "cpa_channel_fine", "asp_k3_cpa_channel_fine", "asp_k3_pooled_cpa_channel_fine"),
+    ),
+    "Matching of pedestrians and cyclists": (
+        *("cpa_channel", "cpa_channel_lower_ious", "cpa_channel_fine", "cpa_channel_fine_lower_ious"),
+    ),
 }
+COMPONENTS = ("ASP", "CPA", "Aug", "neck", "persons' IoU")
 BANDS_M = ((0.0, 40.0), (40.0, 80.0))
 
 
@@ -59,7 +67,7 @@ def read_results(runs: Iterable[Run]) -> dict[str, list[dict[str, Any]]]:
 
 def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
     bands = [f"{low:g}-{high:g} m" for low, high in BANDS_M]
-    header = ["ASP", "CPA", "Aug", *CLASS_NAMES, "mean", *bands, "parameters", "FPS", "time / baseline"]
+    header = [*COMPONENTS, *CLASS_NAMES, "mean", *bands, "parameters", "FPS", "time / baseline"]
     rows = []
     for name in names:
         runs, speed = results[name], speeds.get(name)
@@ -72,22 +80,26 @@ def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]
             low, high = speed.ratio_quartiles
             cells += [f"{speed.parameters:,}", f"{speed.fps:.1f}", f"{speed.ratio:.2f} ({low:.2f}-{high:.2f})"]
         rows.append([*_components(VARIANTS[name]), *cells])
-    return markdown_table(header, rows, left=3)
+    return markdown_table(header, rows, left=len(COMPONENTS))
 
 
 def _by_difficulty(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
-    header = ["ASP", "CPA", "Aug", *(f"{c} {d}" for c in CLASS_NAMES for d in DIFFICULTIES)]
+    header = [*COMPONENTS, *(f"{c} {d}" for c in CLASS_NAMES for d in DIFFICULTIES)]
     rows = []
     for name in names:
         cells = [_spread([_ap(run, c, d) for run in results[name]]) for c in CLASS_NAMES for d in DIFFICULTIES]
         rows.append([*_components(VARIANTS[name]), *cells])
-    return markdown_table(header, rows, left=3)
+    return markdown_table(header, rows, left=len(COMPONENTS))
 
 
-def _components(variant: Variant) -> tuple[str, str, str]:
+def _components(variant: Variant) -> tuple[str, ...]:
     zones = f"K={variant.zones}" if variant.zones > 1 else "-"
+    if variant.map != "warped":
+        zones += f" {variant.map}"
     cpa = "-" if variant.cpa == "none" else variant.cpa
-    return zones, cpa, {"none": "-", "gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}[variant.insert]
+    neck = "-" if variant.neck == "dense" else variant.active_cells
+    matching = "-" if variant.person_ious is None else " / ".join(f"{iou:g}" for iou in variant.person_ious)
+    return zones, cpa, {"none": "-", "gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}[variant.insert], neck, matching
 
 
 def _ap(result: dict[str, Any], class_name: str, difficulty: str) -> float:

@@ -1,4 +1,4 @@
-"""The ablation: the rows of the paper's Table 5, the number of zones K and the readings of CPA, trained on equal terms.
+"""The ablation: the paper's Table 5, zones and their map, readings of CPA, necks, matching, trained on equal terms.
 
 Every run is `asca train` with one base configuration and a few overrides, in a process of its own; finished runs are
 kept, so that an interrupted ablation goes on where it stopped.
@@ -11,13 +11,15 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.progress import track
 
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
+from asca_pillars.geometry.anchors import KITTI_CLASSES
+from asca_pillars.schema import to_dict
 from asca_pillars.system import default_threads
 
 
@@ -29,16 +31,37 @@ class Variant:
     zones: int = 1
     cpa: str = "none"
     insert: str = "none"
+    map: str = "warped"
+    neck: str = "dense"
+    active_cells: str = "fine"
+    person_ious: tuple[float, float] | None = None
+    """Overlap from which an anchor is positive and below which it is negative, of every class but cars; None for the
+    base configuration's."""
 
     @property
     def overrides(self) -> tuple[str, ...]:
         """For `asca train -s`. One zone means PointPillars' pillars of 0.16 m, several start at the paper's 0.32 m."""
         return (
+            f"model.spec.grid.map={self.map}",
+            f"model.network.neck={self.neck}",
+            f"model.network.active_cells={self.active_cells}",
+            *self._matching,
             f"model.spec.grid.zones={self.zones}",
             f"model.spec.grid.v_max_m={0.16 if self.zones == 1 else 0.32}",
             f"model.network.cpa={self.cpa}",
             f"augment.insert.method={self.insert}",
         )
+
+    @property
+    def _matching(self) -> tuple[str, ...]:
+        if self.person_ious is None:
+            return ()
+        positive, negative = self.person_ious
+        classes = [
+            spec if spec.name == "Car" else replace(spec, positive_iou=positive, negative_iou=negative)
+            for spec in KITTI_CLASSES
+        ]
+        return (f"model.spec.classes={json.dumps([to_dict(spec) for spec in classes])}",)
 
 
 VARIANTS = {
@@ -55,6 +78,13 @@ VARIANTS = {
         Variant("rs_aug", insert="rs_aug"),
         Variant("asp_k3_cpa_channel_rs_aug", zones=3, cpa="channel", insert="rs_aug"),
         Variant("asp_k3_cpa_point", zones=3, cpa="point"),
+        Variant("asp_k3_pooled_cpa_channel", zones=3, cpa="channel", map="pooled"),
+        Variant("cpa_channel_sub", cpa="channel", neck="sparse", active_cells="sub"),
+        Variant("cpa_channel_fine", cpa="channel", neck="sparse"),
+        Variant("asp_k3_cpa_channel_fine", zones=3, cpa="channel", neck="sparse"),
+        Variant("asp_k3_pooled_cpa_channel_fine", zones=3, cpa="channel", map="pooled", neck="sparse"),
+        Variant("cpa_channel_lower_ious", cpa="channel", person_ious=(0.35, 0.2)),
+        Variant("cpa_channel_fine_lower_ious", cpa="channel", neck="sparse", person_ious=(0.35, 0.2)),
     )
 }
 

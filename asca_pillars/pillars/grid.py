@@ -14,7 +14,7 @@ Columns run along x and rows along y; a pillar's flat index is row * nx + column
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,9 @@ class PillarGrid:
     """Width along y of every pillar."""
     zones: int = 3
     """K, the number of pillar depths."""
+    map: Literal["warped", "pooled"] = "warped"
+    """What the neck reads. `warped`: a column for every pillar along x, as the paper prints it. `pooled`: columns as
+    deep as the second zone's pillars everywhere, see `map_pooling`. With one zone both are the same."""
 
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
@@ -115,7 +118,32 @@ class PillarGrid:
     @property
     def head_shape(self) -> tuple[int, int]:
         """(H, W) of the map that the head reads."""
-        return self.ny // HEAD_STRIDE, self.nx // HEAD_STRIDE
+        rows, columns = self.map_shape
+        return rows // HEAD_STRIDE, columns // HEAD_STRIDE
+
+    @property
+    def pools(self) -> bool:
+        """Whether the map is another one than the pillars' own."""
+        return self.map == "pooled" and self.zones > 1
+
+    @cached_property
+    def map_shape(self) -> tuple[int, int]:
+        """(rows, columns) of the pseudo-image that the neck reads."""
+        return self.ny, 2 * self.zones * self._first_zone_columns if self.pools else self.nx
+
+    @cached_property
+    def map_columns(self) -> NDArray[np.int64]:
+        """First column of the pooled map that each column of pillars stands in, (nx,)."""
+        per_zone = 2 * self._first_zone_columns
+        zones = [
+            zone * per_zone + (np.arange(self._first_zone_columns << zone) * 2 >> zone) for zone in range(self.zones)
+        ]
+        return np.concatenate(zones)
+
+    @cached_property
+    def map_copies(self) -> NDArray[np.int64]:
+        """In how many columns of the pooled map each column of pillars stands, (nx,)."""
+        return np.where(np.arange(self.nx) < self._first_zone_columns, 2, 1)
 
     @cached_property
     def x_edges_m(self) -> NDArray[np.float64]:
@@ -163,7 +191,8 @@ class PillarGrid:
 
         Zones hold a multiple of HEAD_STRIDE columns, so the two columns of a head cell are equally deep.
         """
-        x_m, y_m = self.x_edges_m[::HEAD_STRIDE], self.y_edges_m[::HEAD_STRIDE]
+        x_edges_m = np.linspace(*self.x_range_m, self.map_shape[1] + 1) if self.pools else self.x_edges_m
+        x_m, y_m = x_edges_m[::HEAD_STRIDE], self.y_edges_m[::HEAD_STRIDE]
         return (x_m[:-1] + x_m[1:]) / 2, (y_m[:-1] + y_m[1:]) / 2
 
     @cached_property

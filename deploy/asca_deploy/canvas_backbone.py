@@ -11,10 +11,11 @@ from asca_deploy.graph import Session, Tensor, check_interface
 from asca_deploy.pillar_backbone import HeadAnswer, Maps
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.map_pooling import pool_pillars
 
 
 class Canvas:
-    """The pseudo-image (1, ny + 1, nx + 1, C), channels last, allocated once and kept from frame to frame.
+    """The pseudo-image (1, rows + 1, columns + 1, C), channels last, allocated once and kept from frame to frame.
 
     Its first row and column are the padding of the network's first convolution, so that they can hold whatever stands
     for zero. Channels last, a pillar is one run of memory. A frame fills a few percent of the cells: clearing only the
@@ -23,11 +24,12 @@ class Canvas:
 
     def __init__(self, channels: int, grid: PillarGrid, stored_as: CanvasFormat | None = None) -> None:
         stored_as = stored_as or CanvasFormat()
-        self.image: NDArray[Any] = np.empty((1, grid.ny + 1, grid.nx + 1, channels), stored_as.type)
+        rows, columns = grid.map_shape
+        self.image: NDArray[Any] = np.empty((1, rows + 1, columns + 1, channels), stored_as.type)
         self._empty = np.array(stored_as.empty or [0] * channels, stored_as.type)
         self._cells = self.image.reshape(-1, channels)
         self._cells[:] = self._empty
-        self._nx = grid.nx
+        self._nx = columns
         self._occupied = np.empty(0, np.int64)
 
     def scatter(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> NDArray[Any]:
@@ -35,7 +37,7 @@ class Canvas:
 
         Args:
             pillar_features: (P, C), of the format's type.
-            cells: (P,) flat indices row * nx + column, each at most once.
+            cells: (P,) flat indices row * columns + column on the map, each at most once.
 
         Returns:
             The pseudo-image (1, ny + 1, nx + 1, C). It is this object's own memory: valid until the next call.
@@ -68,7 +70,8 @@ class CanvasBackbone:
     def __init__(self, path: Path, session: Session, bundle: Bundle) -> None:
         self._bundle = bundle
         grid, section, anchors = bundle.spec.grid, bundle.pillar, bundle.spec.anchors.shape[2]
-        inputs = {"canvas": Tensor(section.canvas.type, (1, grid.ny + 1, grid.nx + 1, section.channels))}
+        rows, columns = grid.map_shape
+        inputs = {"canvas": Tensor(section.canvas.type, (1, rows + 1, columns + 1, section.channels))}
         outputs = {
             name: Tensor("float32", (1, *grid.head_shape, channels * anchors))
             for name, channels in zip(HeadMaps._fields, (1, 7, 2), strict=True)
@@ -82,7 +85,7 @@ class CanvasBackbone:
             canvas = self._free.pop()  # atomic, as append is: two threads never get the same one
         except IndexError:
             canvas = self.new_canvas()
-        canvas.scatter(pillar_features, cells)
+        canvas.scatter(*pool_pillars(pillar_features, cells, self._bundle.spec.grid))
         return canvas
 
     def run(self, placed: Canvas) -> HeadAnswer:

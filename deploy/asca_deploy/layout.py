@@ -20,14 +20,14 @@ def layout_of(spec: PillarSpec) -> dict[str, Any]:
     """Plain values for bundle.json.
 
     x_zones, y_zones: runs of equally sized pillars, ascending: first edge, size and number of pillars.
-    canvas_shape: rows and columns (ny + 1, nx + 1) of the pseudo-image, the first of each its padding.
+    canvas_shape: rows and columns of the pseudo-image, the first of each its padding.
     head_shape: (H, W) of the head maps.
     features: channels of the encoder's input. anchor_yaws_rad: the anchors of one class in one head cell.
     """
     return {
         "x_zones": _zones(spec.grid.x_edges_m),
         "y_zones": _zones(spec.grid.y_edges_m),
-        "canvas_shape": [spec.grid.ny + 1, spec.grid.nx + 1],
+        "canvas_shape": [size + 1 for size in spec.grid.map_shape],
         "head_shape": list(spec.grid.head_shape),
         "features": list(FEATURES),
         "anchor_yaws_rad": list(ANCHOR_YAWS_RAD),

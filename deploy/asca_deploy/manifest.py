@@ -21,9 +21,10 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
 
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
-# Of `pillar`, and what they are where they are not written: bundles made before there were sparse necks. The graphs'
-# metadata tells whether they were taken out.
+# Of `pillar` and `spec.grid`, and what they are where they are not written: in bundles made before there were sparse
+# necks and pooled maps. The graphs' metadata tells whether they were taken out.
 _LATER_KEYS = {"neck": "dense", "active_cells": None}
+_LATER_GRID_KEYS = {"map": "warped"}
 _LARGEST_BYTES = 1 << 20
 _LONGEST_REASON = 300
 _EXPORT_AGAIN = "export the bundle again with `asca export`"
@@ -47,6 +48,8 @@ def load_bundle(folder: str | Path) -> Bundle:
     if isinstance(section := data.get("pillar"), dict):
         data["pillar"] = _LATER_KEYS | section
         layout = data["pillar"].pop("layout", None)
+    if isinstance(spec := data.get("spec"), dict) and isinstance(grid := spec.get("grid"), dict):
+        data["spec"] = spec | {"grid": _LATER_GRID_KEYS | grid}
     try:
         bundle = parse(Bundle, data, str(manifest))
         if ignored := _first_difference(data, to_dict(bundle)):

@@ -10,6 +10,7 @@ from asca_deploy.bundle import Bundle
 from asca_deploy.graph import Session, Tensor, check_interface
 from asca_deploy.pillar_backbone import HeadAnswer
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.pillars.map_pooling import pool_pillars
 from asca_pillars.tables.neck_tables import LEVELS, NeckTableBuilder, NeckTables, table_inputs
 
 FEATURES = "pillar_features"
@@ -19,7 +20,7 @@ class PlacedPillars(NamedTuple):
     """What the graph reads of one scan."""
 
     features: NDArray[Any]
-    """(P, C)"""
+    """(P, C), of a pooled map (cells, C)"""
     tables: NeckTables[NDArray[np.int32]]
 
 
@@ -59,9 +60,10 @@ class TableBackbone:
             builder = self._free.pop()  # atomic, as append is: two threads never get the same one
         except IndexError:
             builder = self._new_builder()
-        tables = builder.build(cells)
+        features, occupied = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
+        tables = builder.build(occupied)
         self._free.append(builder)
-        return PlacedPillars(pillar_features, tables)
+        return PlacedPillars(features, tables)
 
     def run(self, placed: PlacedPillars) -> HeadAnswer:
         """Scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
@@ -74,6 +76,6 @@ class TableBackbone:
         return HeadAnswer(HeadMaps(*self._session.run(HeadMaps._fields, inputs)), tables.head_cells)
 
     def _new_builder(self) -> NeckTableBuilder:
-        grid, rule = self._bundle.spec.grid, self._bundle.pillar.active_cells
+        rule = self._bundle.pillar.active_cells
         assert rule is not None
-        return NeckTableBuilder(grid.ny, grid.nx, rule)
+        return NeckTableBuilder(*self._bundle.spec.grid.map_shape, rule)

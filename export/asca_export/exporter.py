@@ -113,5 +113,5 @@ def _export_backbone(detector: PillarDetector, path: Path, scans: Sequence[NDArr
         return graphs.multiply_accumulates(path) / 1e9
     backbone, preparation = SparseBackbone(detector), detector.preparation
     export_sparse_backbone(backbone, path)
-    tables = [preparation.tables(preparation.spec.pillarize(scan)) for scan in scans]
+    tables = [preparation.place(preparation.spec.pillarize(scan)).tables for scan in scans]
     return float(np.mean([multiply_accumulates(backbone, each) for each in tables if each is not None])) / 1e9

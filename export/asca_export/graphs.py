@@ -53,9 +53,10 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
 def export_backbone(backbone: FastBackbone, grid: PillarGrid, path: Path) -> None:
     """Write backbone.onnx: canvas (1, ny + 1, nx + 1, C) -> scores, boxes, directions, see `FastBackbone`."""
     channels = next(iter(backbone.stages()[0].convolutions.values())).in_channels
+    rows, columns = grid.map_shape
     _export(
         backbone,
-        (torch.zeros(1, grid.ny + 1, grid.nx + 1, channels),),
+        (torch.zeros(1, rows + 1, columns + 1, channels),),
         path,
         input_names=["canvas"],
         output_names=list(HeadMaps._fields),

@@ -50,7 +50,7 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
     worst_map = worst_box = worst_yaw = 0.0
     for number, points in enumerate(scans):
         pillars = spec.pillarize(points)
-        batch = batch_pillars([pillars], [detector.preparation.tables(pillars)])
+        batch = batch_pillars([pillars], [detector.preparation.place(pillars)])
         with torch.inference_mode():
             expected_features = detector.encode(batch.features, batch.pillar_index, batch.point_counts)
             expected_maps = _maps(detector, batch)
@@ -61,7 +61,7 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
         _require_close("encode", expected_features.numpy(), features, allowed, number)
         if isinstance(placed, Canvas):
             with torch.inference_mode():
-                pseudo_image = detector.scatter(expected_features, batch.cells, batch.frame_pillars).numpy()
+                pseudo_image = detector.scatter(*detector.pool(expected_features, batch)).numpy()
             expected_canvas = np.pad(pseudo_image.transpose(0, 2, 3, 1), ((0, 0), (1, 0), (1, 0), (0, 0)))
             _require_close("scatter", expected_canvas, placed.image, allowed, number)
         maps, cells = runtime.backbone.run(placed)

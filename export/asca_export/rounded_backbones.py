@@ -20,6 +20,7 @@ from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
 from asca_export.sparse_quantize import SparseSample, read_moments, round_products, scale_rows_to_steps
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillars.map_pooling import pool_pillars
 from asca_pillars.pillars.pillarize import Pillars
 
 
@@ -69,7 +70,10 @@ class _RoundedDense:
 
         def canvases() -> Iterator[NDArray[np.uint8]]:
             canvas = Canvas(len(steps.empty), detector.grid, form)
-            return (canvas.scatter(each.in_steps(steps), each.pillars.cells) for each in encoded)
+            return (
+                canvas.scatter(*pool_pillars(each.in_steps(steps), each.pillars.cells, detector.grid))
+                for each in encoded
+            )
 
         self._rounded = FastBackbone(detector, steps).eval()
         scale_to_steps(self._rounded, canvases(), steps)
@@ -108,6 +112,7 @@ class _RoundedSparse:
 
 
 def _sample(detector: PillarDetector, encoded: Encoded) -> SparseSample:
-    tables = detector.preparation.tables(encoded.pillars)
+    tables = detector.preparation.place(encoded.pillars).tables
     assert tables is not None
-    return SparseSample(torch.from_numpy(encoded.features), tree_map_only(np.ndarray, torch.from_numpy, tables))
+    features, _ = pool_pillars(encoded.features, encoded.pillars.cells, detector.grid)
+    return SparseSample(torch.from_numpy(features), tree_map_only(np.ndarray, torch.from_numpy, tables))

@@ -30,6 +30,10 @@ def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
     assert config.model.spec.grid.zones == variant.zones and config.model.network.cpa == variant.cpa
     assert config.augment.insert.method == variant.insert
     assert config.model.spec.grid.v_max_m == (0.16 if variant.zones == 1 else 0.32)
+    assert config.model.spec.grid.map == variant.map and config.model.network.neck == variant.neck
+    car, *persons = config.model.spec.classes
+    assert (car.positive_iou, car.negative_iou) == (0.6, 0.45)
+    assert {(spec.positive_iou, spec.negative_iou) for spec in persons} == {variant.person_ious or (0.5, 0.35)}
 
 
 def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -39,7 +43,7 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.
     ablate(config, data=data, out=out, jobs=2, **options)
     text = (out / "results.md").read_text()
     assert "6 frames for training, 8 for validation" in text and "2 runs" in text
-    assert sum(line.startswith("| K=2 | - | - |") for line in text.splitlines()) == 2
+    assert sum(line.startswith("| K=2 | - | - | - | - |") for line in text.splitlines()) == 2
     trained = load_config(out / "baseline" / "seed0" / "config.yaml")
     assert (trained.train.learning_rate, trained.model.spec.grid.zones) == (2e-3, 1)
     weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
@@ -51,6 +55,13 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.
 
     with pytest.raises(TrainingError, match="another base configuration or data"):
         ablate(config, data=data, out=out, seeds="0", variants="baseline")
+
+
+def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(tmp_path: Path, config: str) -> None:
+    data, names = write_dataset(tmp_path / "data", 14, val_frames=8), "asp_k3_pooled_cpa_channel_fine"
+    any_zones = ["model.spec.grid.x_range_m=[4.8, 20.16]"]
+    ablate(config, data=data, out=tmp_path / "out", override=any_zones, seeds="0", variants=names)
+    assert "| K=3 pooled | channel | - | fine | - |" in (tmp_path / "out" / "results.md").read_text()
 
 
 def test_a_failed_run_names_its_log(tmp_path: Path, config: str) -> None:

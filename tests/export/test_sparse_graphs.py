@@ -20,7 +20,7 @@ from asca_pillars.config import PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.models.pillar.pillar_preparation import Placement, batch_pillars
 from asca_pillars.pillars.pillarize import Pillars
 from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables, table_inputs
 from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
@@ -48,7 +48,7 @@ def tables_of(pillars: Pillars, rule: str) -> NeckTables[np.ndarray]:
 
 def sample_of(detector: PillarDetector, pillars: Pillars) -> SparseSample:
     assert isinstance(detector.neck, SparseRPNNeck)
-    batch = batch_pillars([pillars], [tables_of(pillars, detector.neck.rule)])
+    batch = batch_pillars([pillars], [Placement(None, tables_of(pillars, detector.neck.rule))])
     assert batch.neck is not None
     with torch.inference_mode():
         return SparseSample(detector.encode(batch.features, batch.pillar_index, batch.point_counts), batch.neck)

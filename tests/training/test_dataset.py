@@ -16,7 +16,7 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, PreparedPillars
+from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, Placement, PreparedPillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
@@ -183,7 +183,7 @@ def samples(root: Path) -> list[Sample]:
     nothing = assign_targets(SPEC.anchors, SPEC.classes, empty.boxes, empty.labels)
     return [
         frames.sample(0, 0),
-        Sample(empty, PreparedPillars(SPEC.pillarize(empty.points), nothing)),
+        Sample(empty, PreparedPillars(SPEC.pillarize(empty.points), Placement(None, None), nothing)),
         frames.sample(0, 1),
     ]
 
@@ -205,7 +205,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
     assert all(boxes is sample.frame.boxes for boxes, sample in zip(batch.boxes, chosen, strict=True))
     assert all(labels is sample.frame.labels for labels, sample in zip(batch.labels, chosen, strict=True))
 
-    features, pillar_index, point_counts, cells, frame_pillars, _ = pillar_batch
+    features, pillar_index, point_counts, cells, frame_pillars, *_ = pillar_batch
     assert list(frame_pillars) == [len(sample.prepared.pillars.cells) for sample in chosen]
     first_pillar = first_point = first_positive = 0
     for i, sample in enumerate(chosen):
@@ -237,7 +237,7 @@ def test_a_batch_moves_as_a_whole(tmp_path: Path) -> None:
     assert isinstance(batch.inputs, LabeledPillars)
     frame_pillars = list(batch.inputs.pillars.frame_pillars)
     assert batch.to("meta") is batch
-    *tensors, found, _ = batch.inputs.pillars
+    *tensors, found, _, _, _ = batch.inputs.pillars
     assert {tensor.device.type for tensor in (*tensors, *batch.inputs.targets)} == {"meta"}
     assert list(found) == frame_pillars and isinstance(batch.boxes[0], np.ndarray)
 

@@ -4,13 +4,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from asca_pillars.config import LossConfig, PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.models.pillar.encoder import PillarEncoder
+from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
 from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pillar.loss import detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
@@ -62,13 +63,17 @@ class PillarDetector(nn.Module):
         """Pillars of B frames -> head maps (B, channels, H, W) of logits and residuals.
 
         With a sparse neck: rows (M, channels) of the active head cells, see `SSDHead`.
+
+        Raises:
+            ValueError: the batch was made without the placements of `self.preparation`, which this detector needs.
         """
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
-        if batch.neck is not None and not pillar_features.is_cuda:
-            return self.head.at_cells(self.neck(pillar_features, batch.neck))
-        canvas = self.scatter(pillar_features, batch.cells, batch.frame_pillars)  # (B, C, ny, nx)
+        features, cells, frame_cells = self.pool(pillar_features, batch)
+        if batch.neck is not None and not features.is_cuda:
+            return self.head.at_cells(self.neck(features, batch.neck))
+        canvas = self.scatter(features, cells, frame_cells)  # (B, C, rows, columns)
         if batch.neck is not None:  # where a dense convolution costs less than gathering
             assert isinstance(self.neck, SparseRPNNeck)
             return self.head.at_cells(self.neck.forward_dense(canvas, batch.neck))
@@ -102,15 +107,28 @@ class PillarDetector(nn.Module):
             first += rows
         return found
 
-    def scatter(self, pillar_features: Tensor, cells: Tensor, frame_pillars: Sequence[int]) -> Tensor:
-        """Put each pillar's features at its cell of an empty pseudo-image: (P, C) -> (B, C, ny, nx)."""
-        ny, nx = self.grid.ny, self.grid.nx
-        frames, channels = len(frame_pillars), pillar_features.shape[1]
-        frame_starts = cells.new_tensor([frame * ny * nx for frame in range(frames)])
-        row = cells + frame_starts.repeat_interleave(cells.new_tensor(frame_pillars))
+    def pool(self, pillar_features: Tensor, batch: PillarBatch) -> tuple[Tensor, Tensor, Sequence[int]]:
+        """Pillar features (P, C) -> features (M, C) and cells (M,) of the map, and how many each frame has.
+
+        See `pillars.map_pooling`; without a pooled map pillars and cells are the same.
+        """
+        if self.grid.pools != (batch.pooling is not None) or isinstance(self.neck, RPNNeck) != (batch.neck is None):
+            raise ValueError("the batch was placed for another map or neck; use `preparation.place` of this detector")
+        if batch.pooling is None:
+            return pillar_features, batch.cells, batch.frame_pillars
+        cells, pillars, counts = batch.pooling
+        cell_index = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+        return pillar_max(pillar_features[pillars], cell_index, counts), cells, batch.frame_cells
+
+    def scatter(self, features: Tensor, cells: Tensor, frame_cells: Sequence[int]) -> Tensor:
+        """Put features at their cells of an empty pseudo-image: (M, C) -> (B, C, rows, columns)."""
+        rows, columns = self.grid.map_shape
+        frames, channels = len(frame_cells), features.shape[1]
+        frame_starts = cells.new_tensor([frame * rows * columns for frame in range(frames)])
+        row = cells + frame_starts.repeat_interleave(cells.new_tensor(frame_cells))
         # Channels last in memory: a pillar is one contiguous row here, and convolutions on a CPU prefer it.
-        canvas = pillar_features.new_zeros(frames * ny * nx, channels).index_put((row,), pillar_features)
-        return canvas.view(frames, ny, nx, channels).permute(0, 3, 1, 2)
+        canvas = features.new_zeros(frames * rows * columns, channels).index_put((row,), features)
+        return canvas.view(frames, rows, columns, channels).permute(0, 3, 1, 2)
 
 
 def build_pillar_detector(model: PillarModel) -> PillarDetector:

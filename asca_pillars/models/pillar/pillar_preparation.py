@@ -13,17 +13,30 @@ from torch.utils._pytree import tree_map_only
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.targets import Targets, assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch
+from asca_pillars.pillars.map_pooling import MapCells, map_cells
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import Pillars
 from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, NeckTables, stack_neck_tables
 
 
+class Placement(NamedTuple):
+    """What the neck is told of where a frame's pillars stand.
+
+    Attributes:
+        pooling: of a pooled map; None where pillars and cells are the same.
+        tables: of a sparse neck; None for a dense one.
+    """
+
+    pooling: MapCells[NDArray[np.int64]] | None
+    tables: NeckTables[NDArray[np.int32]] | None
+
+
 class PreparedPillars(NamedTuple):
-    """One frame: its pillars, the targets of its anchors, and the tables of a sparse neck."""
+    """One frame: its pillars, where they stand on the map, and the targets of its anchors."""
 
     pillars: Pillars
+    placement: Placement
     targets: Targets
-    tables: NeckTables[NDArray[np.int32]] | None = None
 
 
 class PillarBatch(NamedTuple):
@@ -36,6 +49,9 @@ class PillarBatch(NamedTuple):
         cells: (P,) flat index (row * nx + column) of each pillar in its own frame.
         frame_pillars: pillars of each frame.
         neck: what a sparse neck reads; None for the dense one.
+        pooling: cells of a pooled map (in their own frame) and their pillars (counted through the batch); None where
+            pillars and cells are the same.
+        frame_cells: cells of the map that each frame occupies; without pooling its pillars.
     """
 
     features: Tensor
@@ -44,6 +60,8 @@ class PillarBatch(NamedTuple):
     cells: Tensor
     frame_pillars: Sequence[int]
     neck: NeckTables[Tensor] | None = None
+    pooling: MapCells[Tensor] | None = None
+    frame_cells: Sequence[int] = ()
 
 
 class LabeledPillars(NamedTuple):
@@ -75,29 +93,37 @@ class PillarPreparation:
         spec = self.spec
         pillars = spec.pillarize(frame.points, rng)
         targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
-        return PreparedPillars(pillars, targets, self.tables(pillars))
+        return PreparedPillars(pillars, self.place(pillars), targets)
 
     def collate(self, frames: Sequence[PreparedPillars]) -> LabeledPillars:
         """Frames as one batch."""
         return LabeledPillars(
-            batch_pillars([frame.pillars for frame in frames], [frame.tables for frame in frames]),
+            batch_pillars([frame.pillars for frame in frames], [frame.placement for frame in frames]),
             _batch_targets([frame.targets for frame in frames]),
         )
 
-    def tables(self, pillars: Pillars) -> NeckTables[NDArray[np.int32]] | None:
-        """What a sparse neck reads of a frame besides the features; None for a dense one."""
-        if self.active_cells is None:
-            return None
+    def place(self, pillars: Pillars) -> Placement:
+        """What the neck reads of a frame besides the features."""
         grid = self.spec.grid
-        return NeckTableBuilder(grid.ny, grid.nx, self.active_cells, training=True).build(pillars.cells)
+        pooling = map_cells(pillars.cells, grid)
+        if self.active_cells is None:
+            return Placement(pooling, None)
+        builder = NeckTableBuilder(*grid.map_shape, self.active_cells, training=True)
+        return Placement(pooling, builder.build(pillars.cells if pooling is None else pooling.cells))
 
 
-def batch_pillars(
-    frames: Sequence[Pillars], tables: Sequence[NeckTables[NDArray[np.int32]] | None] = ()
-) -> PillarBatch:
-    """Pillars of several frames, one frame's after the other's, and the tables of each for a sparse neck."""
+def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = ()) -> PillarBatch:
+    """Pillars of several frames, one frame's after the other's.
+
+    Args:
+        frames: at least one.
+        placements: of each frame; without them the neck is dense and its map the pillars' own.
+    """
     frame_pillars = [len(frame.cells) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(frame_pillars)[:-1]]).astype(np.int64)
+    poolings = [each.pooling for each in placements if each.pooling is not None]
+    tables = [each.tables for each in placements if each.tables is not None]
+    frame_cells = [len(each.cells) for each in poolings] or frame_pillars
     return PillarBatch(
         features=torch.from_numpy(np.concatenate([frame.features for frame in frames])),
         pillar_index=torch.from_numpy(
@@ -106,17 +132,32 @@ def batch_pillars(
         point_counts=torch.from_numpy(np.concatenate([frame.point_counts for frame in frames])),
         cells=torch.from_numpy(np.concatenate([frame.cells for frame in frames])),
         frame_pillars=frame_pillars,
-        neck=_batch_tables([each for each in tables if each is not None], frame_pillars),
+        neck=_batch_tables(tables, frame_cells),
+        pooling=_batch_poolings(poolings, starts),
+        frame_cells=frame_cells,
     )
 
 
 def _batch_tables(
-    tables: Sequence[NeckTables[NDArray[np.int32]]], frame_pillars: Sequence[int]
+    tables: Sequence[NeckTables[NDArray[np.int32]]], frame_cells: Sequence[int]
 ) -> NeckTables[Tensor] | None:
     if not tables:
         return None
-    batch: NeckTables[Tensor] = tree_map_only(np.ndarray, torch.from_numpy, stack_neck_tables(tables, frame_pillars))
+    batch: NeckTables[Tensor] = tree_map_only(np.ndarray, torch.from_numpy, stack_neck_tables(tables, frame_cells))
     return batch
+
+
+def _batch_poolings(
+    poolings: Sequence[MapCells[NDArray[np.int64]]], first_pillars: NDArray[np.int64]
+) -> MapCells[Tensor] | None:
+    if not poolings:
+        return None
+    rows = [each.pillars + first for each, first in zip(poolings, first_pillars, strict=True)]
+    return MapCells(
+        torch.from_numpy(np.concatenate([each.cells for each in poolings])),
+        torch.from_numpy(np.concatenate(rows)),
+        torch.from_numpy(np.concatenate([each.counts for each in poolings])),
+    )
 
 
 def _batch_targets(frames: Sequence[Targets]) -> TargetBatch:

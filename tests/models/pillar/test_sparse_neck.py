@@ -12,7 +12,7 @@ from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch, detection_loss
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, PillarOutputs, build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, batch_pillars
+from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, Placement, batch_pillars
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.tables.neck_tables import NeckTableBuilder
 from tests.scenes import SPEC, make_scene
@@ -33,7 +33,7 @@ def make_batch(rule: str | None, seeds: tuple[int, ...] = (0, 1), *, training: b
     if rule is None:
         return batch_pillars(frames)
     builder = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule, training=training)  # type: ignore[arg-type]
-    return batch_pillars(frames, [builder.build(frame.cells) for frame in frames])
+    return batch_pillars(frames, [Placement(None, builder.build(frame.cells)) for frame in frames])
 
 
 def dense_rows(detector: PillarDetector, batch: PillarBatch) -> torch.Tensor:
@@ -78,7 +78,7 @@ def test_where_everything_is_active_it_is_the_dense_neck() -> None:
     ny, nx = SPEC.grid.ny, SPEC.grid.nx
     features = torch.randn(ny * nx, 8, dtype=torch.float64)
     tables = NeckTableBuilder(ny, nx, "fine").build(np.arange(ny * nx))
-    (batch,) = [batch_pillars([SPEC.pillarize(make_scene(0)[0])], [tables])]
+    (batch,) = [batch_pillars([SPEC.pillarize(make_scene(0)[0])], [Placement(None, tables)])]
     assert isinstance(sparse.neck, SparseRPNNeck) and isinstance(dense.neck, RPNNeck) and batch.neck is not None
     with torch.no_grad():
         expected = dense.neck(features.view(1, ny, nx, 8).permute(0, 3, 1, 2))
