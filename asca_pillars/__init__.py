@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from asca_deploy import Bundle, Detector, load_bundle
+    from asca_pillars.data.mounting import Mounting
     from asca_pillars.data.scans.scan_reader import Scan, read_scan
     from asca_pillars.errors import AscaError
     from asca_pillars.geometry.detections import Detection, Detections
@@ -27,6 +28,7 @@ __all__ = [
     "Detections",
     "Detector",
     "FrameReport",
+    "Mounting",
     "Scan",
     "__version__",
     "load_bundle",
@@ -40,6 +42,7 @@ _HOMES = {
     "Detections": "asca_pillars.geometry.detections",
     "Detector": "asca_deploy",
     "FrameReport": "asca_pillars.geometry.frame_report",
+    "Mounting": "asca_pillars.data.mounting",
     "Scan": "asca_pillars.data.scans.scan_reader",
     "load_bundle": "asca_deploy",
     "read_scan": "asca_pillars.data.scans.scan_reader",

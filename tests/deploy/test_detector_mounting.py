@@ -95,6 +95,22 @@ def test_a_turned_scan_gives_turned_boxes() -> None:
     np.testing.assert_allclose(found.scores[other], expected.scores[order], atol=0.02)
 
 
+def test_a_car_on_a_seam_is_found_once() -> None:
+    """The sample turned so that each of its clearest cars stands between two passes, and a little to either side."""
+    points = read_scan(sample_scan_path()).points
+    detector = Detector(view="around")
+    found = detector(points)
+    cars = found[(found.labels == 0) & (found.distances_m < 25)][:3]
+    assert len(cars) == 3 and cars.scores.min() > 0.8
+    for car, off_seam_deg in zip(cars, (-2, 0, 2), strict=True):
+        turn = FrameChange.turn(np.radians(45 + off_seam_deg) - np.arctan2(car.y_m, car.x_m))
+        here = turn.boxes(car.box[None])[0]
+        again = detector(turn.points(points))
+        near = np.hypot(*(again.boxes[:, :2] - here[:2]).T) < 2
+        assert near.sum() == 1
+        assert again.labels[near] == 0
+
+
 def test_streams_and_threads_find_the_same_around(tiny_bundle: Path, scans: list[Points]) -> None:
     detector = Detector(tiny_bundle, view="around", mounting=Mounting(axes="y-forward"))
     alone = [detector(points) for points in scans]
