@@ -118,10 +118,6 @@ class BoxSplit:
         """The frame's scan."""
         return self._frames[frame_id].scan
 
-    def scan_name(self, frame_id: str) -> str:
-        """The scan as a label line names it: its path below `scans_folder`."""
-        return self.scan_path(frame_id).relative_to(self.scans_folder).as_posix()
-
     def input_paths(self, frame_id: str) -> tuple[Path, ...]:
         """The scan and the file that holds its labels."""
         return self._frames[frame_id].scan, self._frames[frame_id].label_file

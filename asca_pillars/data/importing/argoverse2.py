@@ -35,8 +35,8 @@ def read_argoverse2(root: Path) -> Imported:
 
 def _frames(log: Path) -> list[ImportedFrame]:
     path = log / "annotations.feather"
-    names = ("timestamp_ns", "track_uuid", "category", *_CENTER, *_SIZE, *_TURN)
-    table = feather_table(path, names, DatasetError)
+    numbers = ("timestamp_ns", *_CENTER, *_SIZE, *_TURN)
+    table = feather_table(path, numbers, ("track_uuid", "category"), DatasetError)
     w, x, y, z = (table[name] for name in _TURN)
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     boxes = np.column_stack([*(table[name] for name in (*_CENTER, *_SIZE)), yaw]).astype(np.float64)

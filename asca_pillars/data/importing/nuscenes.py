@@ -51,6 +51,14 @@ def read_nuscenes(root: Path) -> Imported:
     """
     tables = _tables_folder(root)
     data = tables.parent.resolve()
+    try:
+        frames = _frames(tables, data)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{tables}: the tables do not fit together (at {error}); download them again") from None
+    return Imported(BoxDataset(scans=str(data), axes="y-forward", columns=5, reflectance_scale=255.0), frames)
+
+
+def _frames(tables: Path, data: Path) -> list[ImportedFrame]:
     poses, sensors = _table(tables, "ego_pose"), _table(tables, "calibrated_sensor")
     samples, scenes = _table(tables, "sample"), _table(tables, "scene")
     channels = {token: row["channel"] for token, row in _table(tables, "sensor").items()}
@@ -67,7 +75,7 @@ def read_nuscenes(root: Path) -> Imported:
             continue
         records = _records(labels.get(row["sample_token"], []), poses[row["ego_pose_token"]], sensor, kinds)
         frames.append(ImportedFrame(scan, records, scenes[samples[row["sample_token"]]["scene_token"]]["name"]))
-    return Imported(BoxDataset(scans=str(data), axes="y-forward", columns=5, reflectance_scale=255.0), frames)
+    return frames
 
 
 def _records(

@@ -25,6 +25,7 @@ MATCHED = 0.6  # share of the boxes that an anchor should overlap by positive_io
 POSITIVE_IOUS = (0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3)
 NEGATIVE_BELOW = 0.15  # negative_iou below positive_iou, as for KITTI's classes
 BEHIND_M = -5.0  # boxes beyond this need a grid that looks back
+FINDABLE_POINTS = 5  # ranges are those of the boxes with so many: far ones with fewer would make the grid huge
 SPARE_PILLARS = 1.1  # room above the fullest scan
 
 _Floats = NDArray[np.float64]
@@ -56,12 +57,14 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
     chosen = [ids[number * len(ids) // min(frames, len(ids))] for number in range(min(frames, len(ids)))]
     clouds = []
     found: dict[str, list[NDArray[np.float32]]] = {}
+    findable: dict[str, list[NDArray[np.float32]]] = {}
     for frame_id in track(chosen, "Measuring", disable=not progress, transient=True):
         points = split.points(frame_id, camera_view=config.data.camera_view)
         boxes, types = split.labeled_boxes(frame_id)
-        visible = points_in_boxes(points, boxes).sum(axis=0) >= max(config.data.min_points, 1)
-        for box, kind, seen in zip(boxes, types, visible, strict=True):
-            found.setdefault(kind, []).extend([box] if seen else [])
+        inside = points_in_boxes(points, boxes).sum(axis=0)
+        for box, kind, held in zip(boxes, types, inside.tolist(), strict=True):
+            found.setdefault(kind, []).extend([box] if held >= max(config.data.min_points, 1) else [])
+            findable.setdefault(kind, []).extend([box] if held >= FINDABLE_POINTS else [])
         clouds.append(points)
     counts = {kind: len(own) for kind, own in sorted(found.items(), key=lambda item: -len(item[1]))}
     names = [kind for kind, count in counts.items() if count >= FEWEST_BOXES]
@@ -71,7 +74,8 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
             f"{split.root}: no type has {FEWEST_BOXES} boxes with points (there are: {there}); add frames"
         )
     measured = {kind: np.array(found[kind], np.float64) for kind in names}
-    grid = _grid(config.model.spec.grid, np.concatenate(list(measured.values())))
+    of_classes = [np.array(findable[kind] or found[kind], np.float64) for kind in names]
+    grid = _grid(config.model.spec.grid, np.concatenate(of_classes))
     classes = tuple(_class(kind, boxes, grid) for kind, boxes in measured.items())
     fullest = max(len(np.unique(cells[cells >= 0])) for cells in map(grid.cells, clouds))
     limits = config.model.spec.limits

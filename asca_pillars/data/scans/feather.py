@@ -16,13 +16,20 @@ def read_feather(path: Path) -> StoredPoints:
         ScanError: no feather file, or one without these columns.
         AscaError: pyarrow is not installed.
     """
-    table = feather_table(path, ("x", "y", "z", "intensity"), ScanError)
+    table = feather_table(path, ("x", "y", "z", "intensity"), (), ScanError)
     xyz = np.column_stack([table[name] for name in "xyz"]).astype(np.float32)
     return StoredPoints(xyz, table["intensity"], table["intensity"].dtype)
 
 
-def feather_table(path: Path, columns: tuple[str, ...], error: type[AscaError]) -> dict[str, Any]:
-    """The named columns of a feather file, each an array (N,); `error` if they are not there."""
+def feather_table(
+    path: Path, numbers: tuple[str, ...], texts: tuple[str, ...], error: type[AscaError]
+) -> dict[str, Any]:
+    """Columns of numbers and columns of texts of a feather file, each an array (N,).
+
+    Raises:
+        AscaError: pyarrow is not installed.
+        error: no feather file, or a column is missing or of another kind.
+    """
     try:
         import pyarrow
         from pyarrow import feather
@@ -34,8 +41,13 @@ def feather_table(path: Path, columns: tuple[str, ...], error: type[AscaError]) 
         raise error(
             f"{path}: no readable feather file ({' '.join(str(reason).split())[:100]}); copy it again"
         ) from None
-    if missing := [name for name in columns if name not in table.column_names]:
+    if missing := [name for name in (*numbers, *texts) if name not in table.column_names]:
         raise error(
             f"{path}: no column `{missing[0]}` (there are: {', '.join(table.column_names)}); give a file of Argoverse 2"
         )
-    return {name: table[name].to_numpy() for name in columns}
+    arrays = {name: table[name].to_numpy() for name in (*numbers, *texts)}
+    wrong = [name for name in numbers if arrays[name].dtype.kind not in "iuf"]
+    wrong += [name for name in texts if not all(isinstance(value, str) for value in arrays[name])]
+    if wrong:
+        raise error(f"{path}: column `{wrong[0]}` is not what Argoverse 2 has there; copy the file again")
+    return arrays

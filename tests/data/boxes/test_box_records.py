@@ -1,6 +1,8 @@
 """Records of boxes in JSON and CSV: every form gives the same boxes, and what is wrong is named by file and line."""
 
 import json
+import re
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,15 @@ def test_all_forms_give_the_same_boxes(tmp_path: Path) -> None:
     for records in found:
         assert np.array_equal(records.boxes, ARRAY) and records.types == ("Forklift",)
         assert np.isnan(records.scores).all() and records.track_ids == (None,)
+
+
+def test_the_examples_of_the_documentation_are_what_they_say(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "DATA.md").read_text(encoding="utf-8")
+    blocks = [textwrap.dedent(block) for block in re.findall(r"^  ```\n(.*?)^  ```$", text, re.DOTALL | re.MULTILINE)]
+    table, lines = write(tmp_path / "l.csv", blocks[0]), write(tmp_path / "l.jsonl", blocks[1])
+    for frame in (next(read_frames(table)), next(read_frames(lines))):
+        assert frame.scan == "000000.bin" and frame.records.types == ("Forklift",)
+        assert frame.records.boxes[0].tolist() == pytest.approx([12.1, -3.0, -0.7, 2.5, 1.2, 2.1, 0.3])
 
 
 def test_scores_and_tracks_are_kept(tmp_path: Path) -> None:

@@ -92,6 +92,15 @@ def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     with pytest.raises(DatasetError, match=r"no annotations\.feather below"):
         run(tmp_path, tmp_path / "out", "--from", "argoverse2")
+    from pyarrow import feather, table
+
+    columns = {name: ["?"] if name == "y" else [1.0] for name in ("x", "y", "z", "intensity")}
+    feather.write_feather(table(columns), tmp_path / "2.feather")
+    with pytest.raises(ScanError, match=r"2\.feather: column `y` is not what Argoverse 2 has there"):
+        read_scan(tmp_path / "2.feather")
+    feather.write_feather(table({"x": [1.0]}), tmp_path / "2.feather")
+    with pytest.raises(ScanError, match=r"2\.feather: no column `y` \(there are: x\)"):
+        read_scan(tmp_path / "2.feather")
     (tmp_path / "1.feather").write_bytes(b"no feather")
     with pytest.raises(ScanError, match=r"1\.feather: no readable feather file"):
         read_scan(tmp_path / "1.feather")
@@ -169,6 +178,12 @@ def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
     source = write_nuscenes(tmp_path / "nuscenes")
     with pytest.raises(DatasetError, match=r"one v1\.0-\*/ with nuScenes' tables is needed, there is none"):
         read_nuscenes(tmp_path)
+    poses = source / "v1.0-mini" / "ego_pose.json"
+    whole = poses.read_text()
+    poses.write_text(whole.replace("translation", "somewhere"))
+    with pytest.raises(DatasetError, match=r"v1\.0-mini: the tables do not fit together \(at 'translation'\)"):
+        read_nuscenes(source)
+    poses.write_text(whole)
     table = source / "v1.0-mini" / "scene.json"
     table.write_text("[7]")
     with pytest.raises(DatasetError, match=r"scene\.json: no table of nuScenes"):

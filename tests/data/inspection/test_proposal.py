@@ -119,3 +119,18 @@ def test_a_class_without_labels_points_to_it(tmp_path: Path) -> None:
     root = write_around(tmp_path / "own", 20, reach_m=30)
     with pytest.raises(AscaError, match="let --propose measure the classes that there are"):
         CliRunner().invoke(app, ["inspect", str(root), "-c", "asca_small_sim"], catch_exceptions=False)
+
+
+def test_boxes_with_hardly_a_point_do_not_widen_the_grid(tmp_path: Path) -> None:
+    root = write_box_dataset(tmp_path, 12)
+    far = np.array([[200.0, 0, -1, 2.5, 1.2, 2, 0]])
+    lines = []
+    for number in range(12):
+        path = root / "scans" / f"{number:06d}.bin"
+        points = np.fromfile(path, "<f4").reshape(-1, 4)
+        np.concatenate([points, [[200, 0, -1, 0.5]]]).astype("<f4").tofile(path)
+        near = BoxSplit(root).labeled_boxes(f"{number:06d}").boxes
+        lines.append(json_line(path.name, records_from(np.concatenate([near, far]), ["Car", "Forklift", "Forklift"])))
+    (root / "labels.jsonl").write_text("".join(lines))
+    proposal = propose(BoxSplit(root), CONFIG)
+    assert proposal.boxes["Forklift"] == 24 and proposal.config.model.spec.grid == SPEC.grid
