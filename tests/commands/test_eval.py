@@ -1,12 +1,10 @@
 """`asca eval` as a whole: text folders, a bundle and a checkpoint, what is written, and what is refused in one line."""
 
 import json
-import logging
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -42,15 +40,6 @@ sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in s
 from asca_pillars.commands.eval import evaluate
 evaluate(predictions=Path("det"), labels=Path("gt"), out=Path("out"))
 """
-
-
-@pytest.fixture(autouse=True)
-def log_level() -> Iterator[None]:
-    """The command silences the runtime's log for the rest of its process, which here goes on with other tests."""
-    log = logging.getLogger("asca_deploy")
-    before = log.level
-    yield
-    log.setLevel(before)
 
 
 def evaluate(

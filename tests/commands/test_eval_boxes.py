@@ -1,8 +1,6 @@
 """`asca eval` on a dataset without a camera: what is written, that it scores the same again, and what is refused."""
 
 import json
-import logging
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,15 +11,6 @@ from asca_pillars.data.boxes.box_records import json_line, read_frames
 from asca_pillars.errors import AscaError
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import write_dataset
-
-
-@pytest.fixture(autouse=True)
-def log_level() -> Iterator[None]:
-    """The command silences the runtime's log for the rest of its process."""
-    log = logging.getLogger("asca_deploy")
-    before = log.level
-    yield
-    log.setLevel(before)
 
 
 @pytest.fixture
@@ -51,7 +40,7 @@ def run(*arguments: object) -> str:
 def test_labels_as_predictions_are_perfect_by_iou_and_distance(root: Path, perfect: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     output = run("--data", root, "--predictions", perfect, "--out", out)  # iou: there is no camera
-    assert "AP by IoU" in output and "2 frames" in output
+    assert "AP by 3D and BEV IoU" in output and "2 frames" in output
     report = json.loads((out / "iou.json").read_text())
     assert {score["class_name"] for score in report["iou"]} == {"Car", "Forklift"}
     assert {score["ap"] for score in report["iou"] if score["band"] == "all"} == {100.0}
