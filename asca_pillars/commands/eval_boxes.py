@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_steps import COMMAND, MADE_BY, TEXT_SCORE, claim
+from asca_pillars.commands.eval_steps import COMMAND, MADE_BY, TEXT_SCORE, claim, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -92,13 +92,7 @@ def _run(model: Model, split: LabeledSplit, task: BoxTask, console: Console) -> 
         write_box_predictions(folder / PREDICTIONS, split, model.detect, console=console)
         about = {"model": model.about, "data": str(split.root), "split": split.name, "files": [PREDICTIONS]}
         write_json(folder / MADE_BY, about)
-    if model.unlike:
-        console.print(
-            f"{len(model.unlike)} of {len(split.frame_ids)} scans are unlike those that {model.name} was trained on; "
-            f"the first: {model.unlike[0]}",
-            style="yellow",
-            soft_wrap=True,
-        )
+    warn_of_unlike_scans(model, len(split.frame_ids), console)
     return read_box_predictions(task.out / "predictions" / PREDICTIONS, split, console=console)
 
 

@@ -149,6 +149,17 @@ def fixed_scores(model: Model, score: float | None, min_score: float) -> dict[st
     return scores
 
 
+def warn_of_unlike_scans(model: Model, scans: int, console: Console) -> None:
+    """Say how many of the scans are not like those of the training, if any."""
+    if model.unlike:
+        console.print(
+            f"{len(model.unlike)} of {scans} scans are unlike those that {model.name} was trained on; "
+            f"the first: {model.unlike[0]}",
+            style="yellow",
+            soft_wrap=True,
+        )
+
+
 def run_model(
     model: Model, split: KittiSplit, labels: Path, scores: dict[str, float], out: Path, console: Console
 ) -> Task:
@@ -157,13 +168,7 @@ def run_model(
     with atomic_directory(out / "predictions", COMMAND, MADE_BY) as folder:
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
         write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
-    if model.unlike:
-        console.print(
-            f"{len(model.unlike)} of {len(split.frame_ids)} scans are unlike those that {model.name} was trained on; "
-            f"the first: {model.unlike[0]}",
-            style="yellow",
-            soft_wrap=True,
-        )
+    warn_of_unlike_scans(model, len(split.frame_ids), console)
     subject = f"{model.name} on {split.root}, {split.name}"
     return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
 

@@ -20,7 +20,7 @@ def import_dataset(
     ] = "boxes",
     scans: Annotated[Path | None, typer.Option("--scans", help="Folder of the scans; with --from boxes.")] = None,
     val_share: Annotated[
-        float, typer.Option("--val-share", min=0, max=0.9, help="Share of the recordings in ImageSets/val.txt.")
+        float, typer.Option("--val-share", min=0.01, max=0.9, help="Share of the recordings in ImageSets/val.txt.")
     ] = 0.2,
 ) -> None:
     """Make a dataset of scans with boxes that train, inspect, prepare and eval read; no camera is needed.

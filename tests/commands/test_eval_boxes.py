@@ -40,7 +40,7 @@ def run(*arguments: object) -> str:
 def test_labels_as_predictions_are_perfect_by_iou_and_distance(root: Path, perfect: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     output = run("--data", root, "--predictions", perfect, "--out", out)  # iou: there is no camera
-    assert "AP by IoU" in output and "2 frames" in output
+    assert "AP by 3D and BEV IoU" in output and "2 frames" in output
     report = json.loads((out / "iou.json").read_text())
     assert {score["class_name"] for score in report["iou"]} == {"Car", "Forklift"}
     assert {score["ap"] for score in report["iou"] if score["band"] == "all"} == {100.0}

@@ -1,12 +1,9 @@
 """Own classes on scans without a camera, end to end: propose, train, eval, export, detect."""
 
 import json
-import logging
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import yaml
 from typer.testing import CliRunner
 
@@ -18,15 +15,6 @@ from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.schema import to_dict
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.training.test_loop import CONFIG
-
-
-@pytest.fixture(autouse=True)
-def log_level() -> Iterator[None]:
-    """`asca eval` silences the runtime's log for the rest of its process."""
-    log = logging.getLogger("asca_deploy")
-    before = log.level
-    yield
-    log.setLevel(before)
 
 
 def run(*arguments: object) -> str:

@@ -122,8 +122,10 @@ def _iou_table(report: BoxReport) -> TextTable:
         values: dict[tuple[str, float], float | None] = {(item.metric, item.min_iou): item.ap for item in own}
         rows.append((name, str(own[0].objects), *(_percent(values[column]) for column in columns)))
     means = [_mean([item.ap for item in everywhere if (item.metric, item.min_iou) == column]) for column in columns]
-    heads = [f"{titles[metric]}\nIoU {least:g}" for metric, least in columns]
-    return TextTable("AP by IoU", ("class", "objects", *heads), (*rows, ("mean", "", *map(_percent, means))), left=1)
+    heads = [f"{titles[metric]}\n{least:g}" for metric, least in columns]
+    return TextTable(
+        "AP by 3D and BEV IoU", ("class", "objects", *heads), (*rows, ("mean", "", *map(_percent, means))), left=1
+    )
 
 
 def _nuscenes_table(report: BoxReport) -> TextTable:
@@ -132,10 +134,10 @@ def _nuscenes_table(report: BoxReport) -> TextTable:
     for item in own:
         each = [None] * len(DISTANCES_M) if item.ap_by_distance is None else list(item.ap_by_distance)
         own_errors = (_decimal(item.ate_m), _decimal(item.ase), _decimal(item.aoe_rad))
-        rows.append((item.class_name, str(item.objects), _percent(item.ap), *map(_percent, each), *own_errors))
-    mean = ("mean", "", _percent(_mean([item.ap for item in own])))
+        rows.append((item.class_name, _percent(item.ap), *map(_tenth, each), *own_errors))
+    mean = ("mean", _percent(_mean([item.ap for item in own])))
     errors = [_decimal(_mean([getattr(item, name) for item in own])) for name in ("ate_m", "ase", "aoe_rad")]
-    heads = ("class", "objects", "AP", *(f"AP\n{limit:g} m" for limit in DISTANCES_M), "ATE\nm", "ASE", "AOE\nrad")
+    heads = ("class", "AP", *(f"AP\n{limit:g} m" for limit in DISTANCES_M), "ATE\nm", "ASE", "AOE\nrad")
     return TextTable("nuScenes' metrics", heads, (*rows, (*mean, *[""] * len(DISTANCES_M), *errors)), left=1)
 
 
@@ -201,6 +203,10 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
+
+
+def _tenth(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
 
 
 def _decimal(value: float | None) -> str:
