@@ -1,8 +1,6 @@
 """Scans of another sensor on the command line: axes, height, pose, scale, columns, all around."""
 
 import json
-import logging
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +23,6 @@ def detect(tmp_path: Path, *arguments: object) -> tuple[Result, list[dict]]:
     result = CliRunner().invoke(app, ["detect", "--out", str(out), *map(str, arguments)])
     lines = (out / "detections.jsonl").read_text().splitlines() if result.exit_code == 0 else []
     return result, [json.loads(line) for line in lines]
-
-
-@pytest.fixture(autouse=True)
-def _log_level() -> Iterator[None]:
-    """The command silences the detector's log for the rest of its process, which here is ours."""
-    logger = logging.getLogger("asca_deploy")
-    level = logger.level
-    yield
-    logger.setLevel(level)
 
 
 @pytest.fixture(scope="module")
