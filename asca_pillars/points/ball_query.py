@@ -32,8 +32,8 @@ def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, sam
     are all of one ring. A query with fewer points repeats its first; one without any gets N.
 
     Args:
-        points: (N, 3 or more) finite x, y, z in metres; N may be 0.
-        queries: (Q, 3 or more) finite x, y, z in metres, anywhere.
+        points: (N, >=3) finite x, y, z in metres; N may be 0.
+        queries: (Q, >=3) finite x, y, z in metres, anywhere.
         radius_m: squared distances in float32 must be below its square.
 
     Raises:

@@ -26,7 +26,7 @@ class Columns(NamedTuple):
 
 
 def require_points(points: NDArray[Any]) -> NDArray[np.float32]:
-    """The positions (N, 3) of points (N, >= 3) as contiguous float32.
+    """The positions (N, 3) of points (N, >=3), metres, as contiguous float32.
 
     Raises:
         ValueError: another shape, or a coordinate that is not finite, which has no column.
@@ -57,7 +57,7 @@ def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
 
 
 def cells_of(xyz: NDArray[np.float32], columns: Columns) -> NDArray[np.int64]:
-    """Row and column of each position (N, 3): (N, 2); beside the points below 0 or beyond `columns.shape`."""
+    """Row and column of positions: (N, 3) in metres -> (N, 2); beside the points below 0 or beyond `columns.shape`."""
     along_x, along_y = (
         np.clip((xyz[:, axis] - low) * columns.per_m, np.float32(-1e6), np.float32(1e6))
         for axis, low in enumerate(columns.origin_m)

@@ -19,7 +19,7 @@ def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
     a new sample can change; it takes the same points.
 
     Args:
-        points: (N, 3 or more) finite x, y, z in metres; N may be 0.
+        points: (N, >=3) finite x, y, z in metres; N may be 0.
         count: how many; fewer come out where there are fewer different positions.
 
     Raises:

@@ -95,7 +95,7 @@ class CellMap:
         self._kernels.list_cells(*self.columns, self.shape[0], self.cells)
 
     def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
-        """Row in `source` that each tap joins with each active cell of this map: (N, K), len(source) for none.
+        """Index of the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
 
         With `Convolution.inputs` it is what the convolution from `source` to this map reads. With `outputs` it is
         the inverse that its backward pass reads: which output, of the map `source`, each input was read by.

@@ -94,7 +94,7 @@ def voxelize(points: NDArray[np.float32], grid: VoxelGrid, cell_map: CellMap) ->
     Sums are float64 in the scan's order, so the means do not depend on the machine.
 
     Args:
-        points: (M, C >= 3) x, y, z in metres, LiDAR frame, and other values.
+        points: (M, >=3) x, y, z in metres, LiDAR frame, and other values.
         grid: where the voxels are.
         cell_map: of the grid's shape; the voxels are its active cells afterwards.
 

@@ -85,7 +85,7 @@ class PillarPreparation:
         )
 
     def tables(self, pillars: Pillars) -> NeckTables[NDArray[np.int32]] | None:
-        """What a sparse neck reads of a frame besides the features; None for a dense one."""
+        """Tables, indices (M, 9), that a sparse neck reads of a frame besides the features; None for a dense one."""
         if self.active_cells is None:
             return None
         grid = self.spec.grid
@@ -95,7 +95,12 @@ class PillarPreparation:
 def batch_pillars(
     frames: Sequence[Pillars], tables: Sequence[NeckTables[NDArray[np.int32]] | None] = ()
 ) -> PillarBatch:
-    """Pillars of several frames, one frame's after the other's, and the tables of each for a sparse neck."""
+    """Pillars of several frames, one frame's after the other's, and the tables of each for a sparse neck.
+
+    Args:
+        frames: each with features (M, 9), positions among them in metres, and flat indices (P,) of its pillars.
+        tables: of indices (M, 9) into the pillars; empty for a dense neck.
+    """
     frame_pillars = [len(frame.cells) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(frame_pillars)[:-1]]).astype(np.int64)
     return PillarBatch(
