@@ -99,7 +99,7 @@ def batch_pillars(
 
     Args:
         frames: each with features (M, 9), positions among them in metres, and flat indices (P,) of its pillars.
-        tables: of indices (M, 9) into the pillars; empty for a dense neck.
+        tables: of indices (M, 9), see `NeckTables`; empty for a dense neck.
     """
     frame_pillars = [len(frame.cells) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(frame_pillars)[:-1]]).astype(np.int64)
