@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.points.load_point_kernels import load_point_kernels
+from asca_pillars.geometry.kernels import load_kernels
 
+KERNELS = "asca_pillars.points.sampling_kernels"
 _MAX_COLUMNS = 1024  # along each axis; beyond it columns grow wider, so that one stray point costs no memory
 
 
@@ -50,7 +51,7 @@ def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
     widest = max(float(last) - float(first) for first, last in zip(low, high, strict=True))
     per_m = np.float32(1 / max(column_m, widest / (_MAX_COLUMNS - 1)))
     nx, ny = (int((last - first) * per_m) + 1 for first, last in zip(low, high, strict=True))
-    kernels = load_point_kernels()
+    kernels = load_kernels(KERNELS)
     sort = _sort if kernels is None else kernels.sort
     order, starts = sort(xyz, low[0], low[1], per_m, ny, nx)
     return Columns(order, starts, low, per_m, (ny, nx))

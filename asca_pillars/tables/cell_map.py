@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.tables.compiled_tables import load_table_kernels
+from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.tables.convolution import Links, Shape
 
+KERNELS = "asca_pillars.tables.table_kernels"
 MAX_Z_CELLS = 64  # the bits of a column's mask
 
 
@@ -53,7 +54,7 @@ class CellMap:
         self.shape = shape
         self.cells: NDArray[np.int64] = np.empty(0, np.int64)
         """(N,) active cells, flat index (y * nx + x) * nz + z, ascending."""
-        self._kernels = load_table_kernels()
+        self._kernels = load_kernels(KERNELS)
         self.columns: Any = None
         if self._kernels is not None:
             columns = shape[1] * shape[2]

@@ -47,6 +47,20 @@ def enter_cells(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
         mask[column] |= _ONE << (np.uint64(cells[i]) - column * np.uint64(nz))
 
 
+@compiled(_CELLS, types.int64, written(types.uint64))
+def mark_points(cells: _Integers, nz: int, mask: _Masks) -> int:
+    """Set the bits of the points' cells, flat indices (M,) or -1, and say how many were not set before."""
+    found = 0
+    for i in range(len(cells)):
+        if cells[i] >= 0:
+            column = cells[i] // nz
+            bit = _ONE << np.uint64(cells[i] - column * nz)
+            if not mask[column] & bit:
+                mask[column] |= bit
+                found += 1
+    return found
+
+
 @compiled(_CELLS, *_LINKS, types.int64, types.int64, written(types.uint64))
 def mark_joined(
     cells: _Integers, z_links: _Integers, y_links: _Integers, x_links: _Integers, ny: int, nx: int, mask: _Masks

@@ -39,20 +39,6 @@ def cells_of_points(
             cells[i] = (y * shape[2] + x) * shape[0] + z
 
 
-@compiled(given(types.int64), types.int64, written(types.uint64))
-def mark_points(cells: _Integers, nz: int, mask: _Masks) -> int:
-    """Set the bits of the points' cells, flat indices (M,) or -1, and say how many were not set before."""
-    found = 0
-    for i in range(len(cells)):
-        if cells[i] >= 0:
-            column = cells[i] // nz
-            bit = _ONE << np.uint64(cells[i] - column * nz)
-            if not mask[column] & bit:
-                mask[column] |= bit
-                found += 1
-    return found
-
-
 @compiled(
     *(given(types.float32, 2), given(types.int64), types.int64, given(types.uint64), given(types.int32), types.int64),
     *(written(types.float64, 2), written(types.int64), written(types.float32, 2)),

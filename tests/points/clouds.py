@@ -15,7 +15,7 @@ def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
     """The function's result where numba is not installed."""
     with ExitStack() as stack:
         for name in _MODULES:
-            stack.enter_context(patch(f"asca_pillars.points.{name}.load_point_kernels", lambda: None))
+            stack.enter_context(patch(f"asca_pillars.points.{name}.load_kernels", lambda _: None))
         return function(*arguments)
 
 
