@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,7 +33,7 @@ from asca_export.sparse_quantize import SparseSample, quantized_backbone
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
+from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import Placement, batch_pillars
 from asca_pillars.system import cpu_model
 from asca_pillars.tables.neck_tables import NeckTableBuilder, table_inputs
@@ -68,6 +69,7 @@ class _Forms:
 
     def __init__(self, config: str, points: NDArray[np.float32], work: Path) -> None:
         dense = random_weights(config, points)
+        assert isinstance(dense.detector, PillarDetector)
         model = dense.config.model
         network, self.spec = replace(model.network, neck="sparse"), model.spec
         self.sparse = build_pillar_detector(replace(model, network=network)).eval()
@@ -102,7 +104,7 @@ class _Forms:
             else:
                 given = {FEATURES: features[feature], **tables}
                 inputs = {name: given[name] for name in session.inputs}
-            steps.append(lambda session=session, inputs=inputs: session.run(HeadMaps._fields, inputs))
+            steps.append(partial(session.run, HeadMaps._fields, inputs))
         return [*steps, lambda: self.tables.build(cells)]
 
     def _sample(self, points: NDArray[np.float32]) -> SparseSample:
@@ -118,7 +120,7 @@ class _Forms:
 
 
 def _views(scan: NDArray[np.float32]) -> list[tuple[str, NDArray[np.float32]]]:
-    in_view = (np.abs(scan[:, 1:3]) <= scan[:, :1] * np.float32(CAMERA_VIEW)).all(axis=1)
+    in_view = (np.abs(scan[:, 1:3]) <= scan[:, :1] * np.array(CAMERA_VIEW, np.float32)).all(axis=1)
     return [("camera", scan[in_view]), ("whole", scan)]
 
 

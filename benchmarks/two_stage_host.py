@@ -38,7 +38,7 @@ def main(
     for path in scans or [sample_scan_path()]:
         points = read_scan(path).points
         points = points[((points[:, :3] >= RANGE_M[:, 0]) & (points[:, :3] < RANGE_M[:, 1])).all(axis=1)]
-        in_view = (np.abs(points[:, 1:3]) <= points[:, :1] * np.float32(CAMERA_VIEW)).all(axis=1)
+        in_view = (np.abs(points[:, 1:3]) <= points[:, :1] * np.array(CAMERA_VIEW, np.float32)).all(axis=1)
         for view, part in (("whole range", points), ("camera view", points[in_view])):
             print(f"{path.name}, {view}: {len(part)} points")
             rows = [(name, *(f"{ms:.2f}" for ms in measure(step, rounds))) for name, step in steps(part).items()]

@@ -51,7 +51,9 @@ def _seen(axes: str) -> Mistake:
 
 MISTAKES = {
     "none": Mistake(lambda points: points, Mounting()),
-    "z = 0 on the ground": Mistake(lambda points: points + np.float32([0, 0, 1.73, 0]), Mounting(sensor_height_m=0.0)),
+    "z = 0 on the ground": Mistake(
+        lambda points: points + np.array([0, 0, 1.73, 0], np.float32), Mounting(sensor_height_m=0.0)
+    ),
     "y forward": _seen("y-forward"),
     "z down": _seen("x,-y,-z"),
     "reflectance 0..100": Mistake(_scaled(100), Mounting()),

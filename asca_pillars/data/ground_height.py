@@ -97,7 +97,7 @@ def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = N
 def measured_mounting(
     scans: Iterable[NDArray[Any]], mounting: Mounting | None = None
 ) -> tuple[Mounting, HeightEstimate]:
-    """The mounting with the height that its scans show, see `estimate_height`."""
+    """The mounting with the height in metres that its scans (N, >=3) show, see `estimate_height`."""
     estimate = estimate_height(scans, mounting)
     return replace(mounting or Mounting(), sensor_height_m=estimate.height_m), estimate
 

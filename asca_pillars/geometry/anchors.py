@@ -119,7 +119,7 @@ def encode_boxes(
 
 
 def direction_bins(yaw_rad: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
-    """Bin 0 or 1 of each yaw, any shape; the two directions of a heading are in different bins."""
+    """Bin 0 or 1 of each yaw: (...,) -> (...,); the two directions of a heading are in different bins."""
     return (np.mod(yaw_rad - _BIN_START_RAD, 2 * math.pi) >= math.pi).astype(np.int64)
 
 

@@ -139,7 +139,7 @@ class Detections:
 
     @property
     def bearings_rad(self) -> NDArray[np.float32]:
-        """(N,) direction of each box's center from straight ahead, positive to the left, in [-pi, pi]."""
+        """(N,) direction of each box's center from straight ahead, radians in [-pi, pi], positive to the left."""
         level = self._level_boxes()
         return np.arctan2(level[:, 1], level[:, 0])
 

@@ -43,7 +43,7 @@ class FrameChange:
         return bool(np.array_equal(self.axes, np.eye(3)) and not self.shift_m.any())
 
     def points(self, points: NDArray[Any]) -> NDArray[np.float32]:
-        """Points (N, >=3) float32, x, y, z first; further columns stay as they are."""
+        """Points (N, >=3) -> float32 in the new frame, x, y, z in metres first; further columns stay as they are."""
         changed = np.array(points, np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold lies outside every range
             changed[:, :3] = changed[:, :3] @ self.axes.T.astype(np.float32)
@@ -51,7 +51,7 @@ class FrameChange:
         return changed
 
     def boxes(self, boxes: NDArray[Any]) -> NDArray[np.float32]:
-        """Boxes (N, 7): centers move with the points, sizes stay, headings turn as seen from above.
+        """Boxes (N, 7), metres and radians: centers move with the points, sizes stay, headings turn as seen from above.
 
         Exact where z stays vertical. A box has no tilt of its own: in a tilted frame it is off by the frame's tilt.
         """

@@ -20,7 +20,7 @@ def table_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor | N
     Under autocast it computes in the lower precision, as a convolution would.
 
     Args:
-        features: (N, C).
+        features: (N, C), unitless.
         weight: (outputs, C, *kernel) as PyTorch stores a convolution's, K cells in its kernel.
         table: (M, K) int32 rows of `features`, N where there is none.
         back: (N, K) int32 the inverse, rows of the output, M where there is none; needed for the features' gradient.
@@ -84,5 +84,5 @@ def _chunks(features: Tensor, table: Tensor) -> Any:
 
 
 def at_active_cells(norm: Callable[[Tensor], Tensor], features: Tensor) -> Tensor:
-    """A batch normalization made for maps or volumes, over active cells alone: (M, C) -> (M, C)."""
+    """A batch normalization made for maps or volumes, over active cells alone: (M, C) -> (M, C), unitless."""
     return norm(features[:, :, None, None])[:, :, 0, 0]

@@ -2,5 +2,5 @@
 
 In the order of the data: `proposals` -> `farthest_points` (keypoints) -> `ball_query` (who aggregates what) ->
 `bilinear` (the first stage's map at the keypoints) -> `roi_grid` -> (the network) -> `refinement`; `roi_targets` for
-training. Where numba is installed it runs the loops, with the same results (`load_point_kernels`).
+training. Where numba is installed it runs the loops, with the same results (`geometry.kernels`).
 """

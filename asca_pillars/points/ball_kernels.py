@@ -23,7 +23,7 @@ def ball_query(
     samples: int,
     share: int,
 ) -> _Integers:
-    """`ball_query._ball_query`, query by query."""
+    """`ball_query._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
     found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
     at = centers, cells_of(centers, columns)
     ball = offsets, squared_radius, share
@@ -32,7 +32,10 @@ def ball_query(
 
 
 def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_Integers, _Floats]:
-    """`ball_query._three_nearest`, in rings of columns around each query."""
+    """`ball_query._three_nearest`, in rings of columns around each query.
+
+    Metres (N, 3), (Q, 3) -> indices (Q, 3) and squared distances (Q, 3) in m²; N and infinity where there is no point.
+    """
     nearest = np.full((len(centers), 3), len(xyz), np.int32)
     squared = np.full((len(centers), 3), np.inf, np.float32)
     if len(xyz):

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.points.columns import Columns, cells_of, require_points, sort_into_columns
-from asca_pillars.points.load_point_kernels import load_point_kernels
 
+KERNELS = "asca_pillars.points.ball_kernels"
 # A column is a little narrower than a quarter of the radius: a ball has about 69 columns, and the first visited do not
 # all lie on one side. Of many points at least eight columns get a share.
 _COLUMNS_PER_RADIUS = 4.01
@@ -32,8 +33,8 @@ def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, sam
     are all of one ring. A query with fewer points repeats its first; one without any gets N.
 
     Args:
-        points: (N, 3 or more) finite x, y, z in metres; N may be 0.
-        queries: (Q, 3 or more) finite x, y, z in metres, anywhere.
+        points: (N, >=3) finite x, y, z in metres; N may be 0.
+        queries: (Q, >=3) finite x, y, z in metres, anywhere.
         radius_m: squared distances in float32 must be below its square.
 
     Raises:
@@ -43,7 +44,7 @@ def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, sam
     columns = sort_into_columns(xyz, radius_m / _COLUMNS_PER_RADIUS)
     offsets = _visiting_order(radius_m * float(columns.per_m))
     squared = np.float32(radius_m) * np.float32(radius_m)
-    kernels = load_point_kernels()
+    kernels = load_kernels(KERNELS)
     query = _ball_query if kernels is None else kernels.ball_query
     return np.asarray(query(xyz, centers, columns, offsets, squared, samples, -(-samples // _COLUMNS_TO_FILL)))
 
@@ -58,7 +59,7 @@ def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[
         ValueError: another shape, or a coordinate that is not finite.
     """
     xyz, centers = require_points(points), require_points(queries)
-    kernels = load_point_kernels()
+    kernels = load_kernels(KERNELS)
     if kernels is None:
         nearest, squared = _three_nearest(xyz, centers)
     else:

@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.points.load_point_kernels import load_point_kernels
+from asca_pillars.geometry.kernels import load_kernels
 
+KERNELS = "asca_pillars.points.sampling_kernels"
 _MAX_COLUMNS = 1024  # along each axis; beyond it columns grow wider, so that one stray point costs no memory
 
 
@@ -26,7 +27,7 @@ class Columns(NamedTuple):
 
 
 def require_points(points: NDArray[Any]) -> NDArray[np.float32]:
-    """The positions (N, 3) of points (N, >= 3) as contiguous float32.
+    """The positions (N, 3) of points (N, >=3), metres, as contiguous float32.
 
     Raises:
         ValueError: another shape, or a coordinate that is not finite, which has no column.
@@ -50,14 +51,14 @@ def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
     widest = max(float(last) - float(first) for first, last in zip(low, high, strict=True))
     per_m = np.float32(1 / max(column_m, widest / (_MAX_COLUMNS - 1)))
     nx, ny = (int((last - first) * per_m) + 1 for first, last in zip(low, high, strict=True))
-    kernels = load_point_kernels()
+    kernels = load_kernels(KERNELS)
     sort = _sort if kernels is None else kernels.sort
     order, starts = sort(xyz, low[0], low[1], per_m, ny, nx)
     return Columns(order, starts, low, per_m, (ny, nx))
 
 
 def cells_of(xyz: NDArray[np.float32], columns: Columns) -> NDArray[np.int64]:
-    """Row and column of each position (N, 3): (N, 2); beside the points below 0 or beyond `columns.shape`."""
+    """Row and column of positions: (N, 3) in metres -> (N, 2); beside the points below 0 or beyond `columns.shape`."""
     along_x, along_y = (
         np.clip((xyz[:, axis] - low) * columns.per_m, np.float32(-1e6), np.float32(1e6))
         for axis, low in enumerate(columns.origin_m)

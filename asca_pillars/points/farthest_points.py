@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.points.columns import require_points, sort_into_columns
-from asca_pillars.points.load_point_kernels import load_point_kernels
+from asca_pillars.geometry.kernels import load_kernels
+from asca_pillars.points.columns import KERNELS, require_points, sort_into_columns
 
 _COLUMN_M = 1.5  # 1 to 3 m take about as long
 
@@ -19,7 +19,7 @@ def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
     a new sample can change; it takes the same points.
 
     Args:
-        points: (N, 3 or more) finite x, y, z in metres; N may be 0.
+        points: (N, >=3) finite x, y, z in metres; N may be 0.
         count: how many; fewer come out where there are fewer different positions.
 
     Raises:
@@ -28,7 +28,7 @@ def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
     xyz = require_points(points)
     if not len(xyz) or count < 1:
         return np.empty(0, np.int32)
-    kernels = load_point_kernels()
+    kernels = load_kernels(KERNELS)
     if kernels is None:
         return _farthest_points(xyz, count)
     return np.asarray(kernels.farthest_points(xyz, count, sort_into_columns(xyz, _COLUMN_M)))
@@ -43,7 +43,7 @@ def near_boxes(points: NDArray[Any], boxes: NDArray[np.floating[Any]], margin_m:
     centers = boxes[:, :2].astype(np.float32)
     reach = (np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + margin_m).astype(np.float32)
     squared = reach * reach
-    kernels = load_point_kernels()
+    kernels = load_kernels(KERNELS)
     if kernels is not None:
         return np.asarray(kernels.near_circles(x, y, centers, squared))
     near = np.zeros(len(points), bool)

@@ -41,7 +41,8 @@ def propose(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, settings: P
     """Proposals of one scan, best first.
 
     Args:
-        maps: of the detector that `spec` describes; its thresholds and suppression give way to those of `settings`.
+        maps: logits and residuals (channels, H, W) of the detector that `spec` describes; its thresholds and
+            suppression give way to those of `settings`.
 
     Raises:
         ValueError: not one quota for each class.

@@ -12,7 +12,7 @@ from asca_pillars.points.roi_grid import boxes_from_frames, boxes_in_frames
 
 
 def encode_refinement(boxes: NDArray[np.floating[Any]], proposals: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """Residuals of boxes[k] against proposals[k]: (R, 7), (R, 7) -> (R, 7) float32.
+    """Residuals of boxes[k] against proposals[k], metres and radians: (R, 7), (R, 7) -> (R, 7) float32.
 
     As an anchor's (`encode_boxes`), the proposal moved to the origin being the anchor; the heading difference lies in
     [-pi/2, pi/2), because refinement leaves it to the proposal which end is the front.
@@ -28,7 +28,7 @@ def decode_refinement(
 ) -> NDArray[np.float32]:
     """Inverse of `encode_refinement`, up to half a turn: (R, 7), (R, 7) -> boxes (R, 7) float32.
 
-    Size ratios are held within 1/100 and 100.
+    Boxes in metres and radians, in the frame of the proposals. Size ratios are held within 1/100 and 100.
     """
     frames = proposals.astype(np.float64)
     seen = decode_boxes(residuals, direction_bins(residuals[:, 6].astype(np.float64)), _at_origin(frames))

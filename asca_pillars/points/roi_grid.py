@@ -14,18 +14,18 @@ def to_box_frames(points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[
 
 
 def from_box_frames(points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Inverse of `to_box_frames`."""
+    """Inverse of `to_box_frames`: (R, P, 3), (R, 7) -> (R, P, 3), metres, LiDAR frame."""
     return _turned(points, boxes[:, 6]) + boxes[:, None, :3]
 
 
 def boxes_in_frames(boxes: NDArray[np.floating[Any]], frames: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """boxes[k] as seen from the box frames[k]: (R, 7), (R, 7) -> (R, 7), yaw in [-pi, pi)."""
+    """boxes[k] as seen from the box frames[k]: (R, 7), (R, 7) -> (R, 7), metres, yaw in radians, [-pi, pi)."""
     position = to_box_frames(boxes[:, None, :3], frames)[:, 0]
     return np.concatenate([position, boxes[:, 3:6], wrap_angle(boxes[:, 6:] - frames[:, 6:])], axis=1)
 
 
 def boxes_from_frames(boxes: NDArray[np.floating[Any]], frames: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Inverse of `boxes_in_frames`."""
+    """Inverse of `boxes_in_frames`: (R, 7), (R, 7) -> (R, 7), metres and radians, yaw in [-pi, pi)."""
     position = from_box_frames(boxes[:, None, :3], frames)[:, 0]
     return np.concatenate([position, boxes[:, 3:6], wrap_angle(boxes[:, 6:] + frames[:, 6:])], axis=1)
 

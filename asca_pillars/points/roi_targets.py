@@ -50,7 +50,7 @@ class RoiTargets:
 
 
 def match_proposals(proposals: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> Overlaps:
-    """Overlaps of proposals with labelled boxes (N, 7) of classes (N,), or IGNORED."""
+    """3D IoU of proposals with labelled boxes (N, 7), LiDAR frame, of classes (N,), or IGNORED."""
     iou = iou_3d(proposals.boxes, boxes)
     own = np.where(proposals.labels[:, None] == labels[None], iou, 0.0)
     other = np.where(labels[None] == IGNORED, iou, 0.0).max(axis=1, initial=0.0)
@@ -60,7 +60,7 @@ def match_proposals(proposals: Detections, boxes: NDArray[np.float32], labels: N
 
 
 def sample_rois(overlaps: Overlaps, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Rows of `count` proposals to learn from; fewer, namely none, only if there are none that are not ignored.
+    """Rows (count,) of proposals to learn from; fewer, namely none, only if there are none that are not ignored.
 
     At most half is foreground, each once. The rest is background, drawn with replacement, 80 % of it hard; where a
     kind is missing the others take its place, and without any background the foreground is drawn with replacement.

@@ -28,14 +28,14 @@ _COLUMNS = (
 def sort(
     xyz: _Floats, x_low: np.float32, y_low: np.float32, per_m: np.float32, ny: int, nx: int
 ) -> tuple[_Integers, _Integers]:
-    """`columns._sort`, by counting."""
+    """`columns._sort`, by counting: (N, 3) in metres -> `Columns.order` (N,) and `Columns.starts` (ny * nx + 1,)."""
     order, starts = np.empty(len(xyz), np.int32), np.zeros(ny * nx + 1, np.int32)
     _sort(xyz, x_low, y_low, per_m, nx, np.empty(len(xyz), np.int32), order, starts)
     return order, starts
 
 
 def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
-    """`farthest_points._farthest_points`, column by column."""
+    """`farthest_points._farthest_points`, column by column: (N, 3) in metres -> indices (S,), S at most `count`."""
     cells = len(columns.starts) - 1
     chosen = np.empty(min(count, len(xyz)), np.int32)
     found = _farthest_points(
@@ -47,7 +47,7 @@ def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
 
 
 def near_circles(x: _Floats, y: _Floats, centers: _Floats, squared: _Floats) -> _Bools:
-    """Which points lie inside any of the circles: (N,), (N,), (R, 2), (R,) -> (N,)."""
+    """Which points lie inside any of the circles: (N,), (N,), (R, 2) in metres, (R,) in m² -> (N,)."""
     near = np.zeros(len(x), np.bool_)
     _near_circles(x, y, np.ascontiguousarray(centers), squared, near)
     return near

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.tables.compiled_tables import load_table_kernels
+from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.tables.convolution import Links, Shape
 
+KERNELS = "asca_pillars.tables.table_kernels"
 MAX_Z_CELLS = 64  # the bits of a column's mask
 
 
@@ -53,7 +54,7 @@ class CellMap:
         self.shape = shape
         self.cells: NDArray[np.int64] = np.empty(0, np.int64)
         """(N,) active cells, flat index (y * nx + x) * nz + z, ascending."""
-        self._kernels = load_table_kernels()
+        self._kernels = load_kernels(KERNELS)
         self.columns: Any = None
         if self._kernels is not None:
             columns = shape[1] * shape[2]
@@ -95,7 +96,7 @@ class CellMap:
         self._kernels.list_cells(*self.columns, self.shape[0], self.cells)
 
     def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
-        """Row in `source` that each tap joins with each active cell of this map: (N, K), len(source) for none.
+        """Index of the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
 
         With `Convolution.inputs` it is what the convolution from `source` to this map reads. With `outputs` it is
         the inverse that its backward pass reads: which output, of the map `source`, each input was read by.

@@ -83,7 +83,7 @@ class NeckTableBuilder:
         self._head = CellMap(shapes[1])
 
     def build(self, cells: NDArray[np.int64]) -> NeckTables[NDArray[np.int32]]:
-        """Tables of a scan with pillars at these cells (P,): row * nx + column, ascending."""
+        """Tables of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
         self._pillars.activate(cells)
         before = self._pillars
         for level in self._strided:
@@ -136,7 +136,7 @@ def stack_neck_tables(
     """Tables of a batch from those of its frames.
 
     Args:
-        frames: at least one, all of one map.
+        frames: at least one, all of one map; indices (M, 9) or (M,).
         pillars: how many each frame has.
     """
     levels, before = [], list(pillars)

@@ -32,14 +32,14 @@ def bits_set(mask: np.uint64) -> Any:
 
 @compiled(_CELLS, types.int64, written(types.uint64))
 def clear_columns(cells: _Integers, nz: int, mask: _Masks) -> None:
-    """Empty the columns of these cells."""
+    """Empty the columns of these cells: flat indices (N,), `mask` (ny * nx,)."""
     for i in range(len(cells)):
         mask[np.uint64(cells[i]) // np.uint64(nz)] = 0
 
 
 @compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
 def enter_cells(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
-    """Enter ascending cells into empty columns."""
+    """Enter ascending cells, flat indices (N,), into empty columns (ny * nx,)."""
     for i in range(len(cells)):
         column = np.uint64(cells[i]) // np.uint64(nz)
         if mask[column] == 0:
@@ -47,11 +47,28 @@ def enter_cells(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
         mask[column] |= _ONE << (np.uint64(cells[i]) - column * np.uint64(nz))
 
 
+@compiled(_CELLS, types.int64, written(types.uint64))
+def mark_points(cells: _Integers, nz: int, mask: _Masks) -> int:
+    """Set the bits of the points' cells, flat indices (M,) or -1, and say how many were not set before."""
+    found = 0
+    for i in range(len(cells)):
+        if cells[i] >= 0:
+            column = cells[i] // nz
+            bit = _ONE << np.uint64(cells[i] - column * nz)
+            if not mask[column] & bit:
+                mask[column] |= bit
+                found += 1
+    return found
+
+
 @compiled(_CELLS, *_LINKS, types.int64, types.int64, written(types.uint64))
 def mark_joined(
     cells: _Integers, z_links: _Integers, y_links: _Integers, x_links: _Integers, ny: int, nx: int, mask: _Masks
 ) -> int:
-    """Set the bits of what is joined with these cells, and say how many were not set before."""
+    """Set the bits of what is joined with these cells, and say how many were not set before.
+
+    `cells`: (N,) flat indices; links: (cells along an axis, taps) indices along it; `mask`: (ny * nx,).
+    """
     depth, width = len(z_links), len(x_links)
     found = i = row = 0
     while i < len(cells):
@@ -83,7 +100,7 @@ def mark_joined(
 
 @compiled(given(types.uint64), written(types.int32), types.int64, written(types.int64))
 def list_cells(mask: _Masks, start: _Rows, nz: int, cells: _Integers) -> None:
-    """The cells whose bits are set, ascending, and where each column starts among them."""
+    """The cells whose bits are set, ascending flat indices (N,), and where each column (ny * nx,) starts among them."""
     count = 0
     for column in range(len(mask)):
         left = mask[np.uint64(column)]
@@ -139,7 +156,7 @@ def fill_table(
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """`CellMap.table`, column by column."""
+    """`CellMap.table`, column by column: cells (N,) -> indices (N, K)."""
     depth, width = len(z_links), len(x_links)
     taps_z, taps_y, taps_x = z_links.shape[1], y_links.shape[1], x_links.shape[1]
     if depth == taps_z == 1:
@@ -185,7 +202,7 @@ def fill_places(
     halvings: int,
     places: _Rows,
 ) -> None:
-    """`CellMap.places`."""
+    """`CellMap.places`: cells (N,) -> indices (N,)."""
     row, within = 0, (1 << halvings) - 1
     for i in range(len(cells)):
         while cells[i] >= (row + 1) * nx:

@@ -22,7 +22,7 @@ _EDGES = (given(types.float32),) * 3
 def cells_of_points(
     points: _Floats, lows_m: _Floats, highs_m: _Floats, sizes_m: _Floats, shape: Shape, cells: _Integers
 ) -> None:
-    """`voxels._cells_of_points`."""
+    """`voxels._cells_of_points`: (M, >=3) in metres -> flat indices (M,)."""
     last = np.empty(3, np.int64)
     for axis in range(3):
         last[axis] = int(np.rint((highs_m[axis] - lows_m[axis]) / sizes_m[axis])) - 1
@@ -37,20 +37,6 @@ def cells_of_points(
             y = min(math.floor((points[i, 1] - lows_m[1]) / sizes_m[1]), last[1])
             z = min(math.floor((points[i, 2] - lows_m[2]) / sizes_m[2]), last[2])
             cells[i] = (y * shape[2] + x) * shape[0] + z
-
-
-@compiled(given(types.int64), types.int64, written(types.uint64))
-def mark_points(cells: _Integers, nz: int, mask: _Masks) -> int:
-    """Set the bits of the points' cells, and say how many were not set before."""
-    found = 0
-    for i in range(len(cells)):
-        if cells[i] >= 0:
-            column = cells[i] // nz
-            bit = _ONE << np.uint64(cells[i] - column * nz)
-            if not mask[column] & bit:
-                mask[column] |= bit
-                found += 1
-    return found
 
 
 @compiled(
@@ -68,7 +54,7 @@ def sum_points(
     counts: _Integers,
     means: _Floats,
 ) -> None:
-    """Mean of the first points of each voxel; `sums` and `counts` come as zeros."""
+    """Mean of the first points of each voxel: (M, C) -> (N, C); `sums` and `counts` come as zeros."""
     for i in range(len(points)):
         if cells[i] < 0:
             continue

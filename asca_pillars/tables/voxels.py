@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.schema import Strict
 from asca_pillars.tables.cell_map import MAX_Z_CELLS, CellMap
-from asca_pillars.tables.compiled_tables import load_table_kernels
 from asca_pillars.tables.convolution import Shape
+
+KERNELS = "asca_pillars.tables.voxel_kernels"
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def voxelize(points: NDArray[np.float32], grid: VoxelGrid, cell_map: CellMap) ->
     Sums are float64 in the scan's order, so the means do not depend on the machine.
 
     Args:
-        points: (M, C >= 3) x, y, z in metres, LiDAR frame, and other values.
+        points: (M, >=3) x, y, z in metres, LiDAR frame, and other values.
         grid: where the voxels are.
         cell_map: of the grid's shape; the voxels are its active cells afterwards.
 
@@ -108,7 +110,7 @@ def voxelize(points: NDArray[np.float32], grid: VoxelGrid, cell_map: CellMap) ->
     highs_m = np.array([high for _, high in grid.ranges_m], np.float32)
     sizes_m, shape = np.array(grid.size_m, np.float32), grid.shape
     cell_of_point = np.empty(len(points), np.int64)
-    kernels = load_table_kernels()
+    kernels = load_kernels(KERNELS)
     if kernels is None:
         cell_of_point = _cells_of_points(points[:, :3], lows_m, highs_m, sizes_m, shape)
         cell_map.activate_points(cell_of_point)

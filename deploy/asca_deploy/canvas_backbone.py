@@ -80,7 +80,7 @@ class CanvasBackbone:
         self._free = [self.new_canvas()]
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
-        """Pillar features (P, C) at their cells (P,), on a canvas that `run` gives back."""
+        """Pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
         try:
             canvas = self._free.pop()  # atomic, as append is: two threads never get the same one
         except IndexError:

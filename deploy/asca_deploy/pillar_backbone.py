@@ -27,7 +27,7 @@ class PillarBackbone(Protocol):
         """What `place` is called in reports."""
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Any:
-        """Pillar features (P, C), in the bundle's type, and their cells (P,) -> the input of the graph."""
+        """Pillar features (P, C), in the bundle's type, and flat indices (P,) of their cells -> the graph's input."""
 
     def run(self, placed: Any) -> HeadAnswer:
         """Run the graph; each placed scan may be given once."""

@@ -66,7 +66,7 @@ class PillarPipeline:
         self._anchors = self.spec.anchors
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedPillars:
-        """Points (N, 4) -> the input of the backbone."""
+        """Points (N, 4), metres, LiDAR frame, and reflectance -> the input of the backbone."""
         pillars = self.pillarize(points)
         laps.append(("pillarize", perf_counter()))
         features = self.encode(pillars)

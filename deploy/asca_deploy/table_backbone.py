@@ -55,7 +55,7 @@ class TableBackbone:
         self._free = [self._new_builder()]
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
-        """Pillar features (P, C) with the tables that their cells (P,) make."""
+        """Pillar features (P, C) with the tables that their cells, flat indices (P,), make."""
         try:
             builder = self._free.pop()  # atomic, as append is: two threads never get the same one
         except IndexError:

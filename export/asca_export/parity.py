@@ -80,7 +80,7 @@ def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:
 
 
 def by_class(scores: NDArray[np.float32], classes: int) -> NDArray[np.float32]:
-    """Logits (A, H, W), or rows (M, A), of each class: (classes, n)."""
+    """The logits (A, H, W), or rows (M, A), of each class: (classes, n)."""
     return (scores if scores.ndim == 3 else scores.T).reshape(classes, scores.size // classes)
 
 

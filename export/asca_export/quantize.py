@@ -137,7 +137,7 @@ def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Mome
 
 
 def round_together(weight: Tensor, squares: Tensor) -> Tensor:
-    """(outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output, so that the outputs change little.
+    """Unitless weights (outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output; the outputs change little.
 
     The largest weight of an output stays at the end of its grid, from which the graph's writer takes the grid's unit.
     """

@@ -32,7 +32,7 @@ class Encoded(NamedTuple):
     pillars: Pillars
 
     def in_steps(self, steps: CanvasSteps) -> NDArray[np.uint8]:
-        """(P, C) whole steps of the features."""
+        """(P, C) unitless whole steps of the features."""
         scale, empty = steps.scale.numpy(), steps.empty.numpy()
         return np.clip(np.round(self.features / scale + empty), 0, STEPS).astype(np.uint8)
 

@@ -93,7 +93,7 @@ class SparseBackbone(nn.Module):
         return product
 
     def passes(self, features: Tensor, tables: NeckTables[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Name, what it reads and what it gives of each product in turn: features (P, C), or STEP_VALUE times steps."""
+        """Name, what it reads and what it gives of each product in turn: unitless (P, C), or STEP_VALUE times steps."""
         inputs, maps = table_inputs(tables), []
         missing = self.empty * STEP_VALUE
         for level in self.levels:

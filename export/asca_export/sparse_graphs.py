@@ -44,7 +44,7 @@ def export_sparse_backbone(
 
 
 def multiply_accumulates(backbone: SparseBackbone, tables: NeckTables[NDArray[np.int32]]) -> int:
-    """What the products cost on the scan that these tables are of."""
+    """Count of multiply-accumulates of the products on the scan that these tables, indices (M, 9), are of."""
     inputs, total = table_inputs(tables), 0
     for level in backbone.levels:
         for layer in level.convolutions:

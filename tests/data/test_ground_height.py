@@ -28,7 +28,7 @@ def test_the_ground_is_not_a_reflection_below_it_nor_the_vehicles_roof() -> None
 def test_too_few_points_near_the_sensor() -> None:
     assert ground_z_m(street(40)) is None
     assert ground_z_m(street()[:0]) is None
-    assert ground_z_m(street() + np.float32([100, 0, 0, 0])) is None
+    assert ground_z_m(street() + np.array([100, 0, 0, 0], np.float32)) is None
 
 
 def sloped(height: float, tilt_deg: float = 0.0, seed: int = 0, noise_m: float = 0.02) -> NDArray[np.float32]:

@@ -145,7 +145,7 @@ def test_a_tilted_sensor() -> None:
     assert warning.about == "tilt" and "--pose" in warning.text
     rows = np.eye(4)
     rows[:3, :3] = turn.T
-    first, second, third, last = (tuple(row) for row in rows.tolist())
+    first, second, third, last = ((a, b, c, d) for a, b, c, d in rows.tolist())
     assert check(points, mounting=Mounting(pose=(first, second, third, last))) == []
 
 

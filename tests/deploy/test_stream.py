@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
+from asca_deploy.canvas_backbone import CanvasBackbone
 from asca_deploy.stream import overlapped
 from asca_pillars.errors import ScanError
 from tests.deploy.conftest import make_scan
@@ -152,6 +153,7 @@ def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: 
     detector, scans = Detector(tiny_bundle), [make_scan(seed, 50 + 20 * seed) for seed in range(5)]
     images: set[int] = set()
     backbone = detector.pipeline.backbone
+    assert isinstance(backbone, CanvasBackbone)
     neck_and_head = backbone.neck_and_head
     monkeypatch.setattr(backbone, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image))
     most_threads = 0

@@ -10,6 +10,7 @@ import pytest
 from onnx import numpy_helper
 
 from asca_deploy import Bundle, Detector, load_bundle
+from asca_deploy.canvas_backbone import CanvasBackbone
 from asca_export import int8
 from asca_export.exporter import export_bundle
 from asca_pillars.errors import ExportError
@@ -64,12 +65,14 @@ def test_weights_are_7_bits_and_multiplications_8(folder: Path) -> None:
 def test_onnxruntime_computes_what_the_graph_says(folder: Path) -> None:
     """Its 8-bit kernels against its float ones on the dequantized graph: saturation would differ by a lot."""
     detector = Detector(folder)
+    backbone = detector.pipeline.backbone
+    assert isinstance(backbone, CanvasBackbone)
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     plain = onnxruntime.InferenceSession(folder / "backbone.onnx", options, providers=["CPUExecutionProvider"])
     for points in SCANS[:3]:
         canvas = detector.pipeline.prepare(points, []).placed.image
-        fast = detector.pipeline.backbone.neck_and_head(canvas)
+        fast = backbone.neck_and_head(canvas)
         for name, maps in zip(("scores", "boxes", "directions"), fast, strict=True):
             (expected,) = plain.run([name], {"canvas": canvas})
             error = np.abs(np.moveaxis(expected[0], -1, 0) - maps)

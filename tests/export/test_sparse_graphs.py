@@ -22,12 +22,12 @@ from asca_pillars.models.pillar.neck import SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import Placement, batch_pillars
 from asca_pillars.pillars.pillarize import Pillars
-from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables, table_inputs
+from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, NeckTables, table_inputs
 from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
 from tests.scenes import SPEC
 
 
-def sparse_detector(rule: str) -> PillarDetector:
+def sparse_detector(rule: MaskRule) -> PillarDetector:
     """The weights of the tiny checkpoint in a sparse network."""
     network = dataclasses.replace(NETWORK, block_convs=(2, 1, 0), neck="sparse", active_cells=rule)
     detector = build_pillar_detector(PillarModel(spec=SPEC, network=network)).eval()
@@ -42,8 +42,8 @@ def sparse_detector(rule: str) -> PillarDetector:
     return detector
 
 
-def tables_of(pillars: Pillars, rule: str) -> NeckTables[np.ndarray]:
-    return NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule).build(pillars.cells)  # type: ignore[arg-type]
+def tables_of(pillars: Pillars, rule: MaskRule) -> NeckTables[np.ndarray]:
+    return NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule).build(pillars.cells)
 
 
 def sample_of(detector: PillarDetector, pillars: Pillars) -> SparseSample:
@@ -74,7 +74,7 @@ def assert_same_bits(runs: Sequence[HeadMaps[np.ndarray]]) -> None:
 
 
 @pytest.mark.parametrize("rule", ["sub", "fine"])
-def test_the_graph_is_the_network_and_the_same_for_any_number_of_threads(rule: str, tmp_path: Path) -> None:
+def test_the_graph_is_the_network_and_the_same_for_any_number_of_threads(rule: MaskRule, tmp_path: Path) -> None:
     detector = sparse_detector(rule)
     export_sparse_backbone(SparseBackbone(detector), tmp_path / "backbone.onnx")
     graphs = {threads: OpenGraph(tmp_path / "backbone.onnx", threads) for threads in (1, 2, 4)}

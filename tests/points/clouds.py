@@ -15,7 +15,7 @@ def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
     """The function's result where numba is not installed."""
     with ExitStack() as stack:
         for name in _MODULES:
-            stack.enter_context(patch(f"asca_pillars.points.{name}.load_point_kernels", lambda: None))
+            stack.enter_context(patch(f"asca_pillars.points.{name}.load_kernels", lambda _: None))
         return function(*arguments)
 
 
@@ -28,7 +28,7 @@ def both_forms(function: Callable[..., Any], *arguments: Any) -> Iterator[Any]:
 def cloud(seed: int, count: int, spread_m: float, coarse: bool) -> np.ndarray:
     """(count, 4) points; coarse ones lie on a lattice, so that many stand in one place or equally far apart."""
     rng = np.random.default_rng(seed)
-    points = rng.normal(0, spread_m, (count, 4)).astype(np.float32) + np.float32([30, -5, 0, 0])
+    points = rng.normal(0, spread_m, (count, 4)).astype(np.float32) + np.array([30, -5, 0, 0], np.float32)
     return np.round(points) if coarse else points
 
 

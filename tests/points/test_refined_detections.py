@@ -42,4 +42,5 @@ def test_what_is_not_finite_is_left_out() -> None:
 
 
 def test_no_proposals() -> None:
-    assert len(refined_detections(Detections.empty(NAMES), np.empty(0, np.float32), np.empty((0, 7)), POST)) == 0
+    scores, residuals = np.empty(0, np.float32), np.empty((0, 7), np.float32)
+    assert len(refined_detections(Detections.empty(NAMES), scores, residuals, POST)) == 0

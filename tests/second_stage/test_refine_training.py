@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from asca_pillars.errors import TrainingError
-from asca_pillars.second_stage.refine_sample import RefineSample
+from asca_pillars.second_stage.refine_sample import RefineSample, prepare_sample
 from asca_pillars.second_stage.refine_training import one_cycle, sample_batches, train_refiner
-from tests.models.refine.test_pillar_refiner import SETTINGS, prepare_sample, proposed_frame, small_refiner
+from tests.models.refine.test_pillar_refiner import SETTINGS, proposed_frame, small_refiner
 
 
 def prepare(number: int, rng: np.random.Generator) -> RefineSample:
@@ -44,7 +44,9 @@ def test_training_by_the_clock_ends() -> None:
 
 def test_a_loss_that_is_not_finite_stops_the_run() -> None:
     network = small_refiner()
-    torch.nn.init.constant_(network.head.confidence[-1].bias, torch.nan)
+    last = network.head.confidence[-1]
+    assert isinstance(last, torch.nn.Linear)
+    torch.nn.init.constant_(last.bias, torch.nan)
     with pytest.raises(TrainingError, match="`confidence` is not finite at step 0"):
         train_refiner(network, sample_batches(prepare, 2, 2, 0), learning_rate=1e-3, steps=3)
 

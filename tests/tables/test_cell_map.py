@@ -31,7 +31,7 @@ seeds, shares = st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.3, 1.0]
 
 def numpy_map(shape: Shape) -> CellMap:
     """As where numba is not installed."""
-    with patch("asca_pillars.tables.cell_map.load_table_kernels", lambda: None):
+    with patch("asca_pillars.tables.cell_map.load_kernels", lambda _: None):
         return CellMap(shape)
 
 

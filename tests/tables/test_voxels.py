@@ -16,7 +16,7 @@ GRID = VoxelGrid((1.0, 4.0), (-2.0, 1.2), (-1.5, 0.5), (0.3, 0.2, 0.1), max_poin
 
 
 def in_numpy(points: np.ndarray, grid: VoxelGrid) -> Voxels:
-    with patch("asca_pillars.tables.voxels.load_table_kernels", lambda: None):
+    with patch("asca_pillars.tables.voxels.load_kernels", lambda _: None):
         return voxelize(points, grid, numpy_map(grid.shape))
 
 

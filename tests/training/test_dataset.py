@@ -11,6 +11,7 @@ import torch
 from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
@@ -25,7 +26,7 @@ CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(train_set="train",
 DONT_CARE = KittiObject("DontCare", -1, -1, -10, (500, 150, 540, 190), -1, -1, -1, -1000, -1000, -1000, -10)
 
 
-def read(split: KittiSplit, config: Config, frame_id: str = "000000") -> LabeledFrame:
+def read(split: LabeledSplit, config: Config, frame_id: str = "000000") -> LabeledFrame:
     data = config.data
     names = config.model.spec.class_names
     return read_frame(split, frame_id, names, camera_view=data.camera_view, min_points=data.min_points)
@@ -246,11 +247,13 @@ def test_the_tables_of_a_sparse_neck_move_with_the_batch(tmp_path: Path) -> None
     model = PillarModel(spec=SPEC, network=NetworkConfig(neck="sparse"))
     frames = open_dataset(write_dataset(tmp_path, 3), dataclasses.replace(CONFIG, model=model), training=True)
     batch = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
-    assert isinstance(batch, Batch)
+    assert isinstance(batch, Batch) and isinstance(batch.inputs, LabeledPillars)
     neck = batch.inputs.pillars.neck
     assert neck is not None and sum(neck.frame_rows) == len(neck.head_cells)
     assert len(neck.levels[0].strided_back) == len(batch.inputs.pillars.cells)
-    moved = batch.to("meta").inputs.pillars.neck
+    inputs = batch.to("meta").inputs
+    assert isinstance(inputs, LabeledPillars)
+    moved = inputs.pillars.neck
     assert moved is not None and moved.frame_rows == neck.frame_rows
     assert {part.device.type for level in moved.levels for part in level} == {"meta"}
 

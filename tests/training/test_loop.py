@@ -8,13 +8,14 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 
 import numpy as np
 import pytest
 import torch
 import yaml
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, PillarModel, TrainConfig
+from asca_pillars.config import AugmentConfig, Config, CpaReading, DataConfig, NetworkConfig, PillarModel, TrainConfig
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ScanError, TrainingError
 from asca_pillars.evaluation.recall import RecallTally
@@ -42,7 +43,7 @@ CONFIG = Config(
     ("cpa", "neck"),
     [("none", "dense"), ("paper", "dense"), ("channel", "dense"), ("point", "dense"), ("channel", "sparse")],
 )
-def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: str, neck: str) -> None:
+def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: CpaReading, neck: Literal["dense", "sparse"]) -> None:
     torch.manual_seed(0)
     model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa=cpa, neck=neck))
     config = dataclasses.replace(CONFIG, model=model, data=DataConfig(train_set="val", workers=0))

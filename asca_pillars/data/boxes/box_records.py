@@ -91,7 +91,7 @@ def records_from(
     scores: Sequence[float] | NDArray[np.floating] | None = None,
     track_ids: Sequence[str | None] | None = None,
 ) -> BoxRecords:
-    """Records of boxes (N, 7) that are arrays already."""
+    """Records of boxes (N, 7), metres and radians, that are arrays already."""
     count = len(types)
     return BoxRecords(
         np.asarray(boxes, np.float32).reshape(count, 7),

@@ -97,7 +97,7 @@ def _records(
 
 
 def rotation(quaternion: list[float]) -> _Doubles:
-    """(3, 3) of w, x, y, z."""
+    """Unitless rotation matrix (3, 3) of the quaternion w, x, y, z."""
     w, x, y, z = np.array(quaternion, np.float64) / np.linalg.norm(quaternion)
     return np.array(
         [

@@ -137,7 +137,7 @@ class KittiSplit:
         return points
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
-        """(N, 4) as the file has them."""
+        """(N, 4) x, y, z in metres, LiDAR frame, and reflectance, as the file has them."""
         return stored_points(self.scan_path(frame_id))
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:

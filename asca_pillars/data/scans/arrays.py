@@ -32,7 +32,7 @@ def read_npy(path: Path) -> StoredPoints:
 
 
 def points_from_array(array: NDArray[Any], source: str = "points") -> StoredPoints:
-    """The points of an array (N, 3 or more): x, y, z, and reflectance if there is a fourth column.
+    """The points of an array (N, >=3): x, y, z, and reflectance if there is a fourth column.
 
     The points of a masked array are those of which neither coordinate nor reflectance is masked; remarks count the
     others.

@@ -66,7 +66,7 @@ class BoxPairs:
     excuse: Doubles
 
     def match(self, close_enough: Callable[[float], bool]) -> NDArray[np.int64]:
-        """(N,) the object that each detection takes, or UNMATCHED."""
+        """(N,) index of the object that each detection takes, or UNMATCHED."""
         matched = np.full(len(self.scores), UNMATCHED)
         taken = np.zeros(len(self.objects), dtype=bool)
         for row, (first, close) in enumerate(zip(self.first.tolist(), self.closeness, strict=True)):

@@ -43,7 +43,7 @@ def write_box_predictions(
 ) -> None:
     """Run a detector over a split and write a line for each frame (`data.boxes.box_records`).
 
-    Where labels stand only in a camera's view the detector gets no other points.
+    The detector gets points (N, 4), only those in the camera's view where labels stand nowhere else.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.

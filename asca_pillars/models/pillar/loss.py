@@ -35,7 +35,7 @@ class LossTerms(NamedTuple):
 
     @property
     def total(self) -> Tensor:
-        """Eq. (15), the scalar that training minimizes."""
+        """Eq. (15), the unitless scalar that training minimizes."""
         return self.box + self.classification + self.direction
 
 

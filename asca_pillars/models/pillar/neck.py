@@ -72,7 +72,7 @@ class SparseRPNNeck(RPNLayers):
         self.rule: MaskRule = rule
 
     def forward(self, pillars: Tensor, tables: NeckTables[Tensor]) -> Tensor:
-        """Pillar features (P, C) -> (M, out_channels) at M active head cells."""
+        """Unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
             for number, (convolution, norm) in enumerate(_convolutions(block)):

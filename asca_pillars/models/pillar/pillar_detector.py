@@ -85,7 +85,7 @@ class PillarDetector(nn.Module):
         return PillarOutputs(self(batch.pillars), batch.pillars.neck)
 
     def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
-        """The terms of eq. (15) by name, scalars, from head maps (B, channels, H, W), see `detection_loss`.
+        """The terms of eq. (15) by name, unitless scalars, from head maps (B, channels, H, W), see `detection_loss`.
 
         Anchors at inactive head cells take no part.
         """

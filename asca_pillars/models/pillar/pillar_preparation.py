@@ -103,7 +103,7 @@ class PillarPreparation:
         )
 
     def place(self, pillars: Pillars) -> Placement:
-        """What the neck reads of a frame besides the features."""
+        """What the neck reads of a frame besides the features: tables of indices (M, 9), and where pillars go on the map."""
         grid = self.spec.grid
         pooling = map_cells(pillars.cells, grid)
         if self.active_cells is None:
@@ -116,7 +116,7 @@ def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = (
     """Pillars of several frames, one frame's after the other's.
 
     Args:
-        frames: at least one.
+        frames: at least one, each with features (M, 9), positions among them in metres, and flat indices (P,).
         placements: of each frame; without them the neck is dense and its map the pillars' own.
     """
     frame_pillars = [len(frame.cells) for frame in frames]

@@ -30,7 +30,7 @@ class Percentiles:
 
     @classmethod
     def of(cls, times_ms: list[float] | NDArray[np.float64]) -> "Percentiles":
-        """Of times, such as (rounds, frames), over all of them."""
+        """Of times (F,), or (R, F) of R rounds, in ms, over all of them."""
         return cls(*(float(np.percentile(times_ms, q)) for q in (50, 95, 0)))
 
 

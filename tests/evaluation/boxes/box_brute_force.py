@@ -183,7 +183,7 @@ def argoverse(frames: list[EvaluatedFrame], name: str) -> tuple[float, list[floa
                 best = [max(precision for _, precision in curve[n:]) for n in range(len(curve))]
                 total += interpolate(SAMPLES[percent], [recall for recall, _ in curve], best)
         aps.append(total / 101)
-    each = [errors_of(box, own, flat=False) for away, box, own in firsts if away < 2]
+    each = [errors_of(box, own, flat=False) for away, box, own in firsts if own is not None and away < 2]
     errors = [sum(e[k] for e in each) / len(each) for k in range(3)] if each else [2.0, 1.0, math.pi]
     ap = sum(aps) / 4
     cds = ap * sum(1 - error / worst for error, worst in zip(errors, (2, 1, math.pi), strict=True)) / 3

@@ -143,7 +143,8 @@ def test_argoverse_gives_an_object_to_the_best_score_alone() -> None:
     assert score.ap == pytest.approx(100 * 100.5 / 101 / 4) and score.ate_m == 2 and score.cds == 0
     # nuScenes lets it: at 0.5, 1 and 2 m precision rises linearly from 0 to 1/2 at recall 1, and exceeds 0.1 by
     # 0.005 k at the 80 recalls beyond 0.2: 0.005 * 3240 / 90 / 0.9.
-    assert nuscenes_scores([frame([box(10)], found)], ["Car"])[0].ap_by_distance[:3] == pytest.approx([20] * 3)
+    ap_by_distance = nuscenes_scores([frame([box(10)], found)], ["Car"])[0].ap_by_distance
+    assert ap_by_distance is not None and ap_by_distance[:3] == pytest.approx([20] * 3)
 
 
 def test_argoverse_limits_range_and_number() -> None:

@@ -1,6 +1,8 @@
 """The sparse neck against dense convolutions with masks, in training and in evaluation."""
 
 import dataclasses
+import operator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, PillarOutputs, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, Placement, batch_pillars
 from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.tables.neck_tables import NeckTableBuilder
+from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder
 from tests.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(2, 1, 1), upsample_channels=8)
@@ -22,17 +24,17 @@ RULES = ("sub", "fine")
 UNSEEN_BY_SCORES = ("head.boxes.weight", "head.boxes.bias", "head.directions.weight", "head.directions.bias")
 
 
-def make_detector(rule: str | None) -> PillarDetector:
+def make_detector(rule: MaskRule | None) -> PillarDetector:
     torch.manual_seed(0)
     network = NETWORK if rule is None else dataclasses.replace(NETWORK, neck="sparse", active_cells=rule)
     return build_pillar_detector(PillarModel(spec=SPEC, network=network))
 
 
-def make_batch(rule: str | None, seeds: tuple[int, ...] = (0, 1), *, training: bool = True) -> PillarBatch:
+def make_batch(rule: MaskRule | None, seeds: tuple[int, ...] = (0, 1), *, training: bool = True) -> PillarBatch:
     frames = [SPEC.pillarize(make_scene(seed)[0]) for seed in seeds]
     if rule is None:
         return batch_pillars(frames)
-    builder = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule, training=training)  # type: ignore[arg-type]
+    builder = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule, training=training)
     return batch_pillars(frames, [Placement(None, builder.build(frame.cells)) for frame in frames])
 
 
@@ -46,7 +48,7 @@ def dense_rows(detector: PillarDetector, batch: PillarBatch) -> torch.Tensor:
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("training", [False, True])
-def test_tables_and_masks_are_the_same_function(rule: str, training: bool) -> None:
+def test_tables_and_masks_are_the_same_function(rule: MaskRule, training: bool) -> None:
     detector, batch = make_detector(rule).double().train(training), make_batch(rule)
     batch = batch._replace(features=batch.features.double())
     names, parameters = zip(*detector.named_parameters(), strict=True)
@@ -59,11 +61,11 @@ def test_tables_and_masks_are_the_same_function(rule: str, training: bool) -> No
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
     for name, one, other in zip(names, gradients, expected_gradients, strict=True):
         if name not in UNSEEN_BY_SCORES:
-            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8, msg=lambda text, name=name: name + text)
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8, msg=partial(operator.add, name))
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_single_precision_agrees_to_a_hundred_thousandth(rule: str) -> None:
+def test_single_precision_agrees_to_a_hundred_thousandth(rule: MaskRule) -> None:
     detector, batch = make_detector(rule).eval(), make_batch(rule)
     with torch.inference_mode():
         expected = detector.head.at_cells(dense_rows(detector, batch))

@@ -66,7 +66,7 @@ def test_only_what_takes_part_counts() -> None:
 def test_nothing_positive_leaves_a_finite_loss_with_gradients() -> None:
     residuals = torch.zeros(2, 7, requires_grad=True)
     refine_loss(outputs([0.0, 0.0], residuals, [0.0]), targets([0, 0], [False, False], [0])).total.backward()
-    assert torch.isfinite(residuals.grad).all()
+    assert residuals.grad is not None and torch.isfinite(residuals.grad).all()
 
 
 def test_a_batch_without_positive_keypoints_does_not_outweigh_others() -> None:

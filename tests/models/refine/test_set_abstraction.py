@@ -1,14 +1,17 @@
 """The split first layer against the equation as printed."""
 
 import copy
+from typing import TypeAlias
 
 import pytest
 import torch
 
 from asca_pillars.models.refine.set_abstraction import SetAbstraction
 
+Balls: TypeAlias = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
-def balls(dtype: torch.dtype, channels: int = 2, offset_m: float = 0.0) -> tuple[torch.Tensor, ...]:
+
+def balls(dtype: torch.dtype, channels: int = 2, offset_m: float = 0.0) -> Balls:
     """12 points, 5 queries, and 4 indices of each; the second query has an empty ball."""
     generator = torch.Generator().manual_seed(3)
     positions = torch.randn(12, 3, generator=generator, dtype=dtype) + offset_m
@@ -17,6 +20,13 @@ def balls(dtype: torch.dtype, channels: int = 2, offset_m: float = 0.0) -> tuple
     indices = torch.randint(0, 12, (5, 4), generator=generator, dtype=torch.int32)
     indices[1] = 12
     return positions, features, queries, indices
+
+
+def first_gradient(module: SetAbstraction) -> torch.Tensor:
+    """Of the first layer's weight."""
+    layer = module.layers[0]
+    assert isinstance(layer, torch.nn.Linear) and layer.weight.grad is not None
+    return layer.weight.grad
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -30,8 +40,8 @@ def test_split_is_naive(training: bool, channels: int) -> None:
     # Batch statistics and gradients, too.
     for module, output in ((split, split(*arguments)), (naive, naive.naive(*arguments))):
         output.square().sum().backward()
-        assert module.layers[0].weight.grad.abs().sum() > 0
-    torch.testing.assert_close(split.layers[0].weight.grad, naive.layers[0].weight.grad)
+        assert first_gradient(module).abs().sum() > 0
+    torch.testing.assert_close(first_gradient(split), first_gradient(naive))
     torch.testing.assert_close(split.norms[0].running_mean, naive.norms[0].running_mean)
 
 
@@ -39,14 +49,17 @@ def test_float32_far_from_the_sensor() -> None:
     torch.manual_seed(0)
     module = SetAbstraction(2, (6, 5)).eval()
     arguments = balls(torch.float32, offset_m=80.0)
-    exact = copy.deepcopy(module).double().naive(*(part.double() for part in arguments[:3]), arguments[3])
+    positions, features, queries, indices = arguments
+    exact = copy.deepcopy(module).double().naive(positions.double(), features.double(), queries.double(), indices)
     torch.testing.assert_close(module(*arguments).double(), exact, atol=5e-5, rtol=0)
 
 
 def test_an_empty_ball_is_the_mlp_of_zero_wherever_it_is() -> None:
     torch.manual_seed(0)
     module = SetAbstraction(2, (6, 5)).eval()
-    torch.nn.init.normal_(module.norms[0].bias)
+    norm = module.norms[0]
+    assert isinstance(norm, torch.nn.BatchNorm1d)
+    torch.nn.init.normal_(norm.bias)
     positions, features, queries, indices = balls(torch.float32)
     zero = module._after_first(torch.zeros(1, 6))[0]
     for moved in (queries, queries + 50):
