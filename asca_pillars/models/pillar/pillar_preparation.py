@@ -103,7 +103,7 @@ class PillarPreparation:
         )
 
     def place(self, pillars: Pillars) -> Placement:
-        """What the neck reads of a frame besides the features: tables of indices (M, 9), and where pillars go on the map."""
+        """What the neck reads besides the features: tables of indices (M, 9), and where pillars go on the map."""
         grid = self.spec.grid
         pooling = map_cells(pillars.cells, grid)
         if self.active_cells is None:
