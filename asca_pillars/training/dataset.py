@@ -138,8 +138,7 @@ class KittiDataset(Dataset[Sample | AscaError]):
             frame = insert_objects(frame, self.inserter, np.random.default_rng((self.seed, epoch, number, 1)))
         if self.augmentation is not None and rng is not None:
             frame = augment(frame, self.augmentation, rng)
-        frame = within_ranges(frame, self.spec.ranges)
-        return Sample(frame, self.preparation.prepare(frame, rng))
+        return Sample(within_ranges(frame, self.spec.ranges), self.preparation.prepare(frame, rng))
 
 
 def open_dataset(root: str | Path, config: Config, *, training: bool) -> KittiDataset:
@@ -156,7 +155,7 @@ def open_dataset(root: str | Path, config: Config, *, training: bool) -> KittiDa
     return KittiDataset(
         split,
         spec,
-        build_preparation(config.model),
+        build_preparation(config.model, split, data),
         camera_view=data.camera_view,
         min_points=data.min_points,
         augmentation=config.augment if training else None,

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from rich.console import Console
 from asca_pillars.config import Config, TrainConfig
 from asca_pillars.errors import TrainingError
 from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.refine_config import RefineModel
+from asca_pillars.second_stage.open_first_stage import with_first_stage
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (
     LAST,
@@ -64,7 +67,10 @@ def train(
             the devices are not there, or a loss became infinite or NaN.
         TrainingInterruptedError: Ctrl-C; the run is saved.
         DatasetError, ScanError: the data cannot be read.
+        BundleError, ExportError, ConfigError: the first stage of two cannot be used.
     """
+    if isinstance(config.model, RefineModel):
+        config = replace(config, model=with_first_stage(config.model))
     out = Path(out)
     checkpoints = out / "checkpoints"
     data = DetectionData(config, data_root)

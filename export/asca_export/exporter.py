@@ -15,6 +15,7 @@ from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
 from asca_export.int8 import quantize_bundle
 from asca_export.parity import prove_parity
+from asca_pillars.config import PillarModel
 from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
@@ -58,7 +59,7 @@ def export_bundle(
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
-    if not isinstance(detector, PillarDetector):
+    if not (isinstance(config.model, PillarModel) and isinstance(detector, PillarDetector)):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
     say("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.geometry.targets import Targets, assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -68,6 +68,7 @@ class PillarPreparation:
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedPillars:
         """Pillars of a frame and the targets of its anchors; `rng` draws what the limits drop."""
         spec = self.spec
+        frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points, rng)
         return PreparedPillars(pillars, assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels))
 
