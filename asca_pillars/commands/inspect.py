@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from asca_pillars.commands.extras import require
 from asca_pillars.commands.options import JsonOption
 
 
@@ -39,7 +40,13 @@ def inspect(
 
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
-    spec, min_points, view = settings.model.spec, settings.data.min_points, settings.data.camera_view
+    model = settings.model
+    if model.kind == "pillar_refine":
+        require("train")
+        from asca_pillars.second_stage.open_first_stage import with_first_stage
+
+        model = with_first_stage(model)
+    spec, min_points, view = model.spec, settings.data.min_points, settings.data.camera_view
     frames_of = KittiSplit(data, settings.data.train_set if split is None else split)
     inspection = inspect_dataset(frames_of, spec, settings.data, frames=frames, progress=True)
     found = findings(inspection, spec, min_points)

@@ -79,11 +79,18 @@ class Proposed:
 
 def propose_on(stage: FirstStage, points: NDArray[np.float32], settings: FirstStageSettings) -> Proposed:
     """Run the first stage on the finite points (N, 4) of one scan."""
-    maps, neck = stage(points)
-    proposals = propose(maps, stage.spec, settings.proposals)
+    return proposed_from(stage(points), points, stage.spec, settings)
+
+
+def proposed_from(
+    found: FirstPass, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
+) -> Proposed:
+    """What the second stage sees of `found`, the first stage's answer to the finite points (N, 4) of one scan."""
+    maps, neck = found
+    proposals = propose(maps, spec, settings.proposals)
     near = points[near_boxes(points, proposals.boxes, settings.keypoints.margin_m)]
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
-    cells, weights = bilinear_cells(keypoints, *stage.spec.head_centers_m())
+    cells, weights = bilinear_cells(keypoints, *spec.head_centers_m())
     rows = neck.reshape(-1, neck.shape[2])
     bev = sum(rows[cells[:, corner]] * weights[:, corner, None] for corner in range(4))
     return Proposed(proposals, keypoints, np.asarray(bev, np.float32))

@@ -18,7 +18,7 @@ OLDEST = (1, 25)
 # It turns layers that an 8-bit bundle keeps in floating point into 8-bit ones of its own making.
 _DISABLED_OPTIMIZERS = ["WeightBiasQuantization"]
 _ERRORS_ONLY = 3  # onnxruntime's severities: 0 verbose, 1 info, 2 warning, 3 error
-_TYPES = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(int64)": "int64"}
+_TYPES = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(int32)": "int32", "tensor(int64)": "int64"}
 
 
 @dataclass(frozen=True)

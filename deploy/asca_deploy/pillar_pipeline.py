@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
-from asca_deploy.bundle import BACKBONE, ENCODER, Bundle, CanvasFormat
+from asca_deploy.bundle import BACKBONE, ENCODER, NECK, Bundle, CanvasFormat
 from asca_deploy.graph import Session, Tensor, check_interface
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.geometry.decode import HeadMaps, decode
@@ -16,6 +16,7 @@ from asca_pillars.geometry.detections import Detections
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES, PillarCounts, Pillars, pillarize
+from asca_pillars.second_stage.first_stage import FirstPass
 
 Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 
@@ -117,6 +118,13 @@ class PillarPipeline:
         laps.append(("neck+head", perf_counter()))
         return maps
 
+    def infer_with_neck(self, prepared: PreparedPillars, laps: Laps) -> FirstPass:
+        """As `infer`, of a bundle of kind pillar_refine: also what its second stage reads."""
+        *maps, neck = self._backbone.run((*HeadMaps._fields, NECK), {"canvas": prepared.canvas.image})
+        self._free.append(prepared.canvas)
+        laps.append(("neck+head", perf_counter()))
+        return FirstPass(_channels_first(maps), neck[0])
+
     def finish(self, raw: Maps, laps: Laps) -> Detections:
         """Head maps -> boxes above the score threshold that survive the rotated NMS."""
         detections = decode(raw, self._anchors, self.spec.classes, self.spec.post)
@@ -141,8 +149,12 @@ class PillarPipeline:
     def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
         """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
         channels_last = self._backbone.run(HeadMaps._fields, {"canvas": canvas})
-        scores, boxes, directions = (maps[0].transpose(2, 0, 1) for maps in channels_last)
-        return HeadMaps(scores, boxes, directions)
+        return _channels_first(channels_last)
+
+
+def _channels_first(channels_last: list[NDArray[Any]]) -> Maps:
+    scores, boxes, directions = (maps[0].transpose(2, 0, 1) for maps in channels_last)
+    return HeadMaps(scores, boxes, directions)
 
 
 def _open_encoder(folder: Path, bundle: Bundle) -> Session:
@@ -169,6 +181,8 @@ def _open_backbone(
         name: Tensor("float32", (1, *grid.head_shape, channels * anchors))
         for name, channels in (("scores", 1), ("boxes", 7), ("directions", 2))
     }
+    if bundle.refine is not None:
+        outputs[NECK] = Tensor("float32", (1, *grid.head_shape, bundle.refine.bev_channels))
     return check_interface(path, providers.open_session(path, provider, precision, threads), inputs, outputs)
 
 

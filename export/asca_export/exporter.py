@@ -77,16 +77,7 @@ def export_bundle(
             quantization=None,
             expected_input=expected or measure_expected_input(scans, config.data.camera_view),
             expected_input_from="training" if expected else "export",
-            provenance=Provenance(
-                command=command,
-                created=datetime.datetime.now(datetime.UTC).date().isoformat(),
-                git_revision=git_revision(),
-                trained_on=trained_on,
-                seed=config.train.seed,
-                steps=checkpoint.steps,
-                versions=package_versions(),
-                machine=cpu_model(),
-            ),
+            provenance=provenance(checkpoint, trained_on, command),
             license=LICENSE,
         )
         draft = graphs.sign(folder, draft)
@@ -97,3 +88,17 @@ def export_bundle(
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, say)
     return bundle
+
+
+def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provenance:
+    """Where the weights of a checkpoint come from; see `export_bundle` for the arguments."""
+    return Provenance(
+        command=command,
+        created=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        git_revision=git_revision(),
+        trained_on=trained_on,
+        seed=checkpoint.config.train.seed,
+        steps=checkpoint.steps,
+        versions=package_versions(),
+        machine=cpu_model(),
+    )
