@@ -1,6 +1,7 @@
 """The pooled map in PyTorch: against the runtime's pooling, frames apart, gradients through the maximum."""
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -17,13 +18,13 @@ NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_con
 EMPTY = np.empty((0, 4), np.float32)
 
 
-def make_detector(neck: str) -> PillarDetector:
+def make_detector(neck: Literal["dense", "sparse"]) -> PillarDetector:
     torch.manual_seed(0)
     return build_pillar_detector(PillarModel(spec=POOLED, network=dataclasses.replace(NETWORK, neck=neck))).eval()
 
 
 @pytest.mark.parametrize("neck", ["dense", "sparse"])
-def test_frames_are_pooled_as_the_runtime_does_and_stay_apart(neck: str) -> None:
+def test_frames_are_pooled_as_the_runtime_does_and_stay_apart(neck: Literal["dense", "sparse"]) -> None:
     detector = make_detector(neck)
     frames = [POOLED.pillarize(points) for points in (make_scene(0)[0], EMPTY, make_scene(1)[0])]
     placements = [detector.preparation.place(frame) for frame in frames]
