@@ -14,6 +14,7 @@ from pydantic import Discriminator, Tag
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.refine_config import RefineModel
 from asca_pillars.schema import Strict, parse
 from asca_pillars.tables.neck_tables import MaskRule
 from asca_pillars.yaml_text import MAX_CHARACTERS, parse_yaml
@@ -96,8 +97,10 @@ def _family(settings: Any) -> Any:
     return None if kind is None else str(kind)
 
 
-# A family joins as `| Annotated[OtherModel, Tag("other")]`; `models.build` is where it is built.
-ModelConfig: TypeAlias = Annotated[Annotated[PillarModel, Tag("pillar")], Discriminator(_family)]
+# A family joins as one more `Annotated[OtherModel, Tag("other")]`; `models.build` is where it is built.
+ModelConfig: TypeAlias = Annotated[
+    Annotated[PillarModel, Tag("pillar")] | Annotated[RefineModel, Tag("pillar_refine")], Discriminator(_family)
+]
 
 
 @dataclass(frozen=True)
@@ -242,6 +245,25 @@ class Config(Strict):
             raise ConfigError(f"augment.insert.proportions.{unknown[0]}: no such class; there are {', '.join(names)}")
         if wanted and not any(wanted.values()):
             raise ConfigError("augment.insert.proportions: all are 0; set augment.insert.method=none to insert nothing")
+        if isinstance(self.model, RefineModel):
+            self._require_still_objects()
+
+    def _require_still_objects(self) -> None:
+        """The first stage has seen each frame once, as it is: nothing may move in it but the whole scene."""
+        augment = self.augment
+        moves = {
+            "insert.method": augment.insert.method,
+            "object_rotation_rad": augment.object_rotation_rad,
+            "object_shift_m": augment.object_shift_m,
+            "object_cut_probability": augment.object_cut_probability,
+        }
+        for name, value in moves.items():
+            if value not in ("none", 0):
+                still = "none" if name == "insert.method" else 0
+                raise ConfigError(
+                    f"augment.{name} = {value}: model.kind pillar_refine learns from proposals that are computed once, "
+                    f"so only the scene as a whole may move; set augment.{name}={still}"
+                )
 
 
 def shipped_configs(kind: str = "") -> dict[str, Path]:

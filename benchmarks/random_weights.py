@@ -18,8 +18,9 @@ from torch import nn
 
 from asca_deploy import sample_scan_path
 from asca_export.exporter import MIN_SCANS, export_bundle
-from asca_pillars.config import load_config
+from asca_pillars.config import PillarModel, load_config
 from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import ConfigError
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
@@ -51,6 +52,8 @@ def random_weights(config: str, points: NDArray[np.float32]) -> Checkpoint:
     """A network with random weights, normalized on a scan (N, 4), so that its maps depend on the points."""
     torch.manual_seed(0)
     resolved = load_config(config)
+    if not isinstance(resolved.model, PillarModel):
+        raise ConfigError(f"{config}: model.kind {resolved.model.kind}; give a configuration of kind pillar")
     network = build_pillar_detector(resolved.model).train()
     norms = [module for module in network.modules() if isinstance(module, (nn.BatchNorm1d, nn.BatchNorm2d))]
     for norm in norms:

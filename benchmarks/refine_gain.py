@@ -26,17 +26,16 @@ from asca_pillars.evaluation.predictions import read_predictions, read_truth, wr
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder
-from asca_pillars.models.refine.pillar_refiner import PillarRefiner
+from asca_pillars.models.refine.refine_detector import build_refiner
 from asca_pillars.models.refine.refine_loss import RefineTerms
-from asca_pillars.models.refine.roi_head import RoiHead
+from asca_pillars.models.second_stage.proposal_cache import ProposalCache
+from asca_pillars.models.second_stage.refine_sample import RefineSample, prepare_sample
+from asca_pillars.models.second_stage.refine_training import sample_batches, train_refiner
+from asca_pillars.models.second_stage.refined_detector import judge
+from asca_pillars.points.first_stage import FirstStageSettings
+from asca_pillars.points.refine_geometry import RefineSettings
 from asca_pillars.points.refined_detections import refined_detections
-from asca_pillars.second_stage.first_stage import FirstStageSettings
-from asca_pillars.second_stage.proposal_cache import ProposalCache
-from asca_pillars.second_stage.refine_geometry import RefineSettings
-from asca_pillars.second_stage.refine_sample import RefineSample, prepare_sample
-from asca_pillars.second_stage.refine_training import sample_batches, train_refiner
-from asca_pillars.second_stage.refined_detector import judge
+from asca_pillars.refine_config import RefineConfig, RefineNetwork
 from asca_pillars.system import cpu_model
 
 
@@ -70,10 +69,11 @@ def main(
     def prepare(number: int, rng: np.random.Generator) -> RefineSample:
         frame_id = training.frame_ids[number]
         frame = within_ranges(read_frame(training, frame_id, stage.spec.class_names), stage.spec.ranges)
-        return prepare_sample(frame, caches[0].read(frame_id), settings, rois, rng)
+        return prepare_sample(frame, caches[0].files.read(frame_id), settings, rois, rng)
 
-    bev_channels = caches[0].read(training.frame_ids[0]).bev.shape[1]
-    network = build(bev_channels, len(stage.spec.classes), settings, width)
+    bev_channels = caches[0].files.read(training.frame_ids[0]).bev.shape[1]
+    widths = RefineNetwork((width // 2, width), 2 * width, (width, width), 4 * width)
+    network = build_refiner(bev_channels, len(stage.spec.classes), RefineConfig(neighbors=settings, network=widths))
     means = np.zeros(4)
 
     def report(step: int, terms: RefineTerms) -> None:
@@ -96,7 +96,7 @@ def main(
     post, class_names = stage.spec.post, stage.spec.class_names
     found = {}
     for frame_id in checking.frame_ids:
-        proposed, points = caches[1].read(frame_id), checking.points(frame_id, camera_view=True)
+        proposed, points = caches[1].files.read(frame_id), checking.points(frame_id, camera_view=True)
         found[frame_id] = proposed.proposals, judge(network, points, proposed, settings)
 
     def detections(frame_id: str, new_scores: bool, new_boxes: bool) -> Detections:
@@ -115,14 +115,6 @@ def main(
         values = moderate_ap(checking, class_names, partial(detections, new_scores=scores, new_boxes=boxes))
         rows.append((name, *(f"{value:.1f}" for value in values)))
     print(markdown_table(("3D AP, moderate, R40", *class_names), rows, left=1))
-
-
-def build(bev_channels: int, classes: int, settings: RefineSettings, width: int) -> PillarRefiner:
-    """A second stage with random weights."""
-    encode = KeypointEncoder(1, bev_channels, len(settings.ball_radii_m), (width // 2, width), 2 * width)
-    radii, roi_channels = len(settings.grid_radii_m), classes + 4
-    head = RoiHead(2 * width, settings.grid_size, radii, (width, width), roi_channels, 4 * width, dropout=0.1)
-    return PillarRefiner(encode, head)
 
 
 def moderate_ap(

@@ -30,6 +30,7 @@ from asca_export.quantize import STEPS, canvas_steps, layer_names, scale_to_step
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
 from asca_export.sparse_quantize import SparseSample, quantized_backbone
+from asca_pillars.config import PillarModel
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps
@@ -69,8 +70,8 @@ class _Forms:
 
     def __init__(self, config: str, points: NDArray[np.float32], work: Path) -> None:
         dense = random_weights(config, points)
-        assert isinstance(dense.detector, PillarDetector)
         model = dense.config.model
+        assert isinstance(dense.detector, PillarDetector) and isinstance(model, PillarModel)
         network, self.spec = replace(model.network, neck="sparse"), model.spec
         self.sparse = build_pillar_detector(replace(model, network=network)).eval()
         self.sparse.load_state_dict(dense.detector.state_dict())

@@ -23,7 +23,9 @@ from asca_pillars.config import (
 )
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ClassSpec
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
+from asca_pillars.models.build import build_model
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.schema import parse, to_dict
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
@@ -46,6 +48,7 @@ def refusal(path: Path, *overrides: str) -> str:
 def test_defaults_are_the_paper_s() -> None:
     """DESIGN's reading of section 3 and 4.1: grid, limits, anchors, widths of Table 1, losses, recipe."""
     config = Config()
+    assert isinstance(config.model, PillarModel)
     spec = config.model.spec
     assert (spec.grid.x_range_m, spec.grid.y_range_m, spec.grid.z_range_m) == ((0, 69.12), (-39.68, 39.68), (-3, 1))
     assert (spec.grid.v_max_m, spec.grid.v_y_m, spec.grid.zones) == (0.32, 0.16, 3)
@@ -76,8 +79,10 @@ def test_configs_that_ship_load_and_build(path: Path) -> None:
     config = load_config(path)
     assert load_config(path.stem) == config, "found by its name too"
     with torch.device("meta"):  # layers and shapes, without the time that random weights take
-        detector = build_pillar_detector(config.model)
-    assert detector.grid == config.model.spec.grid
+        detector = build_model(with_first_stage(config.model) if config.model.kind == "pillar_refine" else config.model)
+    if config.model.kind == "pillar_refine":
+        return
+    assert isinstance(detector, PillarDetector) and detector.grid == config.model.spec.grid
     scores = detector.head.scores.weight
     assert scores.shape == (2 * len(config.model.spec.classes), 3 * config.model.network.upsample_channels, 1, 1)
 
@@ -89,6 +94,7 @@ def test_there_are_configs() -> None:
 
 def test_the_model_for_simulated_streets_has_the_papers_width_and_a_sparse_neck() -> None:
     config = load_config("asca_sim")
+    assert isinstance(config.model, PillarModel)
     assert config.model.network == NetworkConfig(neck="sparse", active_cells="fine")
     assert config.model.spec.grid.zones == 1 and config.train.ema == 0.999 and config.train.schedule == "one_cycle"
     assert [(spec.positive_iou, spec.negative_iou) for spec in config.model.spec.classes] == [
@@ -101,6 +107,7 @@ def test_the_model_for_simulated_streets_has_the_papers_width_and_a_sparse_neck(
 def test_the_baseline_is_pointpillars() -> None:
     """DESIGN 4.1: K = 1 and V_max = 0.16 m are PointPillars, 432 x 496 pillars without attention."""
     config = load_config(next(path for path in CONFIGS if path.stem == "pointpillars_kitti"))
+    assert isinstance(config.model, PillarModel)
     assert (config.model.spec.grid.nx, config.model.spec.grid.ny, config.model.network.cpa) == (432, 496, "none")
 
 
@@ -174,6 +181,7 @@ def test_a_file_holds_what_differs(tmp_path: Path) -> None:
         write(tmp_path, "train: {epochs: 3, learning_rate: 1e-3}\nmodel:\n  spec: {grid: {zones: 1}}\n")
     )
     assert config.train == TrainConfig(epochs=3, learning_rate=1e-3) and config.model.spec.grid.zones == 1
+    assert isinstance(config.model, PillarModel)
     assert config.model.loss == LossConfig() and config.model.spec.classes == Config().model.spec.classes
     assert load_config(write(tmp_path, "# only a comment\n")) == Config()
 
@@ -206,6 +214,7 @@ def test_overrides_win(tmp_path: Path) -> None:
     )
     config = load_config(path, overrides)
     assert (config.train.epochs, config.train.batch_size) == (7, 2)  # the last of two wins, the others stay
+    assert isinstance(config.model, PillarModel)
     assert (config.model.network.cpa, config.augment.scale, config.data.camera_view) == ("none", (0.9, 1.1), False)
     assert (config.model.spec.grid.nx, config.name) == (432, "a=b")
 

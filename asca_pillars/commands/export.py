@@ -51,6 +51,7 @@ def export(
 
     from asca_deploy.bundle import MANIFEST
     from asca_export.exporter import export_bundle
+    from asca_export.refine_exporter import export_refine_bundle
     from asca_pillars.commands.export_steps import (
         CALIBRATION_SCANS,
         CALIBRATION_SEED,
@@ -65,6 +66,7 @@ def export(
     from asca_pillars.errors import ConfigError
     from asca_pillars.files import require_replaceable
     from asca_pillars.models.checkpoint import load_checkpoint
+    from asca_pillars.refine_config import RefineModel
 
     console = Console(markup=False)
     require_replaceable(out, "asca export", MANIFEST)  # before minutes of work
@@ -73,6 +75,9 @@ def export(
     loaded = loaded._replace(config=replace(loaded.config, model=replace(loaded.config.model, spec=spec)))
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
+    refined = isinstance(loaded.config.model, RefineModel)
+    if int8 and refined:
+        raise ConfigError(f"--int8: {checkpoint} is of kind pillar_refine, which is exported in float32; leave it out")
     if loaded.expected_input is None and scans is None:
         raise ConfigError(
             f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
@@ -84,15 +89,21 @@ def export(
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
     environment = run_environment(checkpoint)
     with console.status("Exporting") as status:
-        bundle = export_bundle(
-            loaded,
-            out,
-            points,
-            trained_on=trained_on,
-            command=environment.get("command", "not recorded"),
-            calibration=calibration,
-            progress=status.update,
-        )
+        command = environment.get("command", "not recorded")
+        if refined:
+            bundle = export_refine_bundle(
+                loaded, out, points, trained_on=trained_on, command=command, progress=status.update
+            )
+        else:
+            bundle = export_bundle(
+                loaded,
+                out,
+                points,
+                trained_on=trained_on,
+                command=command,
+                calibration=calibration,
+                progress=status.update,
+            )
     parity = bundle.parity
     assert parity is not None, "export_bundle proves it"
     console.print(

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from asca_pillars.commands.extras import require
 from asca_pillars.commands.options import JsonOption
 
 
@@ -46,12 +47,19 @@ def inspect(
     from asca_pillars.data.inspection.findings import findings
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
     from asca_pillars.data.open_split import open_split
-    from asca_pillars.errors import DatasetError
+    from asca_pillars.errors import ConfigError, DatasetError
     from asca_pillars.files import write_json
 
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
     frames_of = open_split(data, settings.data.train_set if split is None else split)
+    if settings.model.kind == "pillar_refine":
+        if propose is not None:
+            raise ConfigError(f"--propose {propose}: classes of model.kind pillar_refine are its first stage's")
+        require("train")
+        from asca_pillars.models.second_stage.open_first_stage import with_first_stage
+
+        settings = dataclasses.replace(settings, model=with_first_stage(settings.model))
     if propose is not None:
         settings = propose_config(frames_of, settings, propose, frames, console)
     spec, min_points = settings.model.spec, settings.data.min_points

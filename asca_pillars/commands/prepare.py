@@ -15,10 +15,11 @@ def prepare(
     override: OverridesOption = None,
     workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
 ) -> None:
-    """Compute once what GT-Aug and RS-Aug need of a dataset: the object database and the maps of free ground.
+    """Compute once what training needs of a dataset.
 
-    Training does the same on first use; what is there and unchanged is used again. Without an insertion method in
-    the config, what RS-Aug needs is prepared.
+    For GT-Aug and RS-Aug the object database and the maps of free ground, for a second stage the proposals of its
+    first. Training does the same on first use; what is there and unchanged is used again. Without an insertion method
+    in the config, what RS-Aug needs is prepared.
     """
     from dataclasses import replace
 
@@ -32,6 +33,12 @@ def prepare(
     from asca_pillars.data.insertion.insert_objects import prepare_inserter
     from asca_pillars.data.open_split import open_split
 
+    if settings.model.kind == "pillar_refine":
+        from asca_pillars.models.build import build_preparation
+
+        for name in (settings.data.train_set, settings.data.val_set):
+            build_preparation(settings.model, open_split(data, name), settings.data)
+        return
     # A config that is not decided yet gets what either method needs.
     insert = settings.augment.insert
     insert = insert if insert.method != "none" else replace(insert, method="rs_aug")

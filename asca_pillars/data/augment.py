@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.config import AugmentConfig
 from asca_pillars.data.corruption import corrupt_objects, lose_reflectance
-from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import bev_intersection
 
@@ -23,15 +23,25 @@ def augment(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Generator
     move_objects(frame, config, rng)
     frame = replace(frame, points=corrupt_objects(frame.points, frame.boxes, config, rng))
     lose_reflectance(frame.points, config, rng)
-    if rng.random() < config.flip_probability:
-        flip_y(frame)
-    rotate(frame, rng.uniform(-config.rotation_rad, config.rotation_rad))
-    scale(frame, rng.uniform(*config.scale))
-    shift_z_m = rng.uniform(-config.shift_z_m, config.shift_z_m)
-    frame.points[:, 2] += shift_z_m
-    frame.boxes[:, 2] += shift_z_m
+    motion = Motion(
+        flipped=rng.random() < config.flip_probability,
+        rotation_rad=rng.uniform(-config.rotation_rad, config.rotation_rad),
+        scale=rng.uniform(*config.scale),
+        shift_z_m=rng.uniform(-config.shift_z_m, config.shift_z_m),
+    )
+    move_scene(frame, motion)
     kept = rng.random(len(frame.points)) >= rng.uniform(0, config.point_dropout)
-    return replace(frame, points=frame.points[kept])
+    return replace(frame, points=frame.points[kept], motion=motion)
+
+
+def move_scene(frame: LabeledFrame, motion: Motion) -> None:
+    """Move points and boxes, in place."""
+    if motion.flipped:
+        flip_y(frame)
+    rotate(frame, motion.rotation_rad)
+    scale(frame, motion.scale)
+    frame.points[:, 2] += motion.shift_z_m
+    frame.boxes[:, 2] += motion.shift_z_m
 
 
 def flip_y(frame: LabeledFrame) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,18 @@ from asca_pillars.geometry.ranges import Ranges
 NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
+class Motion(NamedTuple):
+    """How augmentation moved a scene as a whole, in this order: mirrored about the x axis, turned, scaled, raised."""
+
+    flipped: bool = False
+    rotation_rad: float = 0.0
+    scale: float = 1.0
+    shift_z_m: float = 0.0
+
+
+UNMOVED = Motion()
+
+
 @dataclass(frozen=True)
 class LabeledFrame:
     """One frame with its labels.
@@ -24,12 +37,14 @@ class LabeledFrame:
         points: (N, 4) float32 x, y, z, reflectance.
         boxes: (M, 7) float32.
         labels: (M,) int64 class index, or IGNORED.
+        motion: of the scene since it was read from its file.
     """
 
     frame_id: str
     points: NDArray[np.float32]
     boxes: NDArray[np.float32]
     labels: NDArray[np.int64]
+    motion: Motion = UNMOVED
 
 
 def read_frame(

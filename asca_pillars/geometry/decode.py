@@ -102,7 +102,7 @@ def decode(
     best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
     return Detections(
         boxes[best],
-        _sigmoid(logits[best]),
+        sigmoid(logits[best]),
         labels[best],
         tuple(spec.name for spec in classes),
         non_finite=int(maps.scores.size - np.count_nonzero(np.isfinite(maps.scores)) + dropped),
@@ -140,5 +140,6 @@ def _logit(probability: float) -> float:
     return math.inf if probability >= 1 else math.log(probability / (1 - probability))
 
 
-def _sigmoid(logits: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+def sigmoid(logits: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Scores in [0, 1], any shape."""
     return np.exp(-np.logaddexp(0.0, -logits.astype(np.float64))).astype(np.float32)

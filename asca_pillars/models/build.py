@@ -2,26 +2,42 @@
 
 from typing import assert_never
 
-from asca_pillars.config import ModelConfig, PillarModel
+from asca_pillars.config import DataConfig, ModelConfig, PillarModel
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import PillarPreparation
+from asca_pillars.models.refine.refine_detector import build_refine_detector
+from asca_pillars.models.second_stage.refine_preparation import cached_preparation
 from asca_pillars.models.trainable import Preparation, Trainable
+from asca_pillars.refine_config import RefineModel
 
 
 def build_model(model: ModelConfig) -> Trainable:
-    """The network that `model` describes, with fresh random weights."""
+    """The network that `model` describes, with fresh random weights.
+
+    Raises:
+        ConfigError: `model` does not say enough about its first stage.
+    """
     match model:
         case PillarModel():
             return build_pillar_detector(model)
+        case RefineModel():
+            return build_refine_detector(model)
         case _:
             assert_never(model)
 
 
-def build_preparation(model: ModelConfig) -> Preparation:
-    """What makes batches for that network; without it, for whoever only looks at samples."""
+def build_preparation(model: ModelConfig, split: LabeledSplit, data: DataConfig) -> Preparation:
+    """What makes batches of the frames of `split` for that network; what is computed once per dataset is computed.
+
+    Raises:
+        AscaError: of what is computed once per dataset.
+    """
     match model:
         case PillarModel():
             network = model.network
             return PillarPreparation(model.spec, network.active_cells if network.neck == "sparse" else None)
+        case RefineModel():
+            return cached_preparation(model, split, data)
         case _:
             assert_never(model)

@@ -26,7 +26,7 @@ class Preparation(Protocol):
         """One frame, NumPy arrays only.
 
         Args:
-            frame: points and boxes in the LiDAR frame; every box lies within the detector's ranges.
+            frame: points and boxes in the LiDAR frame; boxes may lie outside the detector's ranges.
             rng: draws what the detector's limits leave to chance; None chooses the same every time.
         """
         ...

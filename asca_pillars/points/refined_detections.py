@@ -1,12 +1,33 @@
 """The last stop of two stages: proposals, confidences and residuals -> Detections."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.decode import PostProcess
+from asca_pillars.geometry.decode import PostProcess, sigmoid
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.geometry.overlap import rotated_nms
 from asca_pillars.points.refinement import decode_refinement
+
+
+def reported_detections(
+    proposals: Detections, confidence: NDArray[np.float32], residuals: NDArray[np.float32], spec: DetectorSpec
+) -> Detections:
+    """Refined boxes whose scores reach the thresholds of `spec`, best first, after its suppression.
+
+    Args:
+        proposals: R of them.
+        confidence: (R,) logits.
+        residuals: (R, 7), see `decode_refinement`. Rows that are not finite are left out and counted.
+    """
+    finite = np.isfinite(confidence) & np.isfinite(residuals).all(axis=1)
+    scores = sigmoid(np.where(finite, confidence, 0))
+    thresholds = np.array([item.score_threshold for item in spec.classes])
+    kept = np.flatnonzero(finite & (scores >= thresholds[proposals.labels]))
+    found = refined_detections(proposals[kept], scores[kept], residuals[kept], spec.post)
+    return replace(found, non_finite=int((~finite).sum()))
 
 
 def refined_detections(

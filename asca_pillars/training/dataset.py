@@ -139,8 +139,7 @@ class LabeledDataset(Dataset[Sample | AscaError]):
             frame = insert_objects(frame, self.inserter, np.random.default_rng((self.seed, epoch, number, 1)))
         if self.augmentation is not None and rng is not None:
             frame = augment(frame, self.augmentation, rng)
-        frame = within_ranges(frame, self.spec.ranges)
-        return Sample(frame, self.preparation.prepare(frame, rng))
+        return Sample(within_ranges(frame, self.spec.ranges), self.preparation.prepare(frame, rng))
 
 
 def open_dataset(root: str | Path, config: Config, *, training: bool) -> LabeledDataset:
@@ -157,7 +156,7 @@ def open_dataset(root: str | Path, config: Config, *, training: bool) -> Labeled
     return LabeledDataset(
         split,
         spec,
-        build_preparation(config.model),
+        build_preparation(config.model, split, data),
         camera_view=data.camera_view,
         min_points=data.min_points,
         augmentation=config.augment if training else None,

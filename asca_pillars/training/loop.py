@@ -19,6 +19,8 @@ from asca_pillars.config import Config, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
 from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.second_stage.open_first_stage import with_first_stage
+from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (
     LAST,
@@ -66,7 +68,10 @@ def train(
             the devices are not there, or a loss became infinite or NaN.
         TrainingInterruptedError: Ctrl-C; the run is saved.
         DatasetError, ScanError: the data cannot be read.
+        BundleError, ExportError, ConfigError: the first stage of two cannot be used.
     """
+    if isinstance(config.model, RefineModel):
+        config = replace(config, model=with_first_stage(config.model))
     out = Path(out)
     checkpoints = out / "checkpoints"
     # What the run records of itself must hold for its checkpoint: without a camera it has seen whole scans.

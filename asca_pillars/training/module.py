@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import lightning as L  # noqa: N812  (Lightning's own convention)
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,6 +41,9 @@ class DetectionModule(L.LightningModule):
             AscaError: a frame of the batch could not be read, or a term of its loss is not finite.
         """
         batch = _read(batch)
+        # What a network drops at random belongs to the step, so that a resumed run drops what an unbroken one would.
+        draws = np.random.SeedSequence((self.config.train.seed, self.global_step, self.global_rank))
+        torch.manual_seed(int(draws.generate_state(1, np.uint64)[0]))
         terms = self.detector.loss(self.detector.predict(batch.inputs), batch.inputs)
         total = _total(terms)
         self._require_finite(terms, batch)

@@ -16,6 +16,8 @@ from typing import Literal
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import BundleError, ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.points.first_stage import FirstStageSettings
+from asca_pillars.points.refine_geometry import RefineSettings
 from asca_pillars.schema import Strict
 from asca_pillars.tables.neck_tables import MaskRule
 
@@ -23,7 +25,12 @@ SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
 ENCODER = "encoder"
 BACKBONE = "backbone"
+REFINE = "refine"
 PILLAR_GRAPHS = (ENCODER, BACKBONE)
+GRAPHS = {"pillar": PILLAR_GRAPHS, "pillar_refine": (*PILLAR_GRAPHS, REFINE)}
+"""Names of the graphs of each kind."""
+NECK = "neck"
+"""Output of the backbone of a `pillar_refine` bundle: the head's input (1, H, W, C)."""
 
 _LONGEST_NAME = 100
 _MOST_CHANNELS = 4096
@@ -99,10 +106,31 @@ class PillarSection(Strict):
 
 
 @dataclass(frozen=True)
+class RefineSection(Strict):
+    """What bundles of kind pillar_refine have besides `pillar`, which is about their first stage.
+
+    Raises:
+        ConfigError: no such number of channels.
+    """
+
+    bev_channels: int
+    """C of the backbone's output `neck`."""
+    seen: FirstStageSettings
+    """Proposals and keypoints."""
+    neighbors: RefineSettings
+    """Balls and grids."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bev_channels <= _MOST_CHANNELS:
+            raise ConfigError(f"bev_channels {str(self.bev_channels)[:20]} must lie between 1 and {_MOST_CHANNELS}")
+
+
+@dataclass(frozen=True)
 class Parity(Strict):
     """How far the exported float graphs are from the trained model, largest over the compared scans."""
 
     head_maps_max_abs_error: float
+    """Of a `pillar_refine` bundle also of the neck's map and of the second stage's confidences and residuals."""
     box_max_error_m: float
     yaw_max_error_rad: float
     scans: int
@@ -164,7 +192,7 @@ class Bundle(Strict):
     """The contents of bundle.json, but for `pillar.layout`, which follows from `spec`."""
 
     name: str
-    kind: Literal["pillar"]
+    kind: Literal["pillar", "pillar_refine"]
     """The family of detectors; the section of that name holds what only this family has."""
     spec: PillarSpec
     pillar: PillarSection
@@ -173,7 +201,7 @@ class Bundle(Strict):
     backbone_gmac: float
     """Multiply-accumulates of backbone.onnx, 10^9; of a sparse neck in the mean over the scans of `parity`."""
     graphs: Mapping[str, GraphFile]
-    """By name; a pillar detector has PILLAR_GRAPHS."""
+    """By name, see GRAPHS."""
     parity: Parity | None
     """None only while the export is still proving it; of a quantized bundle, the float graphs it was made from."""
     quantization: Quantization | None
@@ -183,6 +211,8 @@ class Bundle(Strict):
     """The scans that `expected_input` was measured on: those trained on, or those given to the export."""
     provenance: Provenance
     license: str
+    refine: RefineSection | None = None
+    """None of kind pillar, whose bundle.json does not have the key."""
     schema_version: int = SCHEMA_VERSION
 
 

@@ -1,17 +1,19 @@
 """The dense neck and head on the vehicle: pillars on a pseudo-image, one graph over all of it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import Bundle, CanvasFormat
+from asca_deploy.bundle import NECK, Bundle, CanvasFormat
 from asca_deploy.graph import Session, Tensor, check_interface
 from asca_deploy.pillar_backbone import HeadAnswer, Maps
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.map_pooling import pool_pillars
+from asca_pillars.points.first_stage import FirstPass
 
 
 class Canvas:
@@ -76,6 +78,8 @@ class CanvasBackbone:
             name: Tensor("float32", (1, *grid.head_shape, channels * anchors))
             for name, channels in zip(HeadMaps._fields, (1, 7, 2), strict=True)
         }
+        if bundle.refine is not None:
+            outputs[NECK] = Tensor("float32", (1, *grid.head_shape, bundle.refine.bev_channels))
         self._session = check_interface(path, session, inputs, outputs)
         self._free = [self.new_canvas()]
 
@@ -94,12 +98,21 @@ class CanvasBackbone:
         self._free.append(placed)
         return HeadAnswer(maps, None)
 
+    def infer_with_neck(self, placed: Canvas) -> FirstPass:
+        """As `run`, of a bundle of kind pillar_refine: also the neck's map (H, W, C), which its second stage reads."""
+        *maps, neck = self._session.run((*HeadMaps._fields, NECK), {"canvas": placed.image})
+        self._free.append(placed)
+        return FirstPass(_channels_first(maps), neck[0])
+
     def new_canvas(self) -> Canvas:
         """An empty canvas of this bundle's format."""
         return Canvas(self._bundle.pillar.channels, self._bundle.spec.grid, self._bundle.pillar.canvas)
 
     def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
         """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
-        channels_last = self._session.run(HeadMaps._fields, {"canvas": canvas})
-        scores, boxes, directions = (maps[0].transpose(2, 0, 1) for maps in channels_last)
-        return HeadMaps(scores, boxes, directions)
+        return _channels_first(self._session.run(HeadMaps._fields, {"canvas": canvas}))
+
+
+def _channels_first(channels_last: Sequence[NDArray[Any]]) -> Maps:
+    scores, boxes, directions = (maps[0].transpose(2, 0, 1) for maps in channels_last)
+    return HeadMaps(scores, boxes, directions)

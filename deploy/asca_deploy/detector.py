@@ -17,7 +17,8 @@ from asca_deploy.bundle import Bundle, find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
 from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pillar_pipeline import PillarPipeline
-from asca_deploy.pipeline import Laps
+from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.refine_pipeline import RefinePipeline
 from asca_deploy.stream import overlapped
 from asca_pillars.data.input_check import InputWarning, check_input
 from asca_pillars.data.mounting import Mounting
@@ -252,16 +253,18 @@ class Detector:
 
     def _choose(
         self, provider: providers.Provider | Literal["auto"], precision: providers.Precision | None
-    ) -> auto.Choice[PillarPipeline]:
-        def open_pipeline(name: providers.Provider, digits: providers.Precision) -> PillarPipeline:
-            return PillarPipeline(self.folder, self.bundle, name, digits, self.threads)
+    ) -> auto.Choice[Pipeline[Any, Any]]:
+        family = PillarPipeline if self.bundle.kind == "pillar" else RefinePipeline
+
+        def open_pipeline(name: providers.Provider, digits: providers.Precision) -> Pipeline[Any, Any]:
+            return family(self.folder, self.bundle, name, digits, self.threads)
 
         if provider != providers.AUTO:
             digits = precision or "float32"
             return auto.Choice(open_pipeline(provider, digits), provider, digits, ())
         points = read_scan(sample_scan_path()).points
 
-        def detect(pipeline: PillarPipeline) -> Detections:
+        def detect(pipeline: Pipeline[Any, Any]) -> Detections:
             laps: Laps = []
             return pipeline.finish(pipeline.infer(pipeline.prepare(points, laps), laps), laps)
 

@@ -7,10 +7,11 @@ is also in the metadata of each graph, under the graph's SHA-256, and the two ha
 import hashlib
 import json
 import reprlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from asca_deploy.bundle import MANIFEST, PILLAR_GRAPHS, SCHEMA_VERSION, Bundle, GraphFile
+from asca_deploy.bundle import GRAPHS, MANIFEST, PILLAR_GRAPHS, SCHEMA_VERSION, Bundle, GraphFile
 from asca_deploy.layout import difference, layout_of
 from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.errors import AscaError, BundleError
@@ -20,6 +21,7 @@ from asca_pillars.schema import parse, to_dict
 ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
 
+_ESSENTIALS_REFINE = (*ESSENTIALS, "refine")
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
 # Of `pillar` and `spec.grid`, and what they are where they are not written: in bundles made before there were sparse
 # necks and pooled maps. The graphs' metadata tells whether they were taken out.
@@ -41,9 +43,13 @@ def load_bundle(folder: str | Path) -> Bundle:
     manifest = folder / MANIFEST
     data = _read_manifest(manifest)
     old = data["schema_version"] == 2
-    stamped = {key: data.get(key) for key in (_ESSENTIALS_2 if old else ESSENTIALS)}
+    stamped = {key: data.get(key) for key in (_ESSENTIALS_2 if old else _stamped_keys(data))}
     if old:
         data = upgrade_schema_2(data)
+    if data.get("kind") == "pillar":
+        if "refine" in data:
+            raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {_EXPORT_AGAIN}")
+        data["refine"] = None
     layout = None
     if isinstance(section := data.get("pillar"), dict):
         data["pillar"] = _LATER_KEYS | section
@@ -59,9 +65,10 @@ def load_bundle(folder: str | Path) -> Bundle:
         raise BundleError(f"{_blamed(manifest, error)}; {_EXPORT_AGAIN}") from None
     except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
         raise BundleError(f"{manifest}: a value makes no sense ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
-    if set(bundle.graphs) != set(PILLAR_GRAPHS):
+    _verify_refine(manifest, bundle)
+    if set(bundle.graphs) != set(GRAPHS[bundle.kind]):
         raise BundleError(
-            f"{manifest}: a pillar detector has the graphs {' and '.join(PILLAR_GRAPHS)}, not "
+            f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(GRAPHS[bundle.kind])}, not "
             f"{_cut(', '.join(bundle.graphs)) or 'none'}; {_EXPORT_AGAIN}"
         )
     for graph in bundle.graphs.values():
@@ -98,7 +105,7 @@ def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
     """Write bundle.json beside the graphs in `folder`, which must lie there already, stamped with `essentials`."""
     data = bundle_to_json(bundle)
     for graph in bundle.graphs.values():
-        _verify_graph(Path(folder), graph, {key: data[key] for key in ESSENTIALS})
+        _verify_graph(Path(folder), graph, {key: data[key] for key in _stamped_keys(data)})
     with atomic_path(Path(folder) / MANIFEST) as path:
         path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
@@ -107,19 +114,38 @@ def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
     """What bundle.json holds: the bundle's fields, and the layout that readers in other languages need."""
     data = {"schema_version": bundle.schema_version, **to_dict(bundle)}
     data["pillar"]["layout"] = layout_of(bundle.spec)
+    if bundle.refine is None:
+        del data["refine"]
     return data
 
 
 def essentials(bundle: Bundle) -> dict[str, Any]:
     """What the export stamps into the metadata of each graph, see ESSENTIALS."""
     data = bundle_to_json(bundle)
-    return {key: data[key] for key in ESSENTIALS}
+    return {key: data[key] for key in _stamped_keys(data)}
 
 
-def graph_files(folder: str | Path) -> dict[str, GraphFile]:
-    """The graphs of a pillar detector as they lie in `folder`, encoder.onnx and backbone.onnx."""
-    files = {name: f"{name}.onnx" for name in PILLAR_GRAPHS}
+def graph_files(folder: str | Path, names: Iterable[str] = PILLAR_GRAPHS) -> dict[str, GraphFile]:
+    """The graphs of these names as they lie in `folder`, such as encoder.onnx and backbone.onnx."""
+    files = {name: f"{name}.onnx" for name in names}
     return {name: GraphFile(file, _sha256((Path(folder) / file).read_bytes())) for name, file in files.items()}
+
+
+def _stamped_keys(data: dict[str, Any]) -> tuple[str, ...]:
+    return _ESSENTIALS_REFINE if data.get("kind") == "pillar_refine" else ESSENTIALS
+
+
+def _verify_refine(manifest: Path, bundle: Bundle) -> None:
+    if bundle.kind != "pillar_refine":
+        return
+    if bundle.refine is None:
+        raise BundleError(f"{manifest}: `refine` is null, kind pillar_refine needs it; {_EXPORT_AGAIN}")
+    if len(bundle.refine.seen.proposals.quotas) != len(bundle.spec.classes):
+        raise BundleError(f"{manifest}: `refine.seen.proposals.quotas` has not one for each class; {_EXPORT_AGAIN}")
+    if bundle.pillar.neck != "dense" or bundle.spec.grid.pools:
+        raise BundleError(f"{manifest}: kind pillar_refine needs a dense neck and a warped map; {_EXPORT_AGAIN}")
+    if bundle.precision != "float32":
+        raise BundleError(f"{manifest}: `precision` of kind pillar_refine is float32; {_EXPORT_AGAIN}")
 
 
 def _read_manifest(manifest: Path) -> dict[str, Any]:

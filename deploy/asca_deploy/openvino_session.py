@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _DEVICE = "CPU"
 _REMEDY = "`pip install 'asca-pillars[openvino]'`"
 _HINTS = {"float32": "f32", "reduced": "bf16"}
-_TYPES = {"f32": "float32", "u8": "uint8", "i64": "int64"}
+_TYPES = {"f32": "float32", "u8": "uint8", "i32": "int32", "i64": "int64"}
 
 
 def require(precision: str) -> None:

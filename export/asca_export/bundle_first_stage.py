@@ -8,19 +8,18 @@ import onnx
 from numpy.typing import NDArray
 
 from asca_deploy import providers
-from asca_deploy.bundle import BACKBONE, find_bundle
+from asca_deploy.bundle import BACKBONE, NECK, find_bundle
 from asca_deploy.canvas_backbone import Canvas
 from asca_deploy.manifest import load_bundle
 from asca_deploy.pillar_pipeline import PillarPipeline
-from asca_export.neck_output import NECK, add_neck_output
-from asca_pillars.errors import ExportError
+from asca_export.neck_output import add_neck_output
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.second_stage.first_stage import FirstPass
+from asca_pillars.points.first_stage import FirstPass, require_dense_map
 
 
 class BundleFirstStage:
-    """A float32 bundle in onnxruntime, see `second_stage.first_stage.FirstStage`.
+    """A float32 bundle in onnxruntime, see `points.first_stage.FirstStage`.
 
     Args:
         bundle: folder, or name of one that ships.
@@ -28,14 +27,14 @@ class BundleFirstStage:
 
     Raises:
         BundleError: the bundle is missing or damaged.
-        ExportError: it is not in float32, or its neck is sparse.
+        ConfigError: it is of another kind, its neck is sparse, or its map is pooled.
+        ExportError: it is not in float32.
     """
 
     def __init__(self, bundle: str | Path, *, threads: int = 1) -> None:
         folder = find_bundle(bundle)
         manifest = load_bundle(folder)
-        if manifest.pillar.neck != "dense":
-            raise ExportError(f"{folder}: its neck is {manifest.pillar.neck}; only a dense one has a map to refine on")
+        require_dense_map(folder, manifest.kind, manifest.pillar.neck, pooled=manifest.spec.grid.pools)
         self._pipeline = PillarPipeline(folder, manifest, threads=threads)
         self._canvas = Canvas(manifest.pillar.channels, manifest.spec.grid, manifest.pillar.canvas)
         model = add_neck_output(onnx.load(folder / manifest.graphs[BACKBONE].file))

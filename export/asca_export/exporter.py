@@ -17,6 +17,7 @@ from asca_export.int8 import quantize_bundle
 from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
+from asca_pillars.config import PillarModel
 from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
@@ -60,7 +61,7 @@ def export_bundle(
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
-    if not isinstance(detector, PillarDetector):
+    if not (isinstance(config.model, PillarModel) and isinstance(detector, PillarDetector)):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
     progress("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
@@ -84,16 +85,7 @@ def export_bundle(
             quantization=None,
             expected_input=expected or measure_expected_input(scans, config.data.camera_view),
             expected_input_from="training" if expected else "export",
-            provenance=Provenance(
-                command=command,
-                created=datetime.datetime.now(datetime.UTC).date().isoformat(),
-                git_revision=git_revision(),
-                trained_on=trained_on,
-                seed=config.train.seed,
-                steps=checkpoint.steps,
-                versions=package_versions(),
-                machine=cpu_model(),
-            ),
+            provenance=provenance(checkpoint, trained_on, command),
             license=LICENSE,
         )
         draft = graphs.sign(folder, draft)
@@ -104,6 +96,20 @@ def export_bundle(
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, progress)
     return bundle
+
+
+def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provenance:
+    """Where the weights of a checkpoint come from; see `export_bundle` for the arguments."""
+    return Provenance(
+        command=command,
+        created=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        git_revision=git_revision(),
+        trained_on=trained_on,
+        seed=checkpoint.config.train.seed,
+        steps=checkpoint.steps,
+        versions=package_versions(),
+        machine=cpu_model(),
+    )
 
 
 def _export_backbone(detector: PillarDetector, path: Path, scans: Sequence[NDArray[np.float32]]) -> float:

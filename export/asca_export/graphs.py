@@ -15,7 +15,7 @@ import torch
 from onnxscript import opset20 as op
 from torch import Tensor, nn
 
-from asca_deploy.bundle import PILLAR_GRAPHS, Bundle
+from asca_deploy.bundle import GRAPHS, Bundle
 from asca_deploy.manifest import essentials, graph_files
 from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
@@ -40,7 +40,7 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
         point_counts,
     )
     rows, cells = torch.export.Dim("points"), torch.export.Dim("pillars")
-    _export(
+    export_graph(
         _Encoder(detector.encode),
         example,
         path,
@@ -54,7 +54,7 @@ def export_backbone(backbone: FastBackbone, grid: PillarGrid, path: Path) -> Non
     """Write backbone.onnx: canvas (1, ny + 1, nx + 1, C) -> scores, boxes, directions, see `FastBackbone`."""
     channels = next(iter(backbone.stages()[0].convolutions.values())).in_channels
     rows, columns = grid.map_shape
-    _export(
+    export_graph(
         backbone,
         (torch.zeros(1, rows + 1, columns + 1, channels),),
         path,
@@ -90,15 +90,16 @@ def graph_path(folder: Path, name: str) -> Path:
 def sign(folder: Path, bundle: Bundle) -> Bundle:
     """Stamp the graphs in `folder` with what they must not be separated from; the bundle with their SHA-256."""
     properties = {key: json.dumps(value) for key, value in essentials(bundle).items()}
-    for name in PILLAR_GRAPHS:
+    for name in GRAPHS[bundle.kind]:
         path = graph_path(folder, name)
         model = onnx.load(path)
         onnx.helper.set_model_props(model, properties)
         onnx.save(model, path)
-    return dataclasses.replace(bundle, graphs=graph_files(folder))
+    return dataclasses.replace(bundle, graphs=graph_files(folder, GRAPHS[bundle.kind]))
 
 
-def _export(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
+def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
+    """Write a module as an ONNX file; `names` are those of `torch.onnx.export`."""
     with errors_only("torch.onnx"), errors_only("onnxscript"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch about torch
         program = torch.onnx.export(

@@ -65,6 +65,7 @@ def quantize_bundle(
     """
     runtime = Detector(folder)
     pipeline, shown = runtime.pipeline, {_digest(points) for points in scans}
+    assert isinstance(pipeline, PillarPipeline), "the bundle has just been exported from a pillar detector"
     own = [points for points in calibration if _digest(points) not in shown]
     encoded = [each for each in (_encode(pipeline, points) for points in own) if len(each.features)]
     if len(encoded) < MIN_CALIBRATION:

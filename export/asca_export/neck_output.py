@@ -3,9 +3,8 @@
 import onnx
 from onnx import TensorProto, helper
 
+from asca_deploy.bundle import NECK
 from asca_pillars.errors import ExportError
-
-NECK = "neck"
 
 
 def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:

@@ -58,15 +58,15 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
         placed = runtime.backbone.place(features, pillars.cells)
         # Features have no unit, and some readings of the attention sum over thousands of pillars: their scale counts.
         allowed = MAP_TOLERANCE * max(1.0, float(expected_features.abs().max()) if len(expected_features) else 0.0)
-        _require_close("encode", expected_features.numpy(), features, allowed, number)
+        require_close("encode", expected_features.numpy(), features, allowed, number)
         if isinstance(placed, Canvas):
             with torch.inference_mode():
                 pseudo_image = detector.scatter(*detector.pool(expected_features, batch)).numpy()
             expected_canvas = np.pad(pseudo_image.transpose(0, 2, 3, 1), ((0, 0), (1, 0), (1, 0), (0, 0)))
-            _require_close("scatter", expected_canvas, placed.image, allowed, number)
+            require_close("scatter", expected_canvas, placed.image, allowed, number)
         maps, cells = runtime.backbone.run(placed)
         for name, expected, found in zip(HeadMaps._fields, expected_maps, maps, strict=True):
-            error = _require_close(f"head `{name}`", expected, found, MAP_TOLERANCE, number)
+            error = require_close(f"head `{name}`", expected, found, MAP_TOLERANCE, number)
             worst_map = max(worst_map, error)
         boxes = compare_boxes(expected_maps, maps, spec, number, cells)
         worst_box, worst_yaw = max(worst_box, boxes.center_size_m), max(worst_yaw, boxes.yaw_rad)
@@ -84,7 +84,7 @@ def by_class(scores: NDArray[np.float32], classes: int) -> NDArray[np.float32]:
     return (scores if scores.ndim == 3 else scores.T).reshape(classes, scores.size // classes)
 
 
-def _require_close(
+def require_close(
     stage: str, expected: NDArray[np.float32], found: NDArray[np.float32], allowed: float, scan: int
 ) -> float:
     """The largest difference, which must not exceed what is allowed."""
@@ -124,8 +124,8 @@ def compare_boxes(
     for post in (replace(uncut, nms_iou=1.0), uncut):
         lowered = replace(spec, classes=classes, post=post)
         ours, theirs = lowered.decode(expected, cells), lowered.decode(found, cells)
-        forward, our_lone = _pair(ours, theirs)
-        backward, their_lone = _pair(theirs, ours)
+        forward, our_lone = nearest_partners(ours, theirs)
+        backward, their_lone = nearest_partners(theirs, ours)
         _require_ties(ours[our_lone], theirs[their_lone], ours, theirs, lowered, scan)
         worst = BoxDifference(*map(max, zip(worst, forward, backward, strict=True)))
     return worst
@@ -139,7 +139,7 @@ def _score_of_rank(logits: NDArray[np.float32]) -> float:
     return float(1 / (1 + np.exp(-logit.astype(np.float64))))
 
 
-def _pair(boxes: Detections, partners: Detections) -> tuple[BoxDifference, NDArray[np.int64]]:
+def nearest_partners(boxes: Detections, partners: Detections) -> tuple[BoxDifference, NDArray[np.int64]]:
     """Largest difference between boxes and their nearest partners, and the boxes (n,) without one in tolerance."""
     worst_m = worst_rad = 0.0
     lone = []

@@ -9,7 +9,7 @@ import yaml
 
 from asca_pillars.ablation.variants import VARIANTS, Variant, runs, train_runs
 from asca_pillars.commands.ablate import ablate
-from asca_pillars.config import load_config, shipped_configs
+from asca_pillars.config import PillarModel, load_config, shipped_configs
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.schema import to_dict
 from tests.scenes import write_dataset
@@ -27,6 +27,7 @@ def config(tmp_path: Path) -> str:
 @pytest.mark.parametrize("variant", VARIANTS.values(), ids=lambda variant: variant.name)
 def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
     config = load_config(shipped_configs()["ablation_small"], variant.overrides)
+    assert isinstance(config.model, PillarModel)
     assert config.model.spec.grid.zones == variant.zones and config.model.network.cpa == variant.cpa
     assert config.augment.insert.method == variant.insert
     assert config.model.spec.grid.v_max_m == (0.16 if variant.zones == 1 else 0.32)

@@ -20,7 +20,7 @@ from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
+from asca_pillars.models.build import build_model
 from asca_pillars.schema import to_dict
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
@@ -172,7 +172,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
 
 def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
     torch.manual_seed(0)
-    network = build_pillar_detector(CONFIG.model)
+    network = build_model(CONFIG.model)
     weights = {f"detector.{name}": value for name, value in network.state_dict().items()}
     content = {"hyper_parameters": {"config": to_dict(CONFIG)}, "state_dict": weights, "global_step": 7}
     torch.save(content, tmp_path / "last.ckpt")
@@ -203,7 +203,7 @@ def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path
         content["model"]["spec"]["classes"], ("Forklift", "Pallet", "Crane")[: len(names)], strict=True
     ):
         item["name"] = name
-    weights = {f"detector.{name}": value for name, value in build_pillar_detector(CONFIG.model).state_dict().items()}
+    weights = {f"detector.{name}": value for name, value in build_model(CONFIG.model).state_dict().items()}
     torch.save(
         {"hyper_parameters": {"config": content}, "state_dict": weights, "global_step": 7}, tmp_path / "last.ckpt"
     )

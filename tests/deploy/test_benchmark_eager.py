@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import CpaReading, NetworkConfig
+from asca_pillars.config import CpaReading, PillarModel
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
@@ -21,9 +21,9 @@ from tests.training.test_loop import CONFIG
 def network(cpa: CpaReading) -> tuple:
     """A small network whose normalization has seen a scan, as `benchmarks.eager.random_weights` does it."""
     torch.manual_seed(1)
-    config = replace(CONFIG, model=replace(CONFIG.model, network=replace(CONFIG.model.network, cpa=cpa)))
-    assert isinstance(config.model.network, NetworkConfig)
-    detector, spec = build_pillar_detector(config.model).train(), config.model.spec
+    assert isinstance(CONFIG.model, PillarModel)
+    model = replace(CONFIG.model, network=replace(CONFIG.model.network, cpa=cpa))
+    detector, spec = build_pillar_detector(model).train(), model.spec
     for module in detector.modules():
         if isinstance(module, (torch.nn.BatchNorm1d, torch.nn.BatchNorm2d)):
             module.momentum = 1.0

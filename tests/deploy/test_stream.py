@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
 from asca_deploy.canvas_backbone import CanvasBackbone
+from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.stream import overlapped
 from asca_pillars.errors import ScanError
 from tests.deploy.conftest import make_scan
@@ -152,6 +153,7 @@ def test_a_call_between_two_scans_of_a_stream_disturbs_neither(tiny_bundle: Path
 def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     detector, scans = Detector(tiny_bundle), [make_scan(seed, 50 + 20 * seed) for seed in range(5)]
     images: set[int] = set()
+    assert isinstance(detector.pipeline, PillarPipeline)
     backbone = detector.pipeline.backbone
     assert isinstance(backbone, CanvasBackbone)
     neck_and_head = backbone.neck_and_head

@@ -11,9 +11,9 @@ from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import export_bundle
 from asca_export.neck_output import add_neck_output
 from asca_pillars.errors import ExportError
+from asca_pillars.models.second_stage.checkpoint_first_stage import CheckpointFirstStage
 from asca_pillars.schema import to_dict
-from asca_pillars.second_stage.checkpoint_first_stage import CheckpointFirstStage
-from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
 
 
 def test_says_what_the_checkpoint_says(tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_says_what_the_checkpoint_says(tmp_path: Path) -> None:
     assert in_torch.identity != in_onnx.identity
     wanted, found = in_torch(SCANS[0]), in_onnx(SCANS[0])
     rows, columns = in_torch.spec.anchors.shape[:2]
-    assert found.neck.shape == (rows, columns, 3 * checkpoint.config.model.network.upsample_channels)
+    assert found.neck.shape == (rows, columns, 3 * NETWORK.upsample_channels)
     np.testing.assert_allclose(found.neck, wanted.neck, atol=1e-4)
     for one, other in zip(found.maps, wanted.maps, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-3)

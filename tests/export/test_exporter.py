@@ -13,6 +13,7 @@ import torch
 import typer
 
 from asca_deploy import Detector, load_bundle
+from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs, reissue
 from asca_export.exporter import export_bundle
 from asca_export.fast_forms import FastBackbone
@@ -78,6 +79,7 @@ def test_encoder_gives_the_same_features_every_time(tmp_path: Path) -> None:
     pipeline = Detector(tmp_path, threads=2).pipeline
     rng = np.random.default_rng(0)
     points = rng.uniform((5, -6, -2, 0), (25, 7, 0, 1), (12000, 4)).astype(np.float32)
+    assert isinstance(pipeline, PillarPipeline)
     pillars = pipeline.pillarize(points)
     assert pillars.point_counts.max() > 4  # indices repeat
     first = pipeline.encode(pillars).copy()

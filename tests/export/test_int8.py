@@ -11,6 +11,7 @@ from onnx import numpy_helper
 
 from asca_deploy import Bundle, Detector, load_bundle
 from asca_deploy.canvas_backbone import CanvasBackbone
+from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import int8
 from asca_export.exporter import export_bundle
 from asca_pillars.errors import ExportError
@@ -65,6 +66,7 @@ def test_weights_are_7_bits_and_multiplications_8(folder: Path) -> None:
 def test_onnxruntime_computes_what_the_graph_says(folder: Path) -> None:
     """Its 8-bit kernels against its float ones on the dequantized graph: saturation would differ by a lot."""
     detector = Detector(folder)
+    assert isinstance(detector.pipeline, PillarPipeline)
     backbone = detector.pipeline.backbone
     assert isinstance(backbone, CanvasBackbone)
     options = onnxruntime.SessionOptions()

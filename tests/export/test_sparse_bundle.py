@@ -13,6 +13,7 @@ from asca_deploy.benchmark import benchmark
 from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.pillar_pipeline import open_backbone
 from asca_export.exporter import export_bundle
+from asca_pillars.config import PillarModel
 from asca_pillars.errors import ConfigError, ProviderError
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
@@ -51,8 +52,9 @@ def same(ours: Detections, theirs: Detections) -> bool:
 def test_the_bundle_finds_what_pytorch_finds(float_bundle: tuple[Path, Checkpoint]) -> None:
     folder, checkpoint = float_bundle
     bundle, runtime = load_bundle(folder), Detector(folder)
-    network = checkpoint.config.model.network
-    assert (bundle.pillar.neck, bundle.pillar.active_cells) == ("sparse", network.active_cells)
+    model = checkpoint.config.model
+    assert isinstance(model, PillarModel)
+    assert (bundle.pillar.neck, bundle.pillar.active_cells) == ("sparse", model.network.active_cells)
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.backbone_gmac > 0
     torch_detector = ScanDetector(checkpoint.detector, bundle.spec)
     everything = (

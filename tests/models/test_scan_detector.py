@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from asca_pillars.config import PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
@@ -14,6 +15,7 @@ from tests.training.test_loop import CONFIG
 def test_scans_one_by_one_are_what_a_batch_of_them_gives() -> None:
     """And the second scan does not inherit the first."""
     torch.manual_seed(3)
+    assert isinstance(CONFIG.model, PillarModel)
     network = build_pillar_detector(CONFIG.model).eval()
     spec = CONFIG.model.spec.with_score_threshold(0.001)
     detect = ScanDetector(network, spec)
@@ -29,5 +31,6 @@ def test_scans_one_by_one_are_what_a_batch_of_them_gives() -> None:
 
 
 def test_a_scan_without_points_is_a_scan() -> None:
+    assert isinstance(CONFIG.model, PillarModel)
     network = build_pillar_detector(CONFIG.model).eval()
     assert len(ScanDetector(network, CONFIG.model.spec)(np.empty((0, 4), np.float32))) == 0

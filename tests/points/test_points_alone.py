@@ -10,7 +10,7 @@ import asca_pillars.points
 for module in pkgutil.iter_modules(asca_pillars.points.__path__):
     if module.name not in ("ball_kernels", "sampling_kernels"):
         importlib.import_module(f"asca_pillars.points.{module.name}")
-import asca_pillars.second_stage.refine_geometry
+import asca_pillars.points.refine_geometry
 import numpy as np
 from asca_pillars.points.ball_query import ball_query
 from asca_pillars.points.farthest_points import farthest_points

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.geometry.targets import Targets, assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch
 from asca_pillars.pillars.map_pooling import MapCells, map_cells
@@ -91,6 +91,7 @@ class PillarPreparation:
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedPillars:
         """Pillars of a frame and the targets of its anchors; `rng` draws what the limits drop."""
         spec = self.spec
+        frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points, rng)
         targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
         return PreparedPillars(pillars, self.place(pillars), targets)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.second_stage.first_stage import FirstPass, FirstStageSettings, KeypointSettings
+from asca_pillars.points.first_stage import FirstPass, FirstStageSettings, KeypointSettings
 from tests.scenes import SPEC
 
 SETTINGS = FirstStageSettings(keypoints=KeypointSettings(count=64))
@@ -15,7 +15,7 @@ CHANNELS = 5
 
 
 class RandomStage:
-    """See `second_stage.first_stage.FirstStage`."""
+    """See `points.first_stage.FirstStage`."""
 
     def __init__(self, identity: str = "noise") -> None:
         self.identity = identity

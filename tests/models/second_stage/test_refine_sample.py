@@ -5,11 +5,11 @@ import pytest
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.errors import ConfigError
-from asca_pillars.second_stage.first_stage import propose_on
-from asca_pillars.second_stage.refine_geometry import RefineScan, RefineSettings, refine_scan, roi_features
-from asca_pillars.second_stage.refine_sample import RefineSample, collate_samples, collate_scans, prepare_sample
+from asca_pillars.models.second_stage.refine_sample import RefineSample, collate_samples, collate_scans, prepare_sample
+from asca_pillars.points.first_stage import propose_on
+from asca_pillars.points.refine_geometry import RefineScan, RefineSettings, refine_scan, roi_features
+from tests.models.second_stage.random_stage import SETTINGS, RandomStage
 from tests.scenes import make_scene
-from tests.second_stage.random_stage import SETTINGS, RandomStage
 
 GEOMETRY = RefineSettings(ball_samples=6, grid_size=2, grid_samples=5)
 

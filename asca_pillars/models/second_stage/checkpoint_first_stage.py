@@ -7,30 +7,33 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from asca_pillars.errors import TrainingError
+from asca_pillars.config import PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
-from asca_pillars.second_stage.first_stage import FirstPass
+from asca_pillars.points.first_stage import FirstPass, require_dense_map
 
 
 class CheckpointFirstStage:
-    """A trained pillar detector in PyTorch, on the CPU; see `second_stage.first_stage.FirstStage`.
+    """A trained pillar detector in PyTorch, on the CPU; see `points.first_stage.FirstStage`.
 
     Args:
         path: checkpoint of `asca train`.
 
     Raises:
-        TrainingError: not a checkpoint of a pillar detector, damaged, or made by an incompatible version.
+        TrainingError: not a checkpoint, damaged, or made by an incompatible version.
+        ConfigError: it is of another kind, its neck is sparse, or its map is pooled.
     """
 
     def __init__(self, path: str | Path) -> None:
         checkpoint = load_checkpoint(path)
-        if not isinstance(checkpoint.detector, PillarDetector):
-            raise TrainingError(f"{path}: model.kind {checkpoint.config.model.kind}; a first stage is of kind pillar")
-        self._network = checkpoint.detector
-        self.spec = checkpoint.config.model.spec
+        model, detector = checkpoint.config.model, checkpoint.detector
+        neck = model.network.neck if isinstance(model, PillarModel) else "dense"
+        require_dense_map(path, model.kind, neck, pooled=model.spec.grid.pools)
+        assert isinstance(detector, PillarDetector), "it is of kind pillar"
+        self._network = detector
+        self.spec = model.spec
         with Path(path).open("rb") as file:
             self.identity = hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -11,13 +12,42 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_pillars.data.insertion.prepared import require_writable, writing
-from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.points.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
 from asca_pillars.schema import to_dict
-from asca_pillars.second_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
 
 _FORMAT = 1  # of the files; another number lets old ones lie
+
+
+@dataclass(frozen=True)
+class ProposalFiles:
+    """The files of a cache; loader processes read them without the first stage."""
+
+    folder: Path
+    class_names: tuple[str, ...]
+
+    def read(self, frame_id: str) -> Proposed:
+        """What the first stage says of a frame.
+
+        Raises:
+            DatasetError: its file is missing or damaged.
+        """
+        path = self.path(frame_id)
+        try:
+            # Opened here: NumPy leaves a file that it cannot read open.
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                detections = Detections(arrays["boxes"], arrays["scores"], arrays["labels"], self.class_names)
+                return Proposed(detections, arrays["keypoints"], arrays["bev"].astype(np.float32))
+        except FileNotFoundError:
+            raise DatasetError(f"{path}: no proposals of this frame; compute them first") from None
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise DatasetError(f"{path}: damaged ({error}); delete it, it will be computed again") from None
+
+    def path(self, frame_id: str) -> Path:
+        """The frame's file."""
+        return self.folder / f"{frame_id}.npz"
 
 
 class ProposalCache:
@@ -34,44 +64,22 @@ class ProposalCache:
         self.stage, self.settings, self.camera_view = stage, settings, camera_view
         about = {"format": _FORMAT, "stage": stage.identity, "camera_view": camera_view, **to_dict(settings)}
         key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
-        self.folder = prepared / f"proposals-{key}"
+        self.files = ProposalFiles(prepared / f"proposals-{key}", stage.spec.class_names)
 
-    def fill(self, split: KittiSplit, *, console: Console | None = None) -> None:
+    def fill(self, split: LabeledSplit, *, console: Console | None = None) -> None:
         """Compute what is missing. Each file appears when it is complete, so that a killed run is simply gone on with.
 
         Raises:
             DatasetError, ScanError: a frame cannot be read, or a file not written.
         """
-        missing = [frame_id for frame_id in split.frame_ids if not self.path(frame_id).is_file()]
+        missing = [frame_id for frame_id in split.frame_ids if not self.files.path(frame_id).is_file()]
         if missing:
-            require_writable(self.folder)
+            require_writable(self.files.folder)
         for frame_id in track(missing, "Proposing", console=console, disable=console is None):
-            found = propose_on(self.stage, split.points(frame_id, camera_view=self.camera_view), self.settings)
-            with writing(self.path(frame_id)) as temporary, temporary.open("wb") as file:
+            points = split.points(frame_id, camera_view=self.camera_view)
+            found = propose_on(self.stage, points[np.isfinite(points).all(axis=1)], self.settings)
+            with writing(self.files.path(frame_id)) as temporary, temporary.open("wb") as file:
                 np.savez(file, allow_pickle=False, **_arrays(found))
-
-    def read(self, frame_id: str) -> Proposed:
-        """What `fill` computed of a frame.
-
-        Raises:
-            DatasetError: its file is missing or damaged.
-        """
-        path = self.path(frame_id)
-        try:
-            # Opened here: NumPy leaves a file that it cannot read open.
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                detections = Detections(
-                    arrays["boxes"], arrays["scores"], arrays["labels"], self.stage.spec.class_names
-                )
-                return Proposed(detections, arrays["keypoints"], arrays["bev"].astype(np.float32))
-        except FileNotFoundError:
-            raise DatasetError(f"{path}: no proposals of this frame; compute them first") from None
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-            raise DatasetError(f"{path}: damaged ({error}); delete it, it will be computed again") from None
-
-    def path(self, frame_id: str) -> Path:
-        """The frame's file."""
-        return self.folder / f"{frame_id}.npz"
 
 
 def _arrays(found: Proposed) -> dict[str, NDArray[np.generic]]:

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from asca_pillars.errors import TrainingError
-from asca_pillars.second_stage.refine_sample import RefineSample, prepare_sample
-from asca_pillars.second_stage.refine_training import one_cycle, sample_batches, train_refiner
+from asca_pillars.models.second_stage.refine_sample import RefineSample, prepare_sample
+from asca_pillars.models.second_stage.refine_training import one_cycle, sample_batches, train_refiner
 from tests.models.refine.test_pillar_refiner import SETTINGS, proposed_frame, small_refiner
 
 

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
+from asca_pillars.models.second_stage.refine_sample import collate_scans
+from asca_pillars.points.first_stage import Proposed
+from asca_pillars.points.refine_geometry import RefineSettings, refine_scan
 from asca_pillars.points.refined_detections import refined_detections
-from asca_pillars.second_stage.first_stage import Proposed
-from asca_pillars.second_stage.refine_geometry import RefineSettings, refine_scan
-from asca_pillars.second_stage.refine_sample import collate_scans
 
 
 def refine(

@@ -77,13 +77,41 @@ class Proposed:
     """(K, C) the neck's map at the keypoints."""
 
 
+def require_dense_map(source: object, kind: str, neck: str, *, pooled: bool) -> None:
+    """Refuse a detector whose neck has no map over the pillars' own cells for keypoints to read.
+
+    Args:
+        source: bundle or checkpoint, to be named to the user.
+        kind: family of the detector.
+        neck: `dense` or `sparse`.
+        pooled: whether its map is another one than the pillars' own.
+
+    Raises:
+        ConfigError: the detector cannot be a first stage.
+    """
+    if kind != "pillar":
+        raise ConfigError(f"{source}: model.kind {kind}; a first stage is of kind pillar")
+    if neck != "dense" or pooled:
+        raise ConfigError(
+            f"{source}: a {neck} neck on a {'pooled' if pooled else 'warped'} map; a first stage has a dense neck and "
+            "a warped map: train one so"
+        )
+
+
 def propose_on(stage: FirstStage, points: NDArray[np.float32], settings: FirstStageSettings) -> Proposed:
     """Run the first stage on the finite points (N, 4) of one scan."""
-    maps, neck = stage(points)
-    proposals = propose(maps, stage.spec, settings.proposals)
+    return proposed_from(stage(points), points, stage.spec, settings)
+
+
+def proposed_from(
+    found: FirstPass, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
+) -> Proposed:
+    """What the second stage sees of `found`, the first stage's answer to the finite points (N, 4) of one scan."""
+    maps, neck = found
+    proposals = propose(maps, spec, settings.proposals)
     near = points[near_boxes(points, proposals.boxes, settings.keypoints.margin_m)]
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
-    cells, weights = bilinear_cells(keypoints, *stage.spec.head_centers_m())
+    cells, weights = bilinear_cells(keypoints, *spec.head_centers_m())
     rows = neck.reshape(-1, neck.shape[2])
     bev = sum(rows[cells[:, corner]] * weights[:, corner, None] for corner in range(4))
     return Proposed(proposals, keypoints, np.asarray(bev, np.float32))

@@ -5,10 +5,10 @@ import pytest
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.points.first_stage import FirstStageSettings, KeypointSettings, propose_on
 from asca_pillars.points.proposals import ProposalSettings
-from asca_pillars.second_stage.first_stage import FirstStageSettings, KeypointSettings, propose_on
+from tests.models.second_stage.random_stage import CHANNELS, SETTINGS, RandomStage
 from tests.scenes import SPEC, make_scene
-from tests.second_stage.random_stage import CHANNELS, SETTINGS, RandomStage
 
 
 def test_quotas_and_suppression() -> None:

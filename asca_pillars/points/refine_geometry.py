@@ -10,8 +10,11 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.points.ball_query import ball_query
 from asca_pillars.points.farthest_points import near_boxes
+from asca_pillars.points.first_stage import Proposed
 from asca_pillars.points.roi_grid import roi_grid_points
-from asca_pillars.second_stage.first_stage import Proposed
+
+ROI_FEATURES = 4
+"""Columns of `roi_features` beside one for each class."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def refine_scan(
 def roi_features(proposals: Detections) -> NDArray[np.float32]:
     """What pooling does not tell of a proposal: class (one of them 1), logit of its score, length, width, height.
 
-    (R, classes + 4). One head serves all classes, which differ in what a good box looks like.
+    (R, classes + ROI_FEATURES). One head serves all classes, which differ in what a good box looks like.
     """
     classes = np.eye(len(proposals.class_names), dtype=np.float32)[proposals.labels]
     score = np.clip(proposals.scores, 1e-4, 1 - 1e-4)[:, None]

@@ -7,10 +7,10 @@ import pytest
 
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError
-from asca_pillars.second_stage.first_stage import FirstStageSettings, propose_on
-from asca_pillars.second_stage.proposal_cache import ProposalCache
+from asca_pillars.models.second_stage.proposal_cache import ProposalCache
+from asca_pillars.points.first_stage import FirstStageSettings, propose_on
+from tests.models.second_stage.random_stage import SETTINGS, RandomStage
 from tests.scenes import write_dataset
-from tests.second_stage.random_stage import SETTINGS, RandomStage
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def test_reads_what_was_computed(split: KittiSplit, tmp_path: Path) -> None:
     cache.fill(split)
     for frame_id in split.frame_ids:
         wanted = propose_on(RandomStage(), split.points(frame_id, camera_view=True), SETTINGS)
-        found = cache.read(frame_id)
+        found = cache.files.read(frame_id)
         for name in ("boxes", "scores", "labels"):
             np.testing.assert_array_equal(getattr(found.proposals, name), getattr(wanted.proposals, name))
         np.testing.assert_array_equal(found.keypoints, wanted.keypoints)
@@ -36,7 +36,7 @@ def test_only_what_is_missing_is_computed(split: KittiSplit, tmp_path: Path) -> 
     cache = ProposalCache(tmp_path, stage, SETTINGS)
     cache.fill(split)
     assert stage.calls == 2
-    cache.path(split.frame_ids[1]).unlink()
+    cache.files.path(split.frame_ids[1]).unlink()
     cache.fill(split)
     assert stage.calls == 3
 
@@ -51,12 +51,12 @@ def test_a_killed_run_leaves_no_half_file(split: KittiSplit, tmp_path: Path, mon
     monkeypatch.setattr(np, "savez", broken)
     with pytest.raises(KeyboardInterrupt):
         cache.fill(split)
-    assert not list(cache.folder.glob("*.npz"))
+    assert not list(cache.files.folder.glob("*.npz"))
 
 
 def test_another_stage_or_setting_is_another_folder(tmp_path: Path) -> None:
     folders = {
-        ProposalCache(tmp_path, RandomStage(identity), settings, camera_view=view).folder
+        ProposalCache(tmp_path, RandomStage(identity), settings, camera_view=view).files.folder
         for identity, settings, view in (
             ("a", SETTINGS, True),
             ("b", SETTINGS, True),
@@ -65,15 +65,15 @@ def test_another_stage_or_setting_is_another_folder(tmp_path: Path) -> None:
         )
     }
     assert len(folders) == 4
-    assert ProposalCache(tmp_path, RandomStage("a"), SETTINGS).folder in folders
+    assert ProposalCache(tmp_path, RandomStage("a"), SETTINGS).files.folder in folders
 
 
 def test_missing_and_damaged_files_are_named(split: KittiSplit, tmp_path: Path) -> None:
     cache = ProposalCache(tmp_path, RandomStage(), SETTINGS)
     with pytest.raises(DatasetError, match=r"000000\.npz: no proposals"):
-        cache.read("000000")
+        cache.files.read("000000")
     cache.fill(split)
-    path = cache.path(split.frame_ids[0])
+    path = cache.files.path(split.frame_ids[0])
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(DatasetError, match=f"{path.name}: damaged"):
-        cache.read(split.frame_ids[0])
+        cache.files.read(split.frame_ids[0])

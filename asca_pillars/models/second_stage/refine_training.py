@@ -9,7 +9,7 @@ import torch
 from asca_pillars.errors import TrainingError
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.refine.refine_loss import RefineTerms, refine_loss
-from asca_pillars.second_stage.refine_sample import RefineBatch, RefineSample, collate_samples
+from asca_pillars.models.second_stage.refine_sample import RefineBatch, RefineSample, collate_samples
 
 _CLIP = 10.0  # largest norm of the whole gradient (PV-RCNN)
 

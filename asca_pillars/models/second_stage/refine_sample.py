@@ -12,9 +12,16 @@ from torch import Tensor
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.models.refine.pillar_refiner import RefineInputs
 from asca_pillars.models.refine.refine_loss import RefineTargets
-from asca_pillars.points.roi_targets import RoiTargets, keypoint_states, match_proposals, roi_targets, sample_rois
-from asca_pillars.second_stage.first_stage import Proposed
-from asca_pillars.second_stage.refine_geometry import RefineScan, RefineSettings, refine_scan
+from asca_pillars.points.first_stage import Proposed
+from asca_pillars.points.refine_geometry import RefineScan, RefineSettings, refine_scan
+from asca_pillars.points.roi_targets import (
+    Overlaps,
+    RoiTargets,
+    keypoint_states,
+    match_proposals,
+    roi_targets,
+    sample_rois,
+)
 
 
 @dataclass(frozen=True)
@@ -40,11 +47,21 @@ def prepare_sample(
 ) -> RefineSample:
     """Draw `rois` proposals of a frame and compute their neighbours and targets."""
     overlaps = match_proposals(proposed.proposals, frame.boxes, frame.labels)
-    drawn = sample_rois(overlaps, rois, rng)
-    chosen = proposed.proposals[drawn]
+    return sample_of(frame, proposed, overlaps, sample_rois(overlaps, rois, rng), settings)
+
+
+def sample_of(
+    frame: LabeledFrame,
+    proposed: Proposed,
+    overlaps: Overlaps,
+    rows: NDArray[np.int64],
+    settings: RefineSettings,
+) -> RefineSample:
+    """Neighbours and targets of the proposals `rows` (S,), which have these `overlaps` with the frame's boxes."""
+    chosen = proposed.proposals[rows]
     return RefineSample(
         scan=refine_scan(frame.points, proposed, chosen, settings),
-        targets=roi_targets(proposed.proposals, frame.boxes, overlaps, drawn),
+        targets=roi_targets(proposed.proposals, frame.boxes, overlaps, rows),
         sizes=chosen.boxes[:, 3:6],
         keypoint_states=keypoint_states(proposed.keypoints, frame.boxes, frame.labels),
     )

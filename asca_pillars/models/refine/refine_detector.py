@@ -1,0 +1,128 @@
+"""The second stage's side of training (`models.trainable.Trainable`); the first stage stands outside it, frozen."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder
+from asca_pillars.models.refine.pillar_refiner import PillarRefiner, RefineInputs, Refinements
+from asca_pillars.models.refine.refine_loss import RefineTargets, refine_loss
+from asca_pillars.models.refine.roi_head import RoiHead
+from asca_pillars.models.second_stage.refine_preparation import LabeledProposals, RefinePreparation, live_preparation
+from asca_pillars.points.refine_geometry import ROI_FEATURES
+from asca_pillars.points.refined_detections import reported_detections
+from asca_pillars.refine_config import RefineConfig, RefineModel
+
+POINT_CHANNELS = 1  # reflectance
+
+
+class RefineOutputs(NamedTuple):
+    """What the second stage says of the proposals of B frames."""
+
+    found: Refinements
+    proposals: tuple[Detections, ...]
+    """Of each frame, which `found` is about."""
+
+
+class RefineDetector(nn.Module):
+    """A second stage on the proposals of the first stage that `model` names.
+
+    Args:
+        model: its section of the configuration.
+        refiner: the network.
+    """
+
+    def __init__(self, model: RefineModel, refiner: PillarRefiner) -> None:
+        super().__init__()
+        self.model = model
+        self.refiner = refiner
+
+    @cached_property
+    def preparation(self) -> RefinePreparation:
+        """Runs the first stage on each frame; training reads cached proposals instead (`models.build`).
+
+        Raises:
+            AscaError: the first stage cannot be opened, or is not the one of the training.
+        """
+        return live_preparation(self.model)
+
+    def predict(self, batch: LabeledProposals) -> RefineOutputs:
+        """Confidence and residuals of the proposals of a batch."""
+        inputs = batch.inputs
+        rows = min(len(inputs.points), len(inputs.keypoints), len(inputs.roi_features))
+        if self.training and rows < 2:  # no statistics of a batch, and nothing to learn
+            return RefineOutputs(self._silence(inputs), batch.proposals)
+        with torch.autocast(inputs.points.device.type, enabled=False):  # positions need float32, `SetAbstraction`
+            found: Refinements = self.refiner(inputs)
+        return RefineOutputs(found, batch.proposals)
+
+    def loss(self, outputs: RefineOutputs, batch: LabeledProposals) -> Mapping[str, Tensor]:
+        """The terms by name, see `refine_loss`; proposals of IGNORED boxes take no part."""
+        found, targets, learnt = outputs.found, batch.targets, batch.learnt
+        counted = Refinements(found.confidence[learnt], found.residuals[learnt], found.keypoint_logits)
+        wanted = RefineTargets(
+            targets.confidence[learnt],
+            targets.positive[learnt],
+            targets.residuals[learnt],
+            targets.sizes[learnt],
+            targets.keypoint_states,
+        )
+        return refine_loss(counted, wanted)._asdict()
+
+    def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
+        """Refined boxes of each frame, with the thresholds of `spec`."""
+        confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
+        ends = np.cumsum([len(proposals) for proposals in outputs.proposals])[:-1]
+        frames = zip(outputs.proposals, np.split(confidence, ends), np.split(residuals, ends), strict=True)
+        return [reported_detections(*frame, spec) for frame in frames]
+
+    def _silence(self, inputs: RefineInputs) -> Refinements:
+        """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
+        nothing = 0 * torch.stack([weight.sum() for weight in self.parameters()]).sum()
+        rois, keypoints = len(inputs.roi_features), len(inputs.keypoints)
+        zeros = inputs.points.new_zeros
+        return Refinements(zeros(rois) + nothing, zeros(rois, 7) + nothing, zeros(keypoints) + nothing)
+
+
+def build_refine_detector(model: RefineModel) -> RefineDetector:
+    """The network that `model` describes, with fresh random weights.
+
+    Raises:
+        ConfigError: it does not say how many channels the first stage's map has.
+    """
+    if not model.bev_channels:
+        raise ConfigError(
+            f"model.bev_channels = 0: not yet read from {model.first_stage}; `asca train` does, "
+            "`models.second_stage.open_first_stage.with_first_stage` elsewhere"
+        )
+    return RefineDetector(model, build_refiner(model.bev_channels, len(model.spec.classes), model.refine))
+
+
+def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> PillarRefiner:
+    """A second stage with fresh random weights."""
+    network, neighbors = refine.network, refine.neighbors
+    return PillarRefiner(
+        KeypointEncoder(
+            POINT_CHANNELS,
+            bev_channels,
+            radii=len(neighbors.ball_radii_m),
+            widths=network.ball_widths,
+            out_channels=network.keypoint_channels,
+        ),
+        RoiHead(
+            network.keypoint_channels,
+            neighbors.grid_size,
+            radii=len(neighbors.grid_radii_m),
+            widths=network.grid_widths,
+            roi_channels=classes + ROI_FEATURES,
+            hidden=network.hidden,
+            dropout=network.dropout,
+        ),
+    )

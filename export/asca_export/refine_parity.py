@@ -1,0 +1,69 @@
+"""The proof that a bundle of two stages is the trained model: graph by graph on the same inputs, then the boxes."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from asca_deploy.bundle import Parity
+from asca_deploy.refine_pipeline import RefinePipeline
+from asca_export.parity import MAP_TOLERANCE, YAW_TOLERANCE_RAD, nearest_partners, require_close
+from asca_pillars.errors import ExportError
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.refine.pillar_refiner import PillarRefiner
+from asca_pillars.models.second_stage.refine_sample import collate_scans
+from asca_pillars.points.first_stage import FirstStage, proposed_from
+from asca_pillars.points.refine_geometry import refine_scan
+from asca_pillars.points.refined_detections import reported_detections
+from asca_pillars.refine_config import RefineModel
+
+
+def prove_refine_parity(
+    refiner: PillarRefiner,
+    stage: FirstStage,
+    runtime: RefinePipeline,
+    model: RefineModel,
+    scans: Sequence[NDArray[np.float32]],
+) -> Parity:
+    """Compare the first stage as it was trained on and the second in PyTorch with the exported graphs.
+
+    The second stage's graph and its boxes are compared on the same proposals, because a proposal that one side has
+    and the other lacks, by a tie between scores, would hide what the graph does.
+
+    Args:
+        refiner: in evaluation mode.
+        stage: the first stage that it was trained on.
+        runtime: opened on the bundle.
+        scans: (N, 4) each.
+
+    Raises:
+        ExportError: they differ; names the first stage that does, and the scan.
+    """
+    worst = worst_box = worst_yaw = 0.0
+    spec = model.spec.with_score_threshold(0.0)
+    spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=10_000))  # every box, none suppressed
+    for number, scan in enumerate(scans):
+        points = scan[np.isfinite(scan).all(axis=1)]
+        expected, found = stage(points), runtime.infer(runtime.prepare(points, []), []).found
+        for name, one, other in zip(HeadMaps._fields, expected.maps, found.maps, strict=True):
+            worst = max(worst, require_close(f"head `{name}`", one, other, MAP_TOLERANCE, number))
+        allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max()))
+        worst = max(worst, require_close("neck", expected.neck, found.neck, allowed, number))
+        proposed = proposed_from(found, points, model.spec, model.refine.seen)
+        inputs = refine_scan(points, proposed, proposed.proposals, model.refine.neighbors)
+        with torch.inference_mode():
+            wanted = refiner(collate_scans([inputs]))
+        ours, theirs = (wanted.confidence.numpy(), wanted.residuals.numpy()), runtime.refine(inputs)
+        for name, one, other in zip(("confidence", "residuals"), ours, theirs, strict=True):
+            worst = max(worst, require_close(f"refine `{name}`", one, other, MAP_TOLERANCE, number))
+        boxes, partners = (reported_detections(proposed.proposals, c, r, spec) for c, r in (ours, theirs))
+        difference, lone = nearest_partners(boxes, partners)
+        if len(lone):
+            raise ExportError(
+                f"scan {number}: stage decode: {len(lone)} refined boxes have no partner within "
+                f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees and a centimetre"
+            )
+        worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
+    return Parity(worst, worst_box, worst_yaw, len(scans), MAP_TOLERANCE)

@@ -1,0 +1,140 @@
+"""Both stages from training to boxes: checkpoint, bundle, runtime."""
+
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from asca_deploy import Detector
+from asca_deploy.bundle import GRAPHS, MANIFEST
+from asca_deploy.manifest import load_bundle
+from asca_export.refine_exporter import export_refine_bundle
+from asca_export.refine_graph import fold_norms
+from asca_pillars.errors import BundleError, ExportError
+from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.refine.refine_detector import RefineDetector
+from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.training.loop import train
+from tests.export.tiny import SCANS
+from tests.models.refine.test_pillar_refiner import batch, small_refiner
+from tests.models.second_stage.tiny_refine import tiny_refine_config, write_first_stage
+from tests.scenes import write_dataset
+
+DETECT = """
+import sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "lightning", "onnx", "onnxscript", "asca_export"):
+            raise ImportError(f"{name} must not be imported here")
+
+sys.meta_path.insert(0, NoTorch())
+import numpy as np
+import asca_deploy
+print(len(asca_deploy.Detector(sys.argv[1], score_threshold=0.0, threads=1)(np.load(sys.argv[2]))))
+"""
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A checkpoint of the second stage, and the bundle exported from it."""
+    folder = tmp_path_factory.mktemp("refine")
+    config = tiny_refine_config(write_first_stage(folder / "first.ckpt"), learning_rate=1e-2)
+    last = train(config, write_dataset(folder / "data", 5), folder / "run")
+    export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
+    return last, folder / "bundle"
+
+
+def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    last, folder = trained
+    bundle = load_bundle(folder)
+    assert (bundle.kind, set(bundle.graphs)) == ("pillar_refine", set(GRAPHS["pillar_refine"]))
+    assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.refine is not None
+    checkpoint = load_checkpoint(last)
+    in_torch = ScanDetector(checkpoint.detector, checkpoint.config.model.spec.with_score_threshold(0.0))
+    in_onnx = Detector(folder, score_threshold=0.0, threads=1)
+    found = [in_onnx(scan) for scan in SCANS]
+    assert sum(map(len, found)) > 0
+    for scan, detections in zip(SCANS, found, strict=True):
+        wanted = in_torch(scan)
+        np.testing.assert_allclose(detections.boxes, wanted.boxes, atol=1e-2)
+        np.testing.assert_allclose(detections.scores, wanted.scores, atol=1e-3)
+    assert set(found[0].report.times_ms) == {"input", *in_onnx.pipeline.stages}
+    for streamed, alone in zip(in_onnx.stream(SCANS), found, strict=True):
+        np.testing.assert_array_equal(streamed.boxes, alone.boxes)
+    with ThreadPoolExecutor(3) as pool:
+        for together, alone in zip(pool.map(in_onnx, SCANS), found, strict=True):
+            np.testing.assert_array_equal(together.boxes, alone.boxes)
+    np.save(tmp_path / "scan.npy", SCANS[0])
+    command = [sys.executable, "-W", "error", "-c", DETECT, str(folder), str(tmp_path / "scan.npy")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) == len(found[0])
+
+
+def test_scans_with_little_or_nothing(trained: tuple[Path, Path]) -> None:
+    detector = Detector(trained[1], score_threshold=0.0, threads=1)
+    for points in (np.empty((0, 4)), np.array([[200, 0, 0, 0.5]]), np.array([[10, 0, -1, 0.5]])):
+        assert np.isfinite(detector(points.astype(np.float32)).boxes).all()
+    assert len(Detector(trained[1], score_threshold=1.0, threads=1)(SCANS[0])) == 0
+
+
+def test_folded_norms_change_nothing() -> None:
+    refiner, inputs = small_refiner(), batch((0, 1)).inputs
+    refiner.train()
+    with torch.no_grad():
+        for _ in range(3):
+            refiner(inputs)  # statistics that are not those of fresh weights
+        wanted, found = refiner.eval()(inputs), fold_norms(refiner)(inputs)
+    for one, other in zip(wanted, found, strict=True):
+        torch.testing.assert_close(other, one, atol=1e-4, rtol=1e-4)
+    assert any(isinstance(module, torch.nn.BatchNorm1d) for module in refiner.modules())
+    assert not any(isinstance(module, torch.nn.BatchNorm1d) for module in fold_norms(refiner).modules())
+
+
+def test_the_graph_needs_no_scatter_and_no_normalization(trained: tuple[Path, Path]) -> None:
+    kinds = {node.op_type for node in onnx.load(trained[1] / "refine.onnx").graph.node}
+    assert not kinds & {"BatchNormalization", "ScatterND", "ScatterElements", "NonZero", "Loop"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data["refine"]["seen"]["keypoints"].update(count=100), "`refine` is not the one that"),
+        (lambda data: data["refine"].update(bev_channels=0), "bev_channels 0 must lie between"),
+        (lambda data: data.pop("refine"), "`refine` is missing|`refine` is null"),
+        (lambda data: data["refine"]["seen"]["proposals"].update(quotas=[1, 2]), "has not one for each class"),
+        (lambda data: data["graphs"].pop("refine"), "has the graphs encoder and backbone and refine, not"),
+        (lambda data: data.update(kind="pillar"), "`refine` belongs to kind pillar_refine"),
+        (lambda data: data["pillar"].update(neck="sparse", active_cells="sub"), "needs a dense neck and a warped map"),
+        (lambda data: data["spec"]["grid"].update(map="pooled"), "needs a dense neck and a warped map"),
+        (lambda data: data.update(precision="int8"), "`precision` of kind pillar_refine is float32"),
+    ],
+)
+def test_manifests_that_were_changed(trained: tuple[Path, Path], tmp_path: Path, change: object, message: str) -> None:
+    for file in trained[1].iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    data = json.loads((tmp_path / MANIFEST).read_text())
+    change(data)  # type: ignore[operator]
+    (tmp_path / MANIFEST).write_text(json.dumps(data))
+    with pytest.raises(BundleError, match=message):
+        load_bundle(tmp_path)
+
+
+def test_a_refiner_with_other_weights_is_no_parity(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    checkpoint = load_checkpoint(trained[0])
+    assert isinstance(checkpoint.detector, RefineDetector)
+    with torch.no_grad():
+        for weight in checkpoint.detector.refiner.head.confidence.parameters():
+            weight.fill_(torch.nan)
+    with pytest.raises(ExportError, match="part at stage refine `confidence`"):
+        export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    assert not (tmp_path / "bundle").exists()
+    with pytest.raises(ExportError, match="at least 8"):
+        export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS[:1])

@@ -1,0 +1,159 @@
+"""The second stage through the same training as a pillar detector: cached proposals, resume, average, evaluation."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.config import AugmentConfig, load_config
+from asca_pillars.data.frames import LabeledFrame, Motion
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.refine.refine_detector import RefineDetector
+from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.second_stage.open_first_stage import open_first_stage, with_first_stage
+from asca_pillars.models.second_stage.refine_preparation import LabeledProposals, move_proposed
+from asca_pillars.models.second_stage.refined_detector import refine
+from asca_pillars.points.first_stage import propose_on
+from asca_pillars.points.roi_targets import match_proposals
+from asca_pillars.refine_config import RefineModel
+from asca_pillars.training.dataset import Batch, Collate, open_dataset
+from asca_pillars.training.loop import train
+from tests.models.refine.test_pillar_refiner import proposed_frame
+from tests.models.second_stage.tiny_refine import (
+    STILL_OBJECTS,
+    opened_config,
+    tiny_refine_config,
+    tiny_refine_model,
+    write_first_stage,
+)
+from tests.scenes import SPEC, write_dataset
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Path:
+    return write_first_stage(tmp_path / "first.ckpt")
+
+
+@pytest.mark.parametrize("ema", [0.0, 0.9])
+def test_a_run_made_longer_is_the_longer_run(tmp_path: Path, stage: Path, ema: float) -> None:
+    data = write_dataset(tmp_path / "data", 5)
+    long, short = (tiny_refine_config(stage, epochs=epochs, ema=ema) for epochs in (2, 1))
+    straight = load_checkpoint(train(long, data, tmp_path / "straight"))
+    train(short, data, tmp_path / "resumed")
+    resumed = load_checkpoint(train(long, data, tmp_path / "resumed"))
+    assert straight.steps == resumed.steps == 4
+    assert straight.config.model.spec == SPEC, "taken from the first stage"
+    for (name, expected), found in zip(
+        straight.detector.state_dict().items(), resumed.detector.state_dict().values(), strict=True
+    ):
+        torch.testing.assert_close(found, expected, msg=name, rtol=0, atol=0)
+
+
+def test_a_checkpoint_runs_both_stages(tmp_path: Path, stage: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    checkpoint = load_checkpoint(train(tiny_refine_config(stage, epochs=1), data, tmp_path / "run"))
+    model, detector = checkpoint.config.model, checkpoint.detector
+    assert isinstance(model, RefineModel) and isinstance(detector, RefineDetector)
+    points = KittiSplit(data, "val").points("000002", camera_view=True)
+    found = ScanDetector(detector, model.spec.with_score_threshold(0.0))(points)
+    proposed = propose_on(open_first_stage(str(stage)), points, model.refine.seen)
+    wanted = refine(detector.refiner, points, proposed, model.refine.neighbors, model.spec.post)
+    assert len(found) > 0
+    np.testing.assert_array_equal(found.boxes, wanted.boxes)
+    np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-6)
+    assert len(ScanDetector(detector, model.spec)(np.empty((0, 4), np.float32))) == 0
+    write_first_stage(stage, cpa="none")
+    open_first_stage.cache_clear()
+    with pytest.raises(ConfigError, match=r"first\.ckpt: other weights are there"):
+        ScanDetector(load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").detector, model.spec)(points)
+
+
+def test_proposals_are_computed_once(tmp_path: Path, stage: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    config = opened_config(stage)
+    open_dataset(data, config, training=True)
+    files = sorted((data / "prepared").glob("*/proposals-*/*.npz"))
+    assert [path.stem for path in files] == ["000000", "000001"]
+    times = [path.stat().st_mtime_ns for path in files]
+    open_dataset(data, config, training=True)
+    assert [path.stat().st_mtime_ns for path in files] == times
+
+
+def test_a_moved_scene_has_its_proposals_moved_with_it(tmp_path: Path, stage: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    moving = AugmentConfig(**vars(STILL_OBJECTS) | {"flip_probability": 1.0, "rotation_rad": 1.5, "shift_z_m": 0.2})
+    config = dataclasses.replace(opened_config(stage), augment=moving)
+    frames = open_dataset(data, config, training=True)
+    sample = frames.sample(0, 0)
+    assert sample.frame.motion.flipped and abs(sample.frame.motion.rotation_rad) > 0.01
+    again = frames.sample(0, 0).prepared
+    np.testing.assert_array_equal(sample.prepared.sample.scan.grid_points, again.sample.scan.grid_points)
+    for keypoint in sample.prepared.sample.scan.keypoints:  # they are points of the scan, and must have stayed so
+        assert np.abs(sample.frame.points[:, :3] - keypoint).max(axis=1).min() < 1e-4
+
+
+@pytest.mark.parametrize("motion", [Motion(flipped=True), Motion(False, 2.0), Motion(True, -0.7, 1.1, 0.3)])
+def test_motion_keeps_overlaps_and_headings(motion: Motion) -> None:
+    frame, proposed = proposed_frame(0)
+    boxes = move_proposed(
+        dataclasses.replace(proposed, proposals=dataclasses.replace(proposed.proposals[:4], boxes=frame.boxes)), motion
+    ).proposals.boxes
+    before = match_proposals(proposed.proposals, frame.boxes, frame.labels)
+    after = match_proposals(move_proposed(proposed, motion).proposals, boxes, frame.labels)
+    np.testing.assert_allclose(after.iou, before.iou, atol=1e-4)
+    np.testing.assert_array_equal(after.matched, before.matched)
+
+
+def test_a_batch_without_proposals_is_learnt_from_and_changes_nothing(tmp_path: Path, stage: Path) -> None:
+    model = with_first_stage(tiny_refine_model(stage))
+    detector = build_model(model)
+    assert isinstance(detector, RefineDetector)
+    empty = LabeledFrame("", np.empty((0, 4), np.float32), np.empty((0, 7), np.float32), np.empty(0, np.int64))
+    batch = detector.preparation.collate([detector.preparation.prepare(empty, np.random.default_rng(0))])
+    before = {name: value.clone() for name, value in detector.named_buffers()}
+    terms = detector.train().loss(detector.predict(batch), batch).values()
+    torch.stack(list(terms)).sum().backward()
+    assert all(weight.grad is not None and not weight.grad.any() for weight in detector.parameters())
+    for name, value in detector.named_buffers():
+        assert torch.equal(value, before[name]), name
+
+
+def test_ignored_proposals_are_detected_and_not_learnt(tmp_path: Path, stage: Path) -> None:
+    config = opened_config(stage)
+    frames = open_dataset(write_dataset(tmp_path / "data", 3), config, training=False)
+    batch = Collate(frames.preparation)([frames.sample(0, 0)])
+    assert isinstance(batch, Batch)
+    detector = build_model(config.model).eval()
+    with torch.inference_mode():
+        outputs = detector.predict(batch.inputs)
+    assert isinstance(batch.inputs, LabeledProposals)
+    batch.inputs.learnt[:] = False
+    assert detector.loss(outputs, batch.inputs)["confidence"] == 0
+    assert len(detector.detect(outputs, SPEC.with_score_threshold(0.0))[0]) > 0
+
+
+def test_what_cannot_be(tmp_path: Path, stage: Path) -> None:
+    model = "model.kind=pillar_refine"
+    base = load_config("asca_refine_sim")
+    assert base.model.kind == "pillar_refine"
+    for override, message in (
+        ("augment.object_shift_m=0.1", r"augment.object_shift_m = 0.1: .* set augment.object_shift_m=0"),
+        ("augment.insert.method=rs_aug", "augment.insert.method = rs_aug"),
+        ("model.refine.rois=1", "model.refine.rois = 1"),
+        ("model.refine.seen.proposals.quotas=[1, 2]", "give one for each of the classes Car, Pedestrian"),
+        ("model.refine.network.dropout=1", "model.refine.network.dropout = 1"),
+        ("model.refine.netwrk=1", "did you mean `network`"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load_config("asca_refine_sim", [model, override])
+    with pytest.raises(ConfigError, match="bev_channels = 0"):
+        build_model(tiny_refine_config(stage).model)
+    with pytest.raises(TrainingError, match="no such checkpoint"):
+        with_first_stage(tiny_refine_model(tmp_path / "none.ckpt"))
+    with pytest.raises(ConfigError, match=r"the map of .* has 48; leave it out"):
+        with_first_stage(dataclasses.replace(tiny_refine_model(stage), bev_channels=47))
