@@ -127,7 +127,8 @@ def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig
     model = with_first_stage(model)
     stage = open_first_stage(model.first_stage)
     folder = prepared_folder(split.root, data) / split.pool
-    cache = ProposalCache(folder, stage, model.refine.seen, camera_view=data.camera_view)
+    view = data.camera_view and split.has_camera
+    cache = ProposalCache(folder, stage, model.refine.seen, camera_view=view)
     cache.fill(split, console=Console(stderr=True))
     return RefinePreparation(model.refine, CachedProposals(cache.files))
 
