@@ -4,6 +4,7 @@ One is not: inserting objects reads a prepared dataset, so it is off until a con
 """
 
 import math
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,8 @@ from asca_pillars.tables.neck_tables import MaskRule
 from asca_pillars.yaml_text import MAX_CHARACTERS, parse_yaml
 
 T = TypeVar("T")
+
+_LARGEST = 2.0**53  # of settings: up to here a float counts every whole number
 
 CpaReading = Literal["none", "paper", "channel", "point"]
 InsertMethod = Literal["none", "gt_aug", "rs_aug"]
@@ -322,7 +325,10 @@ def _require(section: str, settings: Strict, names: Sequence[str], *, low: float
     for name in names:
         value = getattr(settings, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if not (math.isfinite(number) and low <= number <= high):
+            # Compared, never converted: a whole number may be larger than any float.
+            if abs(number) > _LARGEST and number != math.inf:
+                raise ConfigError(f"{section}.{name} = {reprlib.repr(number)}: must be at most {_LARGEST:g}")
+            if not low <= number <= high or number == math.inf:
                 bounds = f"be at least {low:g}" if high == math.inf else f"lie between {low:g} and {high:g}"
                 raise ConfigError(f"{section}.{name} = {number:g}: must {bounds}")
 
