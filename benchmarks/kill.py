@@ -5,6 +5,8 @@
 Each command runs once undisturbed. Then it is started, killed (SIGKILL, with all its processes) at a random moment
 after its first output and before its last, and given again: what is there at the end has to be what the undisturbed
 run wrote, and nothing else may be left. A run that was not killed in time does not count and is repeated.
+
+Run it from a checkout that nobody edits meanwhile: an export writes the git revision into its manifest.
 """
 
 import hashlib
