@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import shutil
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             torch.save(checkpoint, temporary)
             if path.name == LAST:
                 if self.keep_last and path.exists():
-                    path.replace(path.with_name(PREVIOUS))  # a kill now leaves that one to go on from
+                    with atomic_path(path.with_name(PREVIOUS)) as previous:
+                        shutil.copyfile(path, previous)  # not renamed: readers find a last.ckpt at every moment
                 self.keep_last = True
 
 

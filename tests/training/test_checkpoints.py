@@ -32,8 +32,24 @@ def test_the_last_two_are_kept(tmp_path: Path) -> None:
         save(tmp_path, step, files)
     assert step_of(tmp_path / "last.ckpt") == 3 and step_of(tmp_path / "previous.ckpt") == 2
     assert checkpoint_to_resume(tmp_path) == (tmp_path / "last.ckpt", None)
-    (tmp_path / "last.ckpt").unlink()  # killed between the two renames
+    (tmp_path / "last.ckpt").unlink()
     assert checkpoint_to_resume(tmp_path) == (tmp_path / "previous.ckpt", None)
+
+
+def test_there_is_a_last_checkpoint_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader that watches a run (`asca eval`, a copy by rsync) must not find the name gone between two saves."""
+    files = AtomicCheckpointIO(keep_last=True)
+    save(tmp_path, 1, files)
+    last, rename, seen = tmp_path / "last.ckpt", Path.replace, []
+
+    def watched(source: Path, target: Path) -> Path:
+        result = rename(source, target)
+        seen.append(last.exists())
+        return result
+
+    monkeypatch.setattr(Path, "replace", watched)
+    save(tmp_path, 2, files)
+    assert seen == [True, True]
 
 
 @pytest.mark.parametrize("size", [0, 1, 100, -1])

@@ -195,20 +195,21 @@ def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(config)))
     command = [sys.executable, "-m", "asca_pillars.cli", "train", str(tmp_path / "config.yaml"), "--data", str(data)]
-    process = subprocess.Popen(
+    last = broken / "checkpoints" / "last.ckpt"
+    deadline = time.monotonic() + 120
+    with subprocess.Popen(
         [*command, "--out", str(broken)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         # Sums of floats depend on the number of threads, and another test may have changed this process's.
         env=os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())},
-    )
-    last = broken / "checkpoints" / "last.ckpt"
-    deadline = time.monotonic() + 120
-    while not (last.exists() and load_checkpoint(last).steps >= 18):  # of 48, sixteen to an epoch
-        assert process.poll() is None and time.monotonic() < deadline, "the run ended before it could be killed"
-        time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    ) as process:
+        try:
+            while not (last.exists() and load_checkpoint(last).steps >= 18):  # of 48, sixteen to an epoch
+                assert process.poll() is None and time.monotonic() < deadline, "it ended before it could be killed"
+                time.sleep(0.01)
+        finally:
+            process.kill()
     assert load_checkpoint(last).steps < 48, "killed too late to test anything"
 
     resumed = load_checkpoint(train(config, data, broken))
