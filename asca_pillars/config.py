@@ -4,94 +4,21 @@ One is not: inserting objects reads a prepared dataset, so it is off until a con
 """
 
 import math
-import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias
 
-import yaml
 from pydantic import Discriminator, Tag
 
+from asca_pillars.bounds import require_bounds
 from asca_pillars.errors import ConfigError
-from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.refine_config import RefineModel
-from asca_pillars.schema import Strict, parse
-from asca_pillars.tables.neck_tables import MaskRule
-from asca_pillars.yaml_text import MAX_CHARACTERS, parse_yaml
+from asca_pillars.schema import Strict
+from asca_pillars.settings import read_settings, shipped_configs
 
-T = TypeVar("T")
-
-_LARGEST = 2.0**53  # of settings: up to here a float counts every whole number
-
-CpaReading = Literal["none", "paper", "channel", "point"]
 InsertMethod = Literal["none", "gt_aug", "rs_aug"]
-
-
-@dataclass(frozen=True)
-class NetworkConfig(Strict):
-    """Widths and depths of the network.
-
-    Attributes:
-        cpa: reading of the correlative point attention, see docs/READING.md.
-        pillar_channels: C, features of one pillar.
-        block_channels: output channels of Block1..3 (Table 1).
-        block_convs: stride-1 convolutions that follow each block's strided one (Table 1: 3).
-        upsample_channels: output channels of each DeBlock (Table 1: 128).
-        neck: `dense` computes everywhere, `sparse` at active cells alone; the weights fit both.
-        active_cells: which cells are active in a sparse neck, see `tables.neck_tables`.
-    """
-
-    cpa: CpaReading = "channel"
-    pillar_channels: int = 64
-    block_channels: tuple[int, int, int] = (64, 128, 256)
-    block_convs: tuple[int, int, int] = (3, 3, 3)
-    upsample_channels: int = 128
-    neck: Literal["dense", "sparse"] = "dense"
-    active_cells: MaskRule = "fine"
-
-    def __post_init__(self) -> None:
-        _require("model.network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
-        _require("model.network", self, ("block_convs",), low=0)
-        if self.neck == "sparse" and self.active_cells == "fine" and not self.block_convs[0]:
-            raise ConfigError(
-                "model.network.active_cells = fine grows in the first block's stride-1 convolutions, of which "
-                "model.network.block_convs has none; give it one, or set model.network.active_cells=sub"
-            )
-
-
-@dataclass(frozen=True)
-class LossConfig(Strict):
-    """Eq. (13)-(15) with the residuals of PointPillars; `smooth_l1_beta` is SECOND's 1/9."""
-
-    box_weight: float = 2.0
-    class_weight: float = 1.0
-    direction_weight: float = 0.2
-    focal_alpha: float = 0.25
-    focal_gamma: float = 2.0
-    smooth_l1_beta: float = 1 / 9
-
-    def __post_init__(self) -> None:
-        weights = ("box_weight", "class_weight", "direction_weight")
-        _require("model.loss", self, (*weights, "focal_gamma", "smooth_l1_beta"), low=0)
-        _require("model.loss", self, ("focal_alpha",), low=0, high=1)
-
-
-@dataclass(frozen=True)
-class PillarModel(Strict):
-    """ASCA-PointPillars and PointPillars: one stage on pillars.
-
-    Attributes:
-        kind: tells the families of detectors apart.
-        spec: grid, limits, classes and post-processing, which training and the vehicle share.
-        network: widths and depths.
-        loss: weights of the loss.
-    """
-
-    kind: Literal["pillar"] = "pillar"
-    spec: PillarSpec = field(default_factory=PillarSpec)
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
 
 
 def _family(settings: Any) -> Any:
@@ -125,8 +52,8 @@ class InsertConfig(Strict):
     min_points: int = 5
 
     def __post_init__(self) -> None:
-        _require("augment.insert", self, ("objects",), low=0)
-        _require("augment.insert", self, ("min_points",), low=1)
+        require_bounds("augment.insert", self, ("objects",), low=0)
+        require_bounds("augment.insert", self, ("min_points",), low=1)
         for name, share in self.proportions.items():
             if not (math.isfinite(share) and share >= 0):
                 raise ConfigError(f"augment.insert.proportions.{name} = {share:g}: must be at least 0")
@@ -166,9 +93,9 @@ class AugmentConfig(Strict):
 
     def __post_init__(self) -> None:
         shares = ("flip_probability", "point_dropout", "object_cut_probability", "reflectance_loss_probability")
-        _require("augment", self, shares, low=0, high=1)
+        require_bounds("augment", self, shares, low=0, high=1)
         noise = ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m", "object_jitter_m")
-        _require("augment", self, noise, low=0)
+        require_bounds("augment", self, noise, low=0)
         for name in ("scale", "object_reflectance_gain"):
             low, high = getattr(self, name)
             if not 0 < low <= high < math.inf:
@@ -195,7 +122,7 @@ class DataConfig(Strict):
     prepared: str | None = None
 
     def __post_init__(self) -> None:
-        _require("data", self, ("min_points", "workers"), low=0)
+        require_bounds("data", self, ("min_points", "workers"), low=0)
 
 
 @dataclass(frozen=True)
@@ -226,8 +153,8 @@ class TrainConfig(Strict):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _require("train", self, ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"), low=1)
-        _require("train", self, ("learning_rate", "weight_decay", "decay", "gradient_clip", "seed"), low=0)
+        require_bounds("train", self, ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"), low=1)
+        require_bounds("train", self, ("learning_rate", "weight_decay", "decay", "gradient_clip", "seed"), low=0)
         if not 0 <= self.ema < 1:
             raise ConfigError(f"train.ema = {self.ema:g}: must be at least 0 and less than 1, such as 0.999")
 
@@ -269,17 +196,6 @@ class Config(Strict):
                 )
 
 
-def shipped_configs(kind: str = "") -> dict[str, Path]:
-    """The configurations that come along, by name: those of the installed package, or of the checkout.
-
-    Args:
-        kind: folder below configs/ for those of something else than a model.
-    """
-    package = Path(__file__).parent
-    folders = (package / "configs" / kind, package.parent / "configs" / kind)
-    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
-
-
 def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     """Read a YAML file that holds what differs from the defaults.
 
@@ -291,59 +207,3 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
         ConfigError: unreadable YAML, an unknown key anywhere (the nearest is named), an impossible value.
     """
     return read_settings(Config, path, overrides, shipped_configs())
-
-
-def read_settings(type_: type[T], path: str | Path, overrides: Sequence[str], shipped: Mapping[str, Path]) -> T:
-    """Settings of any dataclass, as `load_config` reads those of a model; `shipped` are the names that stand for files.
-
-    Raises:
-        ConfigError: as `load_config`.
-    """
-    path = shipped.get(str(path), Path(path))
-    try:
-        if path.stat().st_size > 4 * MAX_CHARACTERS:  # a character has up to four bytes
-            raise ConfigError(f"{path}: {path.stat().st_size} bytes are too many for settings; give another file")
-        data = parse_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); these ship: {', '.join(shipped)}") from None
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date like 2026-99-99
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if data is None:
-        data = {}
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: expected `key: value` lines, found a {type(data).__name__}")
-    settings = parse(type_, data, str(path))
-    if not overrides:
-        return settings
-    for override in overrides:
-        _apply(data, override)
-    return parse(type_, data, f"{path} with {' '.join(overrides)}")
-
-
-def _require(section: str, settings: Strict, names: Sequence[str], *, low: float, high: float = math.inf) -> None:
-    """Refuse numbers, alone or in a tuple, below `low`, above `high` or not finite."""
-    for name in names:
-        value = getattr(settings, name)
-        for number in value if isinstance(value, tuple) else (value,):
-            # Compared, never converted: a whole number may be larger than any float.
-            if abs(number) > _LARGEST and number != math.inf:
-                raise ConfigError(f"{section}.{name} = {reprlib.repr(number)}: must be at most {_LARGEST:g}")
-            if not low <= number <= high or number == math.inf:
-                bounds = f"be at least {low:g}" if high == math.inf else f"lie between {low:g} and {high:g}"
-                raise ConfigError(f"{section}.{name} = {number:g}: must {bounds}")
-
-
-def _apply(data: dict[str, Any], override: str) -> None:
-    """Set `key.subkey=value` in the nested dictionary `data`."""
-    key, separator, text = override.partition("=")
-    if not separator or not key:
-        raise ConfigError(f"`{override}`: an override is written key.subkey=value, such as train.epochs=20")
-    *parents, leaf = key.strip().split(".")
-    for parent in parents:
-        data = data.setdefault(parent, {})
-        if not isinstance(data, dict):
-            raise ConfigError(f"`{override}`: `{parent}` is a value, it has no keys")
-    try:
-        data[leaf] = parse_yaml(text)
-    except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(f"`{override}`: the value is not valid YAML: {' '.join(str(error).split())}") from None

@@ -10,11 +10,12 @@ import numpy as np
 import yaml
 
 from asca_deploy import default_bundle_path, load_bundle
-from asca_pillars.config import Config, load_config, shipped_configs
+from asca_pillars.config import Config, load_config
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from asca_pillars.schema import to_dict
+from asca_pillars.settings import shipped_configs
 from asca_pillars.sim.simulation_configs import load_simulation_config
 
 LABEL = "Car 0.00 0 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57"

@@ -18,12 +18,13 @@ from torch import nn
 
 from asca_deploy import sample_scan_path
 from asca_export.exporter import MIN_SCANS, export_bundle
-from asca_pillars.config import PillarModel, load_config
+from asca_pillars.config import load_config
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.pillar_config import PillarModel
 
 
 def main(

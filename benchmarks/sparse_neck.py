@@ -30,12 +30,12 @@ from asca_export.quantize import STEPS, canvas_steps, layer_names, scale_to_step
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
 from asca_export.sparse_quantize import SparseSample, quantized_backbone
-from asca_pillars.config import PillarModel
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import Placement, batch_pillars
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.system import cpu_model
 from asca_pillars.tables.neck_tables import NeckTableBuilder, table_inputs
 from benchmarks.host_path import CAMERA_VIEW

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from asca_pillars.config import load_config, read_settings
+from asca_pillars.config import load_config
 from asca_pillars.errors import ConfigError
+from asca_pillars.settings import read_settings
 from asca_pillars.sim.simulation import SimulationConfig
 from asca_pillars.yaml_text import MAX_CHARACTERS, parse_yaml
 

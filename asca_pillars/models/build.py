@@ -2,13 +2,14 @@
 
 from typing import assert_never
 
-from asca_pillars.config import DataConfig, ModelConfig, PillarModel
+from asca_pillars.config import DataConfig, ModelConfig
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import PillarPreparation
 from asca_pillars.models.refine.refine_detector import build_refine_detector
 from asca_pillars.models.second_stage.refine_preparation import cached_preparation
 from asca_pillars.models.trainable import Preparation, Trainable
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.refine_config import RefineModel
 
 

@@ -17,12 +17,12 @@ from asca_export.int8 import quantize_bundle
 from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
-from asca_pillars.config import PillarModel
 from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.system import cpu_model, default_threads, git_revision, package_versions
 
 MIN_SCANS = 8

@@ -9,9 +9,11 @@ import yaml
 
 from asca_pillars.ablation.variants import VARIANTS, Variant, runs, train_runs
 from asca_pillars.commands.ablate import ablate
-from asca_pillars.config import PillarModel, load_config, shipped_configs
+from asca_pillars.config import load_config
 from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
+from asca_pillars.settings import shipped_configs
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import CpaReading, PillarModel
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.pillar_config import CpaReading, PillarModel
 from benchmarks.memory import crops
 from benchmarks.padded import PaddedDetector
 from tests.scenes import make_scene

@@ -13,10 +13,10 @@ from asca_deploy.benchmark import benchmark
 from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.pillar_pipeline import open_backbone
 from asca_export.exporter import export_bundle
-from asca_pillars.config import PillarModel
 from asca_pillars.errors import ConfigError, ProviderError
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.pillar_config import PillarModel
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.scenes import SPEC, make_scene
 

@@ -16,11 +16,11 @@ from asca_export.quantize import STEPS, canvas_steps
 from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
 from asca_export.sparse_quantize import SparseSample, quantized_backbone, scale_rows_to_steps
-from asca_pillars.config import PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import Placement, batch_pillars
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pillars.pillarize import Pillars
 from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, NeckTables, table_inputs
 from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint

@@ -5,9 +5,10 @@ from typing import Any
 
 import torch
 
-from asca_pillars.config import Config, CpaReading, NetworkConfig, PillarModel
+from asca_pillars.config import Config
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
+from asca_pillars.pillar_config import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from tests.scenes import SPEC, make_scene
 

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from asca_pillars.config import Config, DataConfig, PillarModel, TrainConfig
+from asca_pillars.config import Config, DataConfig, TrainConfig
 from asca_pillars.errors import TrainingError
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume, remove_leftovers, save_weights
 from asca_pillars.training.run_folder import claim

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig, NetworkConfig, PillarModel
+from asca_pillars.config import AugmentConfig, Config, DataConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -18,6 +18,7 @@ from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, Placement, PreparedPillars
+from asca_pillars.pillar_config import NetworkConfig, PillarModel
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset

@@ -15,13 +15,14 @@ import pytest
 import torch
 import yaml
 
-from asca_pillars.config import AugmentConfig, Config, CpaReading, DataConfig, NetworkConfig, PillarModel, TrainConfig
+from asca_pillars.config import AugmentConfig, Config, DataConfig, TrainConfig
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ScanError, TrainingError
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillar_config import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.schema import to_dict
 from asca_pillars.training.callbacks import TrainingInterruptedError
 from asca_pillars.training.dataset import Batch, Collate, open_dataset

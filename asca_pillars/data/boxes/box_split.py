@@ -20,7 +20,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.config import read_settings
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, records_from
 from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.data.labeled_split import LabeledBoxes
@@ -29,6 +28,7 @@ from asca_pillars.data.scans.reflectance import ReflectanceScale
 from asca_pillars.data.scans.scan_reader import folder_reflectance_scale, read_scan, stored_points
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.schema import Strict
+from asca_pillars.settings import read_settings
 
 DATASET_FILE = "dataset.yaml"
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.config import LossConfig
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.pillar_config import LossConfig
 
 
 class TargetBatch(NamedTuple):

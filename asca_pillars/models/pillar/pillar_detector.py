@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.config import LossConfig, PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
@@ -16,6 +15,7 @@ from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pillar.loss import detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, PillarPreparation
+from asca_pillars.pillar_config import LossConfig, PillarModel
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.tables.neck_tables import NeckTables
 

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from asca_pillars.config import PillarModel
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.points.first_stage import FirstPass, require_dense_map
 
 

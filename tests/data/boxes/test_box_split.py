@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.config import Config, DataConfig, InsertConfig, PillarModel
+from asca_pillars.config import Config, DataConfig, InsertConfig
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
@@ -17,6 +17,7 @@ from asca_pillars.data.open_split import open_split
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.anchors import ClassSpec
+from asca_pillars.pillar_config import PillarModel
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import SPEC, make_scene, write_dataset
 

@@ -11,7 +11,7 @@ from shapely.geometry import Polygon
 from torch.utils.data import DataLoader
 
 from asca_pillars.commands.prepare import prepare
-from asca_pillars.config import Config, DataConfig, InsertConfig, PillarModel
+from asca_pillars.config import Config, DataConfig, InsertConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares, prepare_inserter
@@ -19,6 +19,7 @@ from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, 
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.training.dataset import Collate, open_dataset
 from tests.data.insertion.simple_streets import TYPES, write_streets
 from tests.scenes import SPEC

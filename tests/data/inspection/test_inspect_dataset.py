@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from asca_pillars.commands.inspect import inspect
-from asca_pillars.config import Config, DataConfig, PillarModel
+from asca_pillars.config import Config, DataConfig
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dataset
@@ -29,6 +29,7 @@ from asca_pillars.data.scans.scan_reader import read_scan, stored_points
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.overlap import aligned_bev_iou
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pillars.pillarize import PillarLimits
 from asca_pillars.schema import to_dict
 from asca_pillars.training.dataset import open_dataset

@@ -9,7 +9,7 @@ import yaml
 from typer.testing import CliRunner
 
 from asca_pillars.cli import app
-from asca_pillars.config import Config, DataConfig, PillarModel, load_config
+from asca_pillars.config import Config, DataConfig, load_config
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.inspection.findings import findings
@@ -18,6 +18,7 @@ from asca_pillars.data.inspection.proposal import differences, propose
 from asca_pillars.data.kitti import write_image_set
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.errors import AscaError, DatasetError, OutputError
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import parse

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from asca_pillars.config import CpaReading
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
+from asca_pillars.pillar_config import CpaReading
 from asca_pillars.pillars.pillarize import PillarLimits
 
 LIMITS = PillarLimits(max_pillars=40, max_points=6)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.models.pillar.neck import RPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
+from asca_pillars.pillar_config import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
 

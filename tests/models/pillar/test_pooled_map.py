@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import NetworkConfig, PillarModel
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.pillar_config import NetworkConfig, PillarModel
 from asca_pillars.pillars.map_pooling import pool_pillars
 from tests.scenes import SPEC, make_scene
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import LossConfig, NetworkConfig, PillarModel
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch, detection_loss
@@ -16,6 +15,7 @@ from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, PillarOutputs, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, Placement, batch_pillars
 from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.pillar_config import LossConfig, NetworkConfig, PillarModel
 from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder
 from tests.scenes import SPEC, make_scene
 

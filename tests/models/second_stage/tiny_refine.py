@@ -5,9 +5,10 @@ from pathlib import Path
 
 import torch
 
-from asca_pillars.config import AugmentConfig, Config, CpaReading, DataConfig, TrainConfig
+from asca_pillars.config import AugmentConfig, Config, DataConfig, TrainConfig
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
+from asca_pillars.pillar_config import CpaReading
 from asca_pillars.points.first_stage import FirstStageSettings, KeypointSettings
 from asca_pillars.points.proposals import ProposalSettings
 from asca_pillars.points.refine_geometry import RefineSettings

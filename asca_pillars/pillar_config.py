@@ -1,0 +1,78 @@
+"""The section `model` of the family `pillar`. Its defaults are the paper's values (section 4.1)."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from asca_pillars.bounds import require_bounds
+from asca_pillars.errors import ConfigError
+from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.schema import Strict
+from asca_pillars.tables.neck_tables import MaskRule
+
+CpaReading = Literal["none", "paper", "channel", "point"]
+
+
+@dataclass(frozen=True)
+class NetworkConfig(Strict):
+    """Widths and depths of the network.
+
+    Attributes:
+        cpa: reading of the correlative point attention, see docs/READING.md.
+        pillar_channels: C, features of one pillar.
+        block_channels: output channels of Block1..3 (Table 1).
+        block_convs: stride-1 convolutions that follow each block's strided one (Table 1: 3).
+        upsample_channels: output channels of each DeBlock (Table 1: 128).
+        neck: `dense` computes everywhere, `sparse` at active cells alone; the weights fit both.
+        active_cells: which cells are active in a sparse neck, see `tables.neck_tables`.
+    """
+
+    cpa: CpaReading = "channel"
+    pillar_channels: int = 64
+    block_channels: tuple[int, int, int] = (64, 128, 256)
+    block_convs: tuple[int, int, int] = (3, 3, 3)
+    upsample_channels: int = 128
+    neck: Literal["dense", "sparse"] = "dense"
+    active_cells: MaskRule = "fine"
+
+    def __post_init__(self) -> None:
+        require_bounds("model.network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
+        require_bounds("model.network", self, ("block_convs",), low=0)
+        if self.neck == "sparse" and self.active_cells == "fine" and not self.block_convs[0]:
+            raise ConfigError(
+                "model.network.active_cells = fine grows in the first block's stride-1 convolutions, of which "
+                "model.network.block_convs has none; give it one, or set model.network.active_cells=sub"
+            )
+
+
+@dataclass(frozen=True)
+class LossConfig(Strict):
+    """Eq. (13)-(15) with the residuals of PointPillars; `smooth_l1_beta` is SECOND's 1/9."""
+
+    box_weight: float = 2.0
+    class_weight: float = 1.0
+    direction_weight: float = 0.2
+    focal_alpha: float = 0.25
+    focal_gamma: float = 2.0
+    smooth_l1_beta: float = 1 / 9
+
+    def __post_init__(self) -> None:
+        weights = ("box_weight", "class_weight", "direction_weight")
+        require_bounds("model.loss", self, (*weights, "focal_gamma", "smooth_l1_beta"), low=0)
+        require_bounds("model.loss", self, ("focal_alpha",), low=0, high=1)
+
+
+@dataclass(frozen=True)
+class PillarModel(Strict):
+    """ASCA-PointPillars and PointPillars: one stage on pillars.
+
+    Attributes:
+        kind: tells the families of detectors apart.
+        spec: grid, limits, classes and post-processing, which training and the vehicle share.
+        network: widths and depths.
+        loss: weights of the loss.
+    """
+
+    kind: Literal["pillar"] = "pillar"
+    spec: PillarSpec = field(default_factory=PillarSpec)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
