@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, ClassSpec, decode_boxes
+from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, ClassSpec
+from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import rotated_nms
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, IGNORED, ClassSpec, encode_boxes
+from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, IGNORED, ClassSpec
+from asca_pillars.geometry.boxes import encode_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 
 

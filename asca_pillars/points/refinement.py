@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.anchors import decode_boxes, direction_bins, encode_boxes
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import decode_boxes, direction_bins, encode_boxes, wrap_angle
 from asca_pillars.points.roi_grid import boxes_from_frames, boxes_in_frames
 
 

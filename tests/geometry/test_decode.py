@@ -9,7 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.anchors import KITTI_CLASSES, decode_boxes, encode_boxes, make_anchors
+from asca_pillars.geometry.anchors import KITTI_CLASSES, make_anchors
+from asca_pillars.geometry.boxes import decode_boxes, encode_boxes
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.pillars.grid import PillarGrid

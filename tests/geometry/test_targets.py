@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.geometry.anchors import IGNORED, KITTI_CLASSES, decode_boxes, make_anchors
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.anchors import IGNORED, KITTI_CLASSES, make_anchors
+from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.geometry.targets import Targets, assign_targets
 from asca_pillars.pillars.grid import PillarGrid
