@@ -18,8 +18,7 @@ import typer
 from numpy.typing import NDArray
 
 from asca_deploy import Bundle, default_bundle_path, load_bundle, sample_scan_path
-from asca_deploy.detector import _usable_points
-from asca_pillars.data.input_check import check_input
+from asca_pillars.data.input_check import check_input, usable_points
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps
@@ -59,7 +58,7 @@ def host_path(points: NDArray[np.float32], bundle: Bundle) -> dict[str, Callable
     maps = HeadMaps(*(np.moveaxis(m, -1, 0) for m in (scores, boxes, directions)))
     counts = spec.pillarize(points).stats
     return {
-        "input": lambda: (_usable_points(points), check_input(points, counts, bundle.expected_input)),
+        "input": lambda: (usable_points(points), check_input(points, counts, bundle.expected_input)),
         "pillarize": lambda: spec.pillarize(points),
         "decode": lambda: spec.decode(maps),
     }

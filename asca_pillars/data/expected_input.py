@@ -6,11 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.data.frame_check import ground_z_m
 from asca_pillars.schema import Strict
-
-RING_M = (4.0, 20.0)  # beyond the vehicle's own roof, before the beams become sparse
-PERCENTILE = 10.0  # below it lie ditches and reflections
-MIN_POINTS = 50
 
 
 @dataclass(frozen=True)
@@ -31,19 +28,6 @@ class ExpectedInput(Strict):
     def sensor_height_m(self) -> float | None:
         """Height of the sensor above the ground in the middle of those scans; None where no scan showed it."""
         return None if self.ground_z_m is None else -sum(self.ground_z_m) / 2
-
-
-def ground_z_m(points: NDArray[np.float32]) -> float | None:
-    """Height of the ground around the sensor, metres: a low percentile of z in a near ring of the points.
-
-    Takes finite points (N, >=3) in the LiDAR frame; None if the ring holds too few of them to tell.
-    """
-    x, y = points[:, 0], points[:, 1]
-    with np.errstate(over="ignore"):  # infinitely far is not near
-        squared_range = x * x + y * y
-    ring = np.flatnonzero((squared_range > RING_M[0] ** 2) & (squared_range < RING_M[1] ** 2))
-    near_z = points[:, 2].take(ring)
-    return float(np.percentile(near_z, PERCENTILE)) if len(near_z) >= MIN_POINTS else None
 
 
 def measure_expected_input(scans: Iterable[NDArray[np.float32]], camera_view: bool) -> ExpectedInput:

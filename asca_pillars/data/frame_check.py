@@ -1,4 +1,4 @@
-"""Whether a scan's axes lie as the model wants them: signs of z down, of turned axes and of a tilt.
+"""Where a scan's ground lies, and whether its axes lie as the model wants them: signs of z down, turned axes, a tilt.
 
 What cannot be seen: a scan that is turned by half, a mirror image, and a quarter turn on a square or a crossing.
 """
@@ -32,7 +32,10 @@ None of 200 simulated whole revolutions falls below; turned by a quarter, 90 % o
 
 _MAX_TILT_DEG = 6.0
 _RING_M = (4.0, 20.0)
+"""Beyond the vehicle's own roof, before the beams become sparse."""
 _LOW_PERCENTILE = 10.0
+"""Below it lie ditches and reflections."""
+_MIN_GROUND_POINTS = 50
 
 
 class FrameDoubt(NamedTuple):
@@ -41,6 +44,19 @@ class FrameDoubt(NamedTuple):
     about: str
     text: str
     axes: str | None
+
+
+def ground_z_m(points: NDArray[np.float32]) -> float | None:
+    """Height of the ground around the sensor, metres: a low percentile of z in a near ring of the points.
+
+    Takes finite points (N, >=3) in the LiDAR frame; None if the ring holds too few of them to tell.
+    """
+    x, y = points[:, 0], points[:, 1]
+    with np.errstate(over="ignore"):  # infinitely far is not near
+        squared_range = x * x + y * y
+    ring = np.flatnonzero((squared_range > _RING_M[0] ** 2) & (squared_range < _RING_M[1] ** 2))
+    near_z = points[:, 2].take(ring)
+    return float(np.percentile(near_z, _LOW_PERCENTILE)) if len(near_z) >= _MIN_GROUND_POINTS else None
 
 
 def doubt_frame(points: NDArray[np.float32], ground_z_m: float | None) -> FrameDoubt | None:

@@ -19,8 +19,6 @@ class ScanCounts:
 def summed(counts: Sequence[ScanCounts]) -> ScanCounts:
     """The counts of a scan's passes, all of one family, added up."""
     first = counts[0]
-    if len(counts) == 1:
-        return first
     return type(first)(**{name.name: sum(getattr(one, name.name) for one in counts) for name in fields(first)})
 
 

@@ -55,12 +55,10 @@ def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: f
     """The boxes of all passes in the frame before the turns, each object once, best first.
 
     Args:
-        passes: of each turn, in its turned frame.
+        passes: of each turn, in its turned frame; two or more.
         turns: see `turns_around`.
         nms_iou: boxes of a class that overlap more, seen from above, are one object.
     """
-    if len(passes) == 1:
-        return passes[0]
     half_sector = _HALF_TURN_RAD / len(passes)
     boxes, scores, labels, off_ahead = [], [], [], []
     for found, turn in zip(passes, turns, strict=True):

@@ -70,7 +70,7 @@ class CanvasBackbone:
     stage = "scatter"
 
     def __init__(self, path: Path, session: Session, bundle: Bundle) -> None:
-        self._bundle = bundle
+        self._bundle, self._pools = bundle, bundle.spec.grid.pools
         grid, section, anchors = bundle.spec.grid, bundle.pillar, bundle.spec.anchors.shape[2]
         rows, columns = grid.map_shape
         inputs = {"canvas": Tensor(section.canvas.type, (1, rows + 1, columns + 1, section.channels))}
@@ -89,7 +89,9 @@ class CanvasBackbone:
             canvas = self._free.pop()  # atomic, as append is: two threads never get the same one
         except IndexError:
             canvas = self.new_canvas()
-        canvas.scatter(*pool_pillars(pillar_features, cells, self._bundle.spec.grid))
+        if self._pools:
+            pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
+        canvas.scatter(pillar_features, cells)
         return canvas
 
     def run(self, placed: Canvas) -> HeadAnswer:

@@ -20,10 +20,10 @@ from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_deploy.stream import overlapped
-from asca_pillars.data.input_check import InputWarning, check_input
+from asca_pillars.data.input_check import InputWarning, UsablePoints, check_input, usable_points
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ConfigError, ScanError
+from asca_pillars.errors import ConfigError
 from asca_pillars.geometry import overlap
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
@@ -36,25 +36,6 @@ _log = logging.getLogger("asca_deploy")
 
 View: TypeAlias = Literal["ahead", "around"]
 _WAITING = "waiting"  # beside the names of stages
-_GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
-
-
-class _Usable(NamedTuple):
-    """The points that a pipeline takes, and what was done to get them."""
-
-    points: NDArray[np.float32]
-    """(N, 4), finite, reflectance within 0..1."""
-    unclipped: NDArray[np.float32]
-    """(N, 4), the same with the reflectance as it came."""
-    non_finite: int
-    clipped: int
-
-    def moved(self, change: FrameChange) -> "_Usable":
-        """The same in another frame."""
-        points = change.points(self.points)
-        if self.unclipped is self.points:
-            return self._replace(points=points, unclipped=points)
-        return self._replace(points=points, unclipped=np.column_stack([points[:, :3], self.unclipped[:, 3]]))
 
 
 class _Frame(NamedTuple):
@@ -62,7 +43,7 @@ class _Frame(NamedTuple):
 
     start: float
     laps: Laps
-    usable: _Usable
+    usable: UsablePoints
     """In the model's frame."""
     counts: list[ScanCounts]
     """Of each pass so far."""
@@ -199,7 +180,7 @@ class Detector:
     def _open(self, points: NDArray[Any]) -> _Frame:
         """The usable points in the model's frame."""
         start = perf_counter()
-        usable = _usable_points(points)
+        usable = usable_points(points)
         warnings = []
         if usable.clipped:
             text = f"{usable.clipped} reflectances lie outside 0..1 and were set to the nearer end"
@@ -222,7 +203,10 @@ class Detector:
 
     def _finish(self, frame: _Frame, raw: list[Any]) -> Detections:
         found = [self.pipeline.finish(one, frame.laps) for one in raw]
-        detections = merge(found, self._turns, self.spec.post.nms_iou)
+        if self.passes == 1:
+            detections, counts = found[0], frame.counts[0]
+        else:
+            detections, counts = merge(found, self._turns, self.spec.post.nms_iou), summed(frame.counts)
         if not self._to_model.is_identity:
             detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
         frame.laps.append((self.pipeline.stages[-1], perf_counter()))
@@ -241,7 +225,7 @@ class Detector:
         report = FrameReport(
             waiting_ms=times_ms.pop(_WAITING),
             times_ms=times_ms,
-            counts=summed(frame.counts),
+            counts=counts,
             passes=self.passes,
             non_finite_points=frame.usable.non_finite,
             clipped_reflectances=frame.usable.clipped,
@@ -271,34 +255,3 @@ class Detector:
         return auto.choose(
             providers.available(), open_pipeline, detect, self.bundle.spec, precision, weights=self.bundle.precision
         )
-
-
-def _usable_points(points: NDArray[Any]) -> _Usable:
-    """The finite points of (N, 4) as contiguous float32, reflectance within 0..1."""
-    if isinstance(points, np.ma.MaskedArray):
-        raise ScanError(
-            "the points are a masked array; give those that are not masked: points[~points.mask.any(1)].data"
-        )
-    try:
-        array = np.asarray(points)
-    except (TypeError, ValueError, OverflowError):
-        raise ScanError(f"the points are not an array of numbers; {_GIVE}") from None
-    if array.dtype.kind not in "iuf":
-        raise ScanError(f"the points are not an array of numbers, but of type {str(array.dtype)[:40]}; {_GIVE}")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is counted
-        scan = np.ascontiguousarray(array, np.float32)
-    if scan.ndim != 2 or scan.shape[1] != 4:
-        columns = scan.shape[1] if scan.ndim == 2 else 0
-        advice = "; append a column of reflectances 0..1" if columns == 3 else ""
-        advice = "; give the first four columns: points[:, :4]" if columns > 4 else advice
-        raise ScanError(f"the points have shape {array.shape}, not (N, 4): x, y, z, reflectance{advice}")
-    finite, non_finite = np.isfinite(scan), 0
-    if not finite.all():
-        usable = finite.all(axis=1)
-        scan, non_finite = scan[usable], int(len(scan) - usable.sum())
-    reflectance = scan[:, 3].copy()  # in one piece, which NumPy searches several times faster
-    if not len(scan) or (reflectance.min() >= 0 and reflectance.max() <= 1):
-        return _Usable(scan, scan, non_finite, 0)
-    clipped = scan.copy()
-    np.clip(reflectance, 0, 1, out=clipped[:, 3])
-    return _Usable(clipped, scan, non_finite, int((clipped[:, 3] != reflectance).sum()))

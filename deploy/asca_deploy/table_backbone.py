@@ -42,7 +42,7 @@ class TableBackbone:
     stage = "tables"
 
     def __init__(self, path: Path, session: Session, bundle: Bundle) -> None:
-        self._bundle, section = bundle, bundle.pillar
+        self._bundle, self._pools, section = bundle, bundle.spec.grid.pools, bundle.pillar
         inputs = {FEATURES: Tensor(section.canvas.type, (None, section.channels))}
         for number in range(LEVELS):
             inputs |= {f"{kind}_{number}": Tensor("int32", (None, 9)) for kind in ("strided", "first", "same")}
@@ -60,10 +60,11 @@ class TableBackbone:
             builder = self._free.pop()  # atomic, as append is: two threads never get the same one
         except IndexError:
             builder = self._new_builder()
-        features, occupied = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
-        tables = builder.build(occupied)
+        if self._pools:
+            pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
+        tables = builder.build(cells)
         self._free.append(builder)
-        return PlacedPillars(features, tables)
+        return PlacedPillars(pillar_features, tables)
 
     def run(self, placed: PlacedPillars) -> HeadAnswer:
         """Scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""

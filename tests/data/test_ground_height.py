@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_pillars.data.expected_input import ground_z_m
+from asca_pillars.data.frame_check import ground_z_m
 from asca_pillars.data.ground_height import estimate_height, measured_mounting
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ScanError

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import DataConfig
-from asca_pillars.data.expected_input import ground_z_m
+from asca_pillars.data.frame_check import ground_z_m
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.anchors import IGNORED
