@@ -1,5 +1,6 @@
 """A bundle as first stage against the checkpoint that it was exported from."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +9,15 @@ import pytest
 import torch
 
 from asca_export.bundle_first_stage import BundleFirstStage
-from asca_export.exporter import export_bundle
 from asca_export.neck_output import add_neck_output
 from asca_pillars.errors import ExportError
 from asca_pillars.models.second_stage.checkpoint_first_stage import CheckpointFirstStage
+from asca_pillars.pillar_config import CpaReading
 from asca_pillars.schema import to_dict
 from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
 
 
-def test_says_what_the_checkpoint_says(tmp_path: Path) -> None:
+def test_says_what_the_checkpoint_says(exported: Callable[[CpaReading], Path], tmp_path: Path) -> None:
     checkpoint = tiny_checkpoint("channel")
     weights = {f"detector.{name}": value for name, value in checkpoint.detector.state_dict().items()}
     content = {
@@ -25,8 +26,7 @@ def test_says_what_the_checkpoint_says(tmp_path: Path) -> None:
         "global_step": 0,
     }
     torch.save(content, tmp_path / "last.ckpt")
-    export_bundle(checkpoint, tmp_path / "bundle", SCANS)
-    in_torch, in_onnx = CheckpointFirstStage(tmp_path / "last.ckpt"), BundleFirstStage(tmp_path / "bundle")
+    in_torch, in_onnx = CheckpointFirstStage(tmp_path / "last.ckpt"), BundleFirstStage(exported("channel"))
     assert in_torch.spec == in_onnx.spec
     assert in_torch.identity != in_onnx.identity
     wanted, found = in_torch(SCANS[0]), in_onnx(SCANS[0])

@@ -1,10 +1,12 @@
 """Both stages from training to boxes: checkpoint, bundle, runtime."""
 
 import json
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -14,10 +16,12 @@ import torch
 from asca_deploy import Detector
 from asca_deploy.bundle import GRAPHS, MANIFEST
 from asca_deploy.manifest import load_bundle
+from asca_export import refine_exporter
+from asca_export.exporter import export_bundle
 from asca_export.refine_exporter import export_refine_bundle
 from asca_export.refine_graph import fold_norms
 from asca_pillars.errors import BundleError, ExportError
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.training.loop import train
@@ -43,11 +47,18 @@ print(len(asca_deploy.Detector(sys.argv[1], score_threshold=0.0, threads=1)(np.l
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A checkpoint of the second stage, and the bundle exported from it."""
+    """A checkpoint of the second stage, and the bundle exported from it; beside it that of the first stage alone."""
     folder = tmp_path_factory.mktemp("refine")
     config = tiny_refine_config(write_first_stage(folder / "first.ckpt"), learning_rate=1e-2)
     last = train(config, write_dataset(folder / "data", 5), folder / "run")
-    export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
+
+    def export_and_keep(checkpoint: Checkpoint, out: Path, *rest: Any, **options: Any) -> None:
+        export_bundle(checkpoint, out, *rest, **options)
+        shutil.copytree(out, folder / "first_stage")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refine_exporter, "export_bundle", export_and_keep)
+        export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
     return last, folder / "bundle"
 
 
@@ -127,7 +138,13 @@ def test_manifests_that_were_changed(trained: tuple[Path, Path], tmp_path: Path,
         load_bundle(tmp_path)
 
 
-def test_a_refiner_with_other_weights_is_no_parity(trained: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_refiner_with_other_weights_is_no_parity(
+    trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first_stage = trained[1].with_name("first_stage")  # as exported above
+    monkeypatch.setattr(
+        refine_exporter, "export_bundle", lambda _, out, *rest, **options: shutil.copytree(first_stage, out)
+    )
     checkpoint = load_checkpoint(trained[0])
     assert isinstance(checkpoint.detector, RefineDetector)
     with torch.no_grad():

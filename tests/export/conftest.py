@@ -1,0 +1,24 @@
+"""Bundles of the tiny checkpoint, exported once: an export takes seconds."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from asca_export.exporter import export_bundle
+from asca_pillars.pillar_config import CpaReading
+from tests.export.tiny import SCANS, tiny_checkpoint
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[CpaReading], Path]:
+    """The bundle of `tiny_checkpoint(reading)` in floating point, which no test changes."""
+    folder = tmp_path_factory.mktemp("exported")
+
+    @cache
+    def export(cpa: CpaReading) -> Path:
+        export_bundle(tiny_checkpoint(cpa), folder / cpa, SCANS, trained_on="nothing", command="none")
+        return folder / cpa
+
+    return export
