@@ -18,6 +18,7 @@ from asca_deploy import Detector, sample_scan_path
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.schema import to_dict
+from tests.in_process import run_here
 from tests.scenes import make_scene, write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -45,11 +46,6 @@ def asca(*arguments: object, cwd: Path | None = None, code: str = WITHOUT_TORCH)
     environment = os.environ | {"COLUMNS": "120", "NO_COLOR": "1"}
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=environment)
-
-
-def full(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess:
-    """Run the command with everything that is installed."""
-    return asca(*arguments, cwd=cwd, code="from asca_pillars.cli import main; main()")
 
 
 def refusal(result: subprocess.CompletedProcess) -> str:
@@ -162,17 +158,19 @@ def test_train_refuses_typos_and_missing_data(tmp_path: Path) -> None:
     config = tmp_path / "config.yaml"
     config.write_text("train: {epoch: 3}\n")
     command = ("train", config, "--data", tmp_path, "--out", tmp_path / "run")
-    assert "unknown key `train.epoch`; did you mean `epochs`?" in refusal(full(*command))
+    assert "unknown key `train.epoch`; did you mean `epochs`?" in refusal(run_here(*command))
     config.write_text("name: x\n")
-    assert "did you mean `batch_size`?" in refusal(full(*command, "-s", "train.batchsize=2"))
-    assert "velodyne" in refusal(full(*command))
+    assert "did you mean `batch_size`?" in refusal(run_here(*command, "-s", "train.batchsize=2"))
+    assert "velodyne" in refusal(run_here(*command))
     assert not (tmp_path / "run").exists()
 
 
 def test_export_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
-    assert "no such checkpoint" in refusal(full("export", tmp_path / "none.ckpt", "-o", tmp_path / "b"))
+    assert "no such checkpoint" in refusal(run_here("export", tmp_path / "none.ckpt", "-o", tmp_path / "b"))
     (tmp_path / "damaged.ckpt").write_bytes(b"not a checkpoint")
-    assert "damaged.ckpt: not a checkpoint" in refusal(full("export", tmp_path / "damaged.ckpt", "-o", tmp_path / "b"))
+    assert "damaged.ckpt: not a checkpoint" in refusal(
+        run_here("export", tmp_path / "damaged.ckpt", "-o", tmp_path / "b")
+    )
 
 
 def test_from_training_to_boxes(tmp_path: Path) -> None:
@@ -180,7 +178,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 4)
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     run, bundle = tmp_path / "run", tmp_path / "bundle"
-    trained = full("train", tmp_path / "config.yaml", "--data", data, "--out", run, "-s", "train.epochs=1")
+    trained = run_here("train", tmp_path / "config.yaml", "--data", data, "--out", run, "-s", "train.epochs=1")
     assert trained.returncode == 0, trained.stderr
     scans = tmp_path / "scans"
     for seed in range(8):
@@ -196,22 +194,24 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     process.wait()
     assert not bundle.exists()
 
-    assert "Pedestrain: no such class; there are" in refusal(full(*export, "--score", "Pedestrain=0.2"))
-    assert "such as Car=0.35" in refusal(full(*export, "--score", "0.2"))
-    exported = full(*export, "--score", "Pedestrian=0.21")
+    assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
+    assert "such as Car=0.35" in refusal(run_here(*export, "--score", "0.2"))
+    exported = run_here(*export, "--score", "Pedestrian=0.21")
     assert exported.returncode == 0, exported.stderr
     assert "parity on 8 scans" in exported.stdout
     manifest = json.loads((bundle / "bundle.json").read_text())
-    assert manifest["provenance"]["command"].startswith("-c train")
+    assert manifest["provenance"]["command"].startswith("asca train")
     before = {spec.name: spec.score_threshold for spec in CONFIG.model.spec.classes}
     after = {spec["name"]: spec["score_threshold"] for spec in manifest["spec"]["classes"]}
     assert after == before | {"Pedestrian": 0.21}
-    assert "add --int8" in refusal(full(*export, "--calibrate", scans))
-    assert "8 were left out because parity is proven on them" in refusal(full(*export, "--int8", "--calibrate", scans))
+    assert "add --int8" in refusal(run_here(*export, "--calibrate", scans))
+    assert "8 were left out because parity is proven on them" in refusal(
+        run_here(*export, "--int8", "--calibrate", scans)
+    )
     others = tmp_path / "others"
     for seed in range(7, 16):  # the first is among the scans of parity
         write_scan(others / f"{seed}.bin", make_scene(seed)[0])
-    quantized = full(*export, "--int8", "--calibrate", others)
+    quantized = run_here(*export, "--int8", "--calibrate", others)
     assert quantized.returncode == 0, quantized.stderr
     assert "1 calibration scans left out" in quantized.stdout
     assert "calibrated on 8 scans" in quantized.stdout and "logit error" in quantized.stdout.lower()
@@ -222,12 +222,12 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
 
 
 def test_simulated_frames_are_what_detect_reads(tmp_path: Path) -> None:
-    result = full("simulate", "sim", "-n", 2, "--view", "camera", "-w", 1, cwd=tmp_path)
+    result = run_here("simulate", "sim", "-n", 2, "--view", "camera", "-w", 1, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     detected = asca("detect", "sim/training/velodyne", cwd=tmp_path)
     assert detected.returncode == 0, detected.stderr
     assert sorted(path.name for path in (tmp_path / "detections").glob("*.txt")) == ["000000.txt", "000001.txt"]
-    assert "view" in refusal(full("simulate", "other", "--view", "rear", cwd=tmp_path))
+    assert "view" in refusal(run_here("simulate", "other", "--view", "rear", cwd=tmp_path))
 
 
 def test_a_file_where_the_output_folder_should_be(tmp_path: Path) -> None:

@@ -83,13 +83,12 @@ def export(
             f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
             "give some of them with --scans"
         )
+    command = run_environment(checkpoint).get("command", "not recorded")
     points = read_or_simulate(scans, console, PARITY_SCANS, PARITY_SEED)
     # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
     view: View = "camera" if loaded.config.data.camera_view else "full"
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
-    environment = run_environment(checkpoint)
     with console.status("Exporting") as status:
-        command = environment.get("command", "not recorded")
         if refined:
             bundle = export_refine_bundle(
                 loaded, out, points, trained_on=trained_on, command=command, progress=status.update

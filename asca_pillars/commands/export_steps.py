@@ -14,7 +14,7 @@ from asca_deploy.bundle import Quantization
 from asca_pillars.commands.extras import require
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, TrainingError
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
 CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
@@ -73,9 +73,23 @@ def read_or_simulate(
 
 
 def run_environment(checkpoint: Path) -> dict[str, Any]:
-    """What the run wrote of itself, if the checkpoint still lies in its run's folder."""
+    """What the run wrote of itself, if the checkpoint still lies in its run's folder.
+
+    Raises:
+        TrainingError: the file there is damaged.
+    """
     path = checkpoint.parent.parent / "environment.json"
     if not path.exists():
         return {}
-    environment: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return environment
+    try:
+        environment = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # not JSON, or not UTF-8
+        reason = " ".join(str(error).split())
+    else:
+        if isinstance(environment, dict) and isinstance(environment.get("command", ""), str):
+            return environment
+        reason = "no object with the text `command`"
+    raise TrainingError(
+        f"{path}: not what `asca train` wrote, or damaged ({reason}); delete it, and the bundle will not say which "
+        "command trained it"
+    )

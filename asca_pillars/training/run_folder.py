@@ -11,7 +11,8 @@ from asca_pillars.data.expected_input import ExpectedInput, measure_expected_inp
 from asca_pillars.data.frames import read_frame
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
-from asca_pillars.schema import parse, to_dict
+from asca_pillars.schema import to_dict
+from asca_pillars.settings import read_settings
 from asca_pillars.system import describe_environment
 from asca_pillars.training.dataset import LabeledDataset
 
@@ -58,10 +59,11 @@ def measure_input(out: Path, frames: LabeledDataset) -> ExpectedInput:
     Raises:
         DatasetError, ScanError: a frame cannot be read.
         TrainingError: no frame has a point.
+        ConfigError: what was kept is damaged.
     """
     path = out / "expected_input.yaml"
     if path.exists():
-        return parse(ExpectedInput, yaml.safe_load(path.read_text(encoding="utf-8")), str(path))
+        return read_settings(ExpectedInput, path, (), {})
     ids = frames.frame_ids
     count = min(len(ids), EXPECTED_INPUT_FRAMES)
     chosen = track([ids[i * len(ids) // count] for i in range(count)], "Measuring training scans", transient=True)

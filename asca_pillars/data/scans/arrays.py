@@ -1,5 +1,6 @@
 """Points from NumPy arrays: of `.npy` files, and of callers."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,14 @@ def read_npy(path: Path) -> StoredPoints:
     # Mapped, not loaded: mapping compares the header's claim with the file's size before memory is taken, and
     # refuses pickled objects.
     try:
-        array = np.lib.format.open_memmap(path, mode="r")
+        with warnings.catch_warnings():
+            # NumPy reads the header as Python source, and Python would talk to the user about what it finds there.
+            warnings.simplefilter("error", SyntaxWarning)
+            warnings.simplefilter("error", DeprecationWarning)
+            array = np.lib.format.open_memmap(path, mode="r")
     except OSError:
         raise
-    except Exception as error:  # NumPy reads the header as Python source and lets the tokenizer's errors pass.
+    except Exception as error:  # NumPy lets the tokenizer's errors pass
         reason = " ".join(str(error).split())[:100]
         raise ScanError(f"{path}: not an array of numbers ({reason}); {AGAIN}") from error
     return points_from_array(array, str(path))

@@ -2,6 +2,7 @@
 
 import struct
 import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -205,6 +206,16 @@ def test_four_or_five_columns_are_asked_for(tmp_path):
 
 
 # --- arrays
+
+
+def test_python_says_nothing_of_a_damaged_npy_header(tmp_path):
+    """NumPy reads it as Python source, of which Python has opinions that users would see."""
+    content = npy(POINTS.astype("<f4")).replace(b"'<f4', ", rb"'<f\d',")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with pytest.raises(ScanError, match="not an array of numbers"):
+            read(tmp_path, "a.npy", content)
+    assert [str(one.message) for one in said] == []
 
 
 def test_arrays_on_their_side_are_refused(tmp_path):

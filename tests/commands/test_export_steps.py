@@ -1,0 +1,32 @@
+"""What `asca export` reads beside the checkpoint: what the run wrote of itself, or one line that says what is wrong."""
+
+from pathlib import Path
+
+import pytest
+
+from asca_pillars.commands.export_steps import run_environment
+from asca_pillars.errors import TrainingError
+from asca_pillars.system import describe_environment
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    return tmp_path / "run" / "checkpoints" / "last.ckpt"
+
+
+def test_the_command_of_the_run_is_known(checkpoint: Path) -> None:
+    assert run_environment(checkpoint) == {}, "the checkpoint lies elsewhere"
+    checkpoint.parent.mkdir(parents=True)
+    (checkpoint.parents[1] / "environment.json").write_text(describe_environment())
+    assert isinstance(run_environment(checkpoint)["command"], str)
+
+
+@pytest.mark.parametrize("content", [b"", b'{"command": ', b"[]", b'{"command": 3}', b"\xff\xfe", b"NaN"])
+def test_a_damaged_file_is_one_line_with_the_remedy(checkpoint: Path, content: bytes) -> None:
+    checkpoint.parent.mkdir(parents=True)
+    path = checkpoint.parents[1] / "environment.json"
+    path.write_bytes(content)
+    with pytest.raises(TrainingError) as caught:
+        run_environment(checkpoint)
+    assert str(caught.value).startswith(f"{path}: not what `asca train` wrote")
+    assert "delete it" in str(caught.value) and "\n" not in str(caught.value)
