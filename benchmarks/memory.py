@@ -5,6 +5,11 @@
 
 Scans are crops of the sample of many sizes, so that everything whose size depends on the scan keeps changing. Half of
 them go through single calls and half through streams that are opened and closed again.
+
+Resident memory goes up and down with what the allocator gives back, by some MiB and for each thread's arena on its own,
+so a difference of two moments says little. The crops come again in the same order, and after CYCLE scans also at the
+same places in a stream: compared is the least of each cycle, below which the memory never fell while it lasted. What is
+kept for ever raises it from cycle to cycle; what the allocator holds now and then does not.
 """
 
 import json
@@ -29,6 +34,7 @@ from asca_pillars.files import atomic_path
 
 CHUNK = 50  # scans of one stream, then as many single calls
 CROPS = 199  # sizes that come again and again, or allocators would go on finding new ones; prime to CHUNK
+CYCLE = CHUNK * CROPS
 WARM_SHARE = 0.2  # the allocator and the graphs find their sizes first
 
 
@@ -41,7 +47,7 @@ def main(
     only: Annotated[Literal["calls", "streams"] | None, typer.Option(help="Default: half of each.")] = None,
     out: Annotated[Path | None, typer.Option("--json", help="Also write the samples to this file.")] = None,
 ) -> None:
-    """Run, sample the resident memory along the way, print start, middle, end and slope."""
+    """Run, sample the resident memory along the way, print what is kept from cycle to cycle, and the slope of all."""
     console = Console(markup=False, highlight=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # crops are unlike any training scan
     detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
@@ -49,16 +55,28 @@ def main(
     counts, resident = np.array(samples).T
     warm = counts >= WARM_SHARE * scans
     slope = np.polyfit(counts[warm], resident[warm], 1)[0] * 1000
-    start, middle, end = resident[warm][0], resident[warm][warm.sum() // 2], resident[-1]
+    floors = cycle_floors(counts[warm], resident[warm])
     console.print(
-        f"{scans} scans, {provider} {precision}: resident {start:.1f} MiB after {counts[warm][0]:.0f} scans, "
-        f"{middle:.1f} in the middle, {end:.1f} at the end ({end - start:+.2f}), peak {peak_memory_mib():.1f}; "
+        f"{scans} scans, {provider} {precision}: resident at least {floors[0]:.1f} MiB in the first cycle after "
+        f"{counts[warm][0]:.0f} scans, {floors[-1]:.1f} in the last of {len(floors)} ({floors[-1] - floors[0]:+.2f}); "
+        f"{resident[warm][0]:.1f} to {resident[-1]:.1f} from moment to moment, peak {peak_memory_mib():.1f}; "
         f"slope {slope:+.3f} MiB per 1,000 scans after the first {WARM_SHARE:.0%}",
         soft_wrap=True,
     )
     if out is not None:
         with atomic_path(out) as path:
             path.write_text(json.dumps({"scans": scans, "slope_mib_per_1000": slope, "samples": samples}) + "\n")
+
+
+def cycle_floors(counts: NDArray[np.floating], resident: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The least resident memory, MiB, of each cycle of scans; of halves of what there is if it holds less than two.
+
+    Args:
+        counts: (N,) scans done at each sample, ascending.
+        resident: (N,) MiB at each sample.
+    """
+    cycles = max(2, round(float(counts[-1] - counts[0]) / CYCLE))
+    return np.array([part.min() for part in np.array_split(resident, cycles)])
 
 
 def _run(detector: Detector, count: int, only: str | None, console: Console) -> Iterator[int]:

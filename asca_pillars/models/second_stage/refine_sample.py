@@ -18,9 +18,7 @@ from asca_pillars.points.roi_targets import (
     Overlaps,
     RoiTargets,
     keypoint_states,
-    match_proposals,
     roi_targets,
-    sample_rois,
 )
 
 
@@ -40,14 +38,6 @@ class RefineBatch(NamedTuple):
 
     inputs: RefineInputs
     targets: RefineTargets
-
-
-def prepare_sample(
-    frame: LabeledFrame, proposed: Proposed, settings: RefineSettings, rois: int, rng: np.random.Generator
-) -> RefineSample:
-    """Draw `rois` proposals of a frame and compute their neighbours and targets."""
-    overlaps = match_proposals(proposed.proposals, frame.boxes, frame.labels)
-    return sample_of(frame, proposed, overlaps, sample_rois(overlaps, rois, rng), settings)
 
 
 def sample_of(

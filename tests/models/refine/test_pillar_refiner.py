@@ -12,11 +12,12 @@ from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.refine.refine_loss import refine_loss
 from asca_pillars.models.refine.roi_head import RoiHead
-from asca_pillars.models.second_stage.refine_sample import RefineBatch, collate_samples, collate_scans, prepare_sample
+from asca_pillars.models.second_stage.refine_sample import RefineBatch, collate_samples, collate_scans
 from asca_pillars.models.second_stage.refined_detector import refine
 from asca_pillars.points.farthest_points import farthest_points
 from asca_pillars.points.first_stage import Proposed
 from asca_pillars.points.refine_geometry import RefineSettings, refine_scan
+from tests.models.second_stage.drawn_samples import prepare_sample
 from tests.scenes import make_scene
 
 NAMES = ("Car", "Pedestrian", "Cyclist")

@@ -5,9 +5,10 @@ import pytest
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.errors import ConfigError
-from asca_pillars.models.second_stage.refine_sample import RefineSample, collate_samples, collate_scans, prepare_sample
+from asca_pillars.models.second_stage.refine_sample import RefineSample, collate_samples, collate_scans
 from asca_pillars.points.first_stage import propose_on
 from asca_pillars.points.refine_geometry import RefineScan, RefineSettings, refine_scan, roi_features
+from tests.models.second_stage.drawn_samples import prepare_sample
 from tests.models.second_stage.random_stage import SETTINGS, RandomStage
 from tests.scenes import make_scene
 
