@@ -1,10 +1,8 @@
 """What `asca inspect` measures, against plain loops and the training loader; and what it says of data gone wrong."""
 
 import dataclasses
-import json
 import math
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.commands.inspect import inspect
 from asca_pillars.config import Config, DataConfig
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
@@ -26,29 +23,17 @@ from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dat
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan, stored_points
-from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pillars.pillarize import PillarLimits
 from asca_pillars.schema import to_dict
 from asca_pillars.training.dataset import open_dataset
-from tests.scenes import GRID, SIZES, SPEC, make_scene, write_dataset
+from tests.data.inspection.conftest import FRAMES
+from tests.scenes import GRID, SIZES, SPEC, make_scene
 
 Points = NDArray[np.float32]
-FRAMES = 12
 CONFIG = Config(name="tiny", model=PillarModel(spec=SPEC), data=DataConfig(train_set="training", val_set="training"))
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("clean"), FRAMES)
-
-
-@pytest.fixture
-def data(clean: Path, tmp_path: Path) -> Path:
-    """A copy to spoil."""
-    return shutil.copytree(clean, tmp_path / "data")
 
 
 def with_data(**changes: Any) -> Config:
@@ -291,78 +276,6 @@ def test_points_that_are_not_numbers_and_scans_that_see_nothing(data: Path) -> N
     assert warning.text.startswith("points with a value that is not finite: 10, in 2 of 12 scans; ")
     change_scans(data, lambda points: np.multiply(points[:, 0], -1, out=points[:, 0]), every=12)
     assert any(item.text.startswith("scans without a point inside the grid: 1 of 12; ") for item in found(data))
-
-
-def refusal(root: Path, config: Config, tmp_path: Path) -> str:
-    """The line that `asca inspect` fails with; the JSON is written anyway."""
-    path = tmp_path / "config.yaml"
-    path.write_text(yaml.safe_dump(to_dict(config)))
-    with pytest.raises(DatasetError) as error:
-        inspect(root, config=path, json=tmp_path / "report.json")
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert report["findings"][0]["level"] == "error" and report["findings"][0]["text"] in str(error.value)
-    assert "\n" not in str(error.value)
-    return str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("folder", "change", "config", "message"),
-    [
-        ("label_2", lambda text: re.sub("Cyclist.*\n", "", text), CONFIG, r"no label is of this type \(there are: Car"),
-        ("label_2", lambda text: text.replace("Cyclist", "cyclist"), CONFIG, r"spell it 'cyclist'; rename"),
-        ("label_2", lambda text: "", CONFIG, r"\(there are: none at all\)"),
-        ("label_2", lambda text: text, with_data(min_points=9999), r"data.min_points = 9999; lower it"),
-        ("label_2", lambda text: text, with_grid(x_range_m=(40, 60.48)), r"widen model.spec.grid.x_range_m \[40"),
-        ("calib", lambda text: text.replace(f"{-0.08:.12e}", "9.0"), CONFIG, r"labels and calib must belong"),
-    ],
-)
-def test_what_training_could_not_learn_from_is_refused(
-    data: Path, tmp_path: Path, folder: str, change: Callable[[str], str], config: Config, message: str
-) -> None:
-    change_files(data, folder, change)
-    assert re.search(message, refusal(data, config, tmp_path))
-
-
-def test_damaged_frames_are_counted_and_refused(data: Path, tmp_path: Path) -> None:
-    for frame_id in ("000003", "000004"):
-        KittiSplit(data).label_path(frame_id).write_text("Car 0 0\n")
-    message = refusal(data, CONFIG, tmp_path)
-    assert re.search(r"cannot be read: 2, the first: .*label_2.000003.txt:1: 3 fields", message)
-    inspection = inspected(data, CONFIG)
-    assert inspection.frames == FRAMES - 2 and not inspection.sampled
-    change_files(data, "label_2", lambda text: "Car 0 0\n")
-    with pytest.raises(DatasetError, match=r"000000.txt:1: 3 fields"):
-        inspected(data, CONFIG)
-
-
-def test_the_tables_come_before_the_refusal(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    change_files(data, "label_2", lambda text: re.sub("Cyclist.*\n", "", text))
-    message = refusal(data, CONFIG, tmp_path)
-    assert "no anchor is positive for Cyclist in 12 of 12 frames of 'training'" in message
-    output = capsys.readouterr().out
-    for title in ("Labels", "Objects", "Sizes", "Matching", "Scans"):
-        assert title in output
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert report["types"] == {"Car": 2 * FRAMES, "Pedestrian": FRAMES}
-    assert [item["boxes"] for item in report["classes"]] == [2 * FRAMES, FRAMES, 0]
-
-
-def test_a_class_missing_in_a_sample_may_be_in_the_rest(data: Path) -> None:
-    for frame_id in ("000000", "000006"):
-        path = KittiSplit(data).label_path(frame_id)
-        path.write_text(re.sub("Cyclist.*\n", "", path.read_text()))
-    inspection = inspected(data, CONFIG, frames=2)
-    assert (
-        "look at all frames with --frames 12" in findings(inspection, CONFIG.model.spec, CONFIG.data.min_points)[0].text
-    )
-
-
-def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path) -> None:
-    split = KittiSplit(data)
-    split.calib_path("000001").unlink()
-    split.label_path("000002").unlink()
-    with pytest.raises(DatasetError, match=r"calib.000001.txt: not there \(2 of 24 calibration and label files"):
-        inspected(data, CONFIG, frames=1)
 
 
 def test_neighbors_are_ignored_and_other_types_left_out(data: Path) -> None:

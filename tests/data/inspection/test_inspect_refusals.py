@@ -1,0 +1,90 @@
+"""Data and settings that training could learn nothing from are refused, and what is merely missing is named."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from asca_pillars.commands.inspect import inspect
+from asca_pillars.config import Config
+from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.errors import DatasetError
+from asca_pillars.schema import to_dict
+from tests.data.inspection.conftest import FRAMES
+from tests.data.inspection.test_inspect_dataset import CONFIG, change_files, inspected, with_data, with_grid
+
+
+def refusal(root: Path, config: Config, tmp_path: Path) -> str:
+    """The line that `asca inspect` fails with; the JSON is written anyway."""
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(to_dict(config)))
+    with pytest.raises(DatasetError) as error:
+        inspect(root, config=path, json=tmp_path / "report.json")
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["findings"][0]["level"] == "error" and report["findings"][0]["text"] in str(error.value)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("folder", "change", "config", "message"),
+    [
+        ("label_2", lambda text: re.sub("Cyclist.*\n", "", text), CONFIG, r"no label is of this type \(there are: Car"),
+        ("label_2", lambda text: text.replace("Cyclist", "cyclist"), CONFIG, r"spell it 'cyclist'; rename"),
+        ("label_2", lambda text: "", CONFIG, r"\(there are: none at all\)"),
+        ("label_2", lambda text: text, with_data(min_points=9999), r"data.min_points = 9999; lower it"),
+        ("label_2", lambda text: text, with_grid(x_range_m=(40, 60.48)), r"widen model.spec.grid.x_range_m \[40"),
+        ("calib", lambda text: text.replace(f"{-0.08:.12e}", "9.0"), CONFIG, r"labels and calib must belong"),
+    ],
+)
+def test_what_training_could_not_learn_from_is_refused(
+    data: Path, tmp_path: Path, folder: str, change: Callable[[str], str], config: Config, message: str
+) -> None:
+    change_files(data, folder, change)
+    assert re.search(message, refusal(data, config, tmp_path))
+
+
+def test_damaged_frames_are_counted_and_refused(data: Path, tmp_path: Path) -> None:
+    for frame_id in ("000003", "000004"):
+        KittiSplit(data).label_path(frame_id).write_text("Car 0 0\n")
+    message = refusal(data, CONFIG, tmp_path)
+    assert re.search(r"cannot be read: 2, the first: .*label_2.000003.txt:1: 3 fields", message)
+    inspection = inspected(data, CONFIG)
+    assert inspection.frames == FRAMES - 2 and not inspection.sampled
+    change_files(data, "label_2", lambda text: "Car 0 0\n")
+    with pytest.raises(DatasetError, match=r"000000.txt:1: 3 fields"):
+        inspected(data, CONFIG)
+
+
+def test_the_tables_come_before_the_refusal(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change_files(data, "label_2", lambda text: re.sub("Cyclist.*\n", "", text))
+    message = refusal(data, CONFIG, tmp_path)
+    assert "no anchor is positive for Cyclist in 12 of 12 frames of 'training'" in message
+    output = capsys.readouterr().out
+    for title in ("Labels", "Objects", "Sizes", "Matching", "Scans"):
+        assert title in output
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["types"] == {"Car": 2 * FRAMES, "Pedestrian": FRAMES}
+    assert [item["boxes"] for item in report["classes"]] == [2 * FRAMES, FRAMES, 0]
+
+
+def test_a_class_missing_in_a_sample_may_be_in_the_rest(data: Path) -> None:
+    for frame_id in ("000000", "000006"):
+        path = KittiSplit(data).label_path(frame_id)
+        path.write_text(re.sub("Cyclist.*\n", "", path.read_text()))
+    inspection = inspected(data, CONFIG, frames=2)
+    assert (
+        "look at all frames with --frames 12" in findings(inspection, CONFIG.model.spec, CONFIG.data.min_points)[0].text
+    )
+
+
+def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path) -> None:
+    split = KittiSplit(data)
+    split.calib_path("000001").unlink()
+    split.label_path("000002").unlink()
+    with pytest.raises(DatasetError, match=r"calib.000001.txt: not there \(2 of 24 calibration and label files"):
+        inspected(data, CONFIG, frames=1)

@@ -1,0 +1,135 @@
+"""Manifests of the schema before, and every field of either: a change is refused, or without effect on boxes."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from numpy.typing import NDArray
+
+from asca_deploy import Detector
+from asca_deploy.bundle import MANIFEST, shipped_bundles
+from asca_deploy.manifest import graph_files, load_bundle
+from asca_pillars.errors import BundleError
+from tests.deploy.test_manifest import NOT_THE_GRAPHS, assert_refused, edit
+
+
+def as_schema_2(folder: Path) -> Path:
+    """The bundle as the version before schema 3 wrote it."""
+    data = json.loads((folder / MANIFEST).read_text())
+    pillar = {key: value for key, value in data.pop("pillar").items() if key not in ("neck", "active_cells")}
+    for key in ("kind", "expected_input_from"):
+        del data[key]
+    del data["expected_input"]["camera_view"]
+    if data["quantization"]:
+        del data["quantization"]["dropped_scans"]
+    data |= {"schema_version": 2, **pillar}
+    for name in ("encoder", "backbone"):
+        model = onnx.load(folder / f"{name}.onnx")
+        stamped = {key: data[key] for key in ("schema_version", "name", "cpa", "license", "spec", "layout")}
+        onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in stamped.items()})
+        onnx.save(model, folder / f"{name}.onnx")
+        data["graphs"][name]["sha256"] = graph_files(folder)[name].sha256
+    (folder / MANIFEST).write_text(json.dumps(data))
+    return folder
+
+
+def test_a_bundle_that_names_no_neck_has_a_dense_one(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
+    assert "neck" not in json.loads((folder / MANIFEST).read_text())["pillar"]
+    section = load_bundle(folder).pillar
+    assert (section.neck, section.active_cells) == ("dense", None)
+    edit(folder, lambda data: data["pillar"].update(neck="sparse", active_cells="fine"))
+    assert_refused(folder, NOT_THE_GRAPHS.format("pillar"))
+
+
+def test_schema_2_is_read_as_kind_pillar(tiny_bundle: Path, bundle_copy: Path, scan: NDArray[np.float32]) -> None:
+    now, then = load_bundle(tiny_bundle), load_bundle(as_schema_2(bundle_copy))
+    expected = replace(now.expected_input, camera_view=True)
+    assert then == replace(now, graphs=then.graphs, expected_input=expected, expected_input_from="export")
+    assert np.array_equal(Detector(bundle_copy)(scan).boxes, Detector(tiny_bundle)(scan).boxes)
+    edit(bundle_copy, lambda data: data["spec"]["classes"][0].update(length_m=13.9))
+    assert_refused(bundle_copy, NOT_THE_GRAPHS.format("spec"))
+
+
+WITHOUT_EFFECT_ON_BOXES = (
+    "parity",
+    "quantization",
+    "expected_input",
+    "expected_input_from",
+    "provenance",
+    "backbone_gmac",
+)
+HOSTILE: tuple[Any, ...] = (
+    None,
+    True,
+    False,
+    -1,
+    0,
+    1,
+    3,
+    0.5,
+    -1e308,
+    1e308,
+    2**63,
+    10**400,
+    "",
+    "0",
+    "x" * 100_000,
+    "\x1b[31m\n",
+    "int8",
+    [],
+    [None],
+    {},
+    {"a": {}},
+    [[[]]],
+)
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Paths of all values in a manifest, the containers too."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        yield from leaves(inner, (*path, key))
+
+
+@pytest.mark.parametrize("old", [False, True], ids=["schema 3", "schema 2"])
+def test_every_field_is_refused_or_harmless(tmp_path: Path, old: bool) -> None:
+    """Each value of an int8 manifest replaced or taken out: one line, or the same boxes."""
+    folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
+    if old:
+        as_schema_2(folder)
+    good, text = load_bundle(folder), (folder / MANIFEST).read_text()
+    paths = [path for path in leaves(json.loads(text)) if path]
+    assert len(paths) > 150
+    rng = np.random.default_rng(0)
+    refused = 0
+    for path in paths:
+        for mutation in rng.choice(len(HOSTILE) + 1, 3, replace=False):
+            data = json.loads(text)
+            parent = data
+            for key in path[:-1]:
+                parent = parent[key]
+            if mutation == len(HOSTILE):
+                del parent[path[-1]]
+            else:
+                parent[path[-1]] = HOSTILE[mutation]
+            (folder / MANIFEST).write_text(json.dumps(data))
+            try:
+                found = load_bundle(folder)
+            except BundleError as error:
+                assert str(error).isprintable() and len(str(error)) < 1500 and str(folder) in str(error)
+                refused += 1
+                continue
+            assert found.spec == good.spec and found.graphs == good.graphs, path
+            if not old:  # schema 2 did not stamp the canvas, the precision and the name
+                assert (found.pillar, found.precision) == (good.pillar, good.precision), path
+                same = data == json.loads(text) or path[0] in WITHOUT_EFFECT_ON_BOXES
+                assert same, f"{path} = {parent[path[-1]]} was taken"
+    assert refused > 300
