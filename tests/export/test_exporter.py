@@ -167,7 +167,7 @@ def test_ties_are_no_differences() -> None:
     compare_boxes(maps._replace(scores=left), maps._replace(scores=right), SPEC)
 
 
-@pytest.mark.parametrize("cpa", READINGS)
+@pytest.mark.parametrize("cpa", READINGS[1:])
 def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: CpaReading) -> None:
     root = os.environ.get("ASCA_KITTI_MINI")
     if not root:
