@@ -15,7 +15,6 @@ from asca_pillars.commands.options import (
     ProviderOption,
     ReflectanceScaleOption,
     RuntimeOptions,
-    ScanOptions,
     ScansArgument,
     SensorHeightOption,
     ThreadsOption,
@@ -71,16 +70,16 @@ def detect(
     from asca_pillars.commands import detect_tables as show
     from asca_pillars.commands.detect_files import ResultWriter
     from asca_pillars.commands.models import open_detector
-    from asca_pillars.commands.scan_input import ScanInput
+    from asca_pillars.commands.scan_input import ScanInput, scan_settings
     from asca_pillars.data.scans.find_scans import name_scans
 
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     named = name_scans(scans or [sample_scan_path()])
-    reading = ScanOptions(
+    settings = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
-    scan_input = ScanInput(reading, [path for path, _ in named])
+    scan_input = ScanInput(settings, [path for path, _ in named])
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:

@@ -5,6 +5,14 @@ from typing import Annotated, Literal
 
 import typer
 
+from asca_pillars.commands.options import (
+    AxesOption,
+    ColumnsOption,
+    PoseOption,
+    ReflectanceScaleOption,
+    SensorHeightOption,
+)
+
 
 def import_dataset(
     source: Annotated[Path, typer.Argument(help="The other dataset's folder; for boxes the file or folder of labels.")],
@@ -19,31 +27,49 @@ def import_dataset(
         ),
     ] = "boxes",
     scans: Annotated[Path | None, typer.Option("--scans", help="Folder of the scans; with --from boxes.")] = None,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
     val_share: Annotated[
         float, typer.Option("--val-share", min=0.01, max=0.9, help="Share of the recordings in ImageSets/val.txt.")
     ] = 0.2,
 ) -> None:
     """Make a dataset of scans with boxes that train, inspect, prepare and eval read; no camera is needed.
 
-    The scans are referred to, not copied. Whole recordings go to one list, because neighboring scans look alike.
+    The scans are referred to, not copied. Whole recordings go to one list, because neighboring scans look alike. How
+    the scans lie (--axes, --sensor-height and so on) is written to dataset.yaml, where every command reads it; of
+    published datasets it is known.
 
-    Example: asca import boxes.csv data/own --scans recordings/
+    Examples:
+
+    asca import boxes.csv data/own --scans recordings/
+
+    asca import results/detections.jsonl data/own --scans sweeps/ --axes y-forward --sensor-height auto
     """
     from rich.console import Console
 
     from asca_pillars.commands.extras import require
+    from asca_pillars.commands.scan_input import scan_settings
     from asca_pillars.data.importing.argoverse2 import read_argoverse2
     from asca_pillars.data.importing.box_files import read_box_files
     from asca_pillars.data.importing.imported import write_imported
     from asca_pillars.data.importing.nuscenes import read_nuscenes
+    from asca_pillars.data.scan_settings import ScanSettings
     from asca_pillars.errors import ConfigError
 
     if (scans is not None) != (source_format == "boxes"):
         raise ConfigError("--scans FOLDER goes with --from boxes, and only with it: other formats say where scans are")
     if not source.exists():
         raise ConfigError(f"{source}: no such file or folder; check the path")
+    settings = scan_settings(
+        sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
+    )
     if scans is not None:
-        imported = read_box_files(source, scans)
+        imported = read_box_files(source, scans, settings)
+    elif settings != ScanSettings():
+        raise ConfigError(f"--from {source_format} knows how its scans lie: leave --axes, --columns and the like out")
     elif source_format == "argoverse2":
         require("import")
         imported = read_argoverse2(source)

@@ -64,7 +64,8 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
     train, val = _lists(frames, val_share)
     for name, own in (("train", train), ("val", val)):
         write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
-    content = {key: value for key, value in to_dict(imported.settings).items() if key != "labels" and value is not None}
+    usual = to_dict(BoxDataset())
+    content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
     with atomic_path(out / DATASET_FILE) as temporary:
         temporary.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     boxes = Counter(kind for frame in frames for kind in frame.records.types)
