@@ -49,7 +49,8 @@ def detect(
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
 
     OUT/NAME.json holds the boxes of one scan in the scan's own frame, OUT/detections.jsonl those of the whole run, one
-    line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image.
+    line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image. Labels beside
+    the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white.
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
 

@@ -32,10 +32,11 @@ from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, find_scans
 from asca_pillars.data.scans.reflectance import ReflectanceScale
 from asca_pillars.data.scans.scan_reader import folder_reflectance_scale, read_scan, stored_points
-from asca_pillars.errors import DatasetError
+from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.frame_change import FrameChange
 
 DATASET_FILE = "dataset.yaml"
+ALL_AROUND_DEG = 360.0
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,18 @@ class BoxDataset(ScanSettings):
     Attributes:
         scans: folder of the scans, relative to the dataset or absolute.
         labels: a .jsonl or .csv file for all frames, or a folder with a .json or .csv for each; relative or absolute.
+        labeled_view_deg: labels stand only within this angle, half of it to each side of straight ahead, as where a
+            camera looks: nothing is learnt from what lies outside. 360: everywhere.
     """
 
     scans: str = "scans"
     labels: str = "labels.jsonl"
+    labeled_view_deg: float = ALL_AROUND_DEG
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.labeled_view_deg <= ALL_AROUND_DEG:
+            raise ConfigError(f"labeled_view_deg {self.labeled_view_deg:g}: give degrees, 360 for labels everywhere")
 
 
 class BoxFrame(NamedTuple):
@@ -71,8 +80,12 @@ class BoxSplit:
     root: str | Path
     name: str = "training"
 
-    has_camera = False
     pool = "scans"
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether labels stand only within an angle ahead."""
+        return self.settings.labeled_view_deg < ALL_AROUND_DEG
 
     @cached_property
     def settings(self) -> BoxDataset:
@@ -130,8 +143,11 @@ class BoxSplit:
         self.frame_ids  # noqa: B018
 
     def points(self, frame_id: str, *, camera_view: bool = False) -> NDArray[np.float32]:
-        """(N, 4) of the scan in the level frame; there is no camera whose view could be asked for."""
-        return self._levelled(self._read(self.scan_path(frame_id)))
+        """(N, 4) of the scan in the level frame; with `camera_view` those within the labelled angle."""
+        points = self._levelled(self._read(self.scan_path(frame_id)))
+        if camera_view and self.has_camera:
+            points = points[_within(points, self.settings.labeled_view_deg)]
+        return points
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
         """(N, 4) all of the file in the level frame; reflectance divided by the dataset's scale."""
@@ -184,6 +200,10 @@ class BoxSplit:
     def _frames(self) -> dict[str, BoxFrame]:
         """Every labelled frame of the dataset, by its id."""
         return find_frames(self.labels_path, self.scans_folder)
+
+
+def _within(points: NDArray[np.float32], view_deg: float) -> NDArray[np.bool_]:
+    return np.abs(np.arctan2(points[:, 1], points[:, 0])) <= np.radians(view_deg / 2)
 
 
 def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
