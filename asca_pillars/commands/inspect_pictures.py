@@ -7,7 +7,6 @@ from rich.console import Console
 
 from asca_pillars.config import Config
 from asca_pillars.data.training_frames import open_frames
-from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_directory, require_replaceable, write_json
 from asca_pillars.pictures.training_pictures import draw_training_frames
 
@@ -24,15 +23,7 @@ def draw_frames(data: Path, split: str, config: Config, count: int, out: Path, c
     """
     require_replaceable(out, COMMAND, MADE_BY)
     config = replace(config, data=replace(config.data, train_set=split))
-    try:
-        frames = open_frames(data, config, training=True)
-        frames.draw(0, 0)
-    except DatasetError as error:
-        if config.augment.insert.method != "rs_aug":
-            raise
-        console.print(f"Drawn without inserted objects: {error}", style="yellow", soft_wrap=True)
-        insert = replace(config.augment.insert, method="none")
-        frames = open_frames(data, replace(config, augment=replace(config.augment, insert=insert)), training=True)
+    frames = open_frames(data, config, training=True)
     with atomic_directory(out, COMMAND, MADE_BY) as folder:
         said = draw_training_frames(folder, frames, count)
         about = {"data": str(data), "split": split, "config": config.name}

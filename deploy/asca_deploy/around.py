@@ -25,8 +25,8 @@ CAMERA_FIELD_RAD = math.pi / 4
 """To each side of a camera's view: KITTI's sees 41 degrees to each side, and a car there is often cut."""
 SEAM_MARGIN_RAD = math.radians(10)
 """How far beyond its own sector a pass still reports, for the neighbour may place the center on the other side."""
-GROUND_POINTS = 30_000
-"""Of a scan that its ground is looked for in: enough for a normal to a tenth of a degree."""
+GROUND_POINTS = 10_000
+"""Of a scan that its ground is looked for in: the normal is then that of all points to some hundredths of a degree."""
 _HALF_TURN_RAD = math.pi
 _STEP_RAD = math.radians(1)
 
