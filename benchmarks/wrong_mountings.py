@@ -13,19 +13,21 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
+import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from asca_deploy import Detections, Detector
-from asca_pillars.commands.options import ScanOptions
 from asca_pillars.commands.scan_input import ScanInput
 from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.schema import parse
 
 MIN_IOU = 0.5
 Points = NDArray[np.float32]
@@ -82,9 +84,10 @@ def _try(path: Path, mistake: Mistake, right: Detections) -> tuple[int, int, int
     with tempfile.TemporaryDirectory() as folder:
         wrong = Path(folder) / "scan.bin"
         mistake.make(read_scan(path).points).astype("<f4").tofile(wrong)
-        texts, found = _detect(wrong, ScanOptions())
+        texts, found = _detect(wrong, ScanSettings())
         options = dict(re.findall(r"\(--([a-z-]+) (\S+?)(?: or auto)?\)", " ".join(texts)))
-        remedy = ScanOptions(**{name.replace("-", "_"): value for name, value in options.items()})
+        named = {name.replace("-", "_"): yaml.safe_load(value) for name, value in options.items()}
+        remedy = parse(ScanSettings, named, "remedy")
         _, mended = _detect(wrong, remedy)
     own = mistake.mounting.to_model(Detector().bundle.expected_input.sensor_height_m)
     return (
@@ -94,9 +97,9 @@ def _try(path: Path, mistake: Mistake, right: Detections) -> tuple[int, int, int
     )
 
 
-def _detect(path: Path, options: ScanOptions) -> tuple[list[str], Detections]:
+def _detect(path: Path, settings: ScanSettings) -> tuple[list[str], Detections]:
     try:
-        scan_input = ScanInput(options, [path])
+        scan_input = ScanInput(settings, [path])
         scan = scan_input.read(path)
     except AscaError as error:
         return [str(error)], Detections.empty(())

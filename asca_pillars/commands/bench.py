@@ -16,7 +16,6 @@ from asca_pillars.commands.options import (
     ProviderOption,
     ReflectanceScaleOption,
     RuntimeOptions,
-    ScanOptions,
     ScansArgument,
     SensorHeightOption,
     ThreadsOption,
@@ -82,7 +81,7 @@ def bench(
     from asca_deploy import load_bundle, sample_scan_path
     from asca_pillars.commands.bench_parts import Parts, measure_parts, named_bundles
     from asca_pillars.commands.models import open_detector
-    from asca_pillars.commands.scan_input import ScanInput
+    from asca_pillars.commands.scan_input import ScanInput, scan_settings
     from asca_pillars.data.scans.find_scans import name_scans
     from asca_pillars.errors import ConfigError, ScanError
     from asca_pillars.files import write_json
@@ -93,11 +92,11 @@ def bench(
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # `asca detect` warns of odd scans; here they are timed
     if around and (matrix or cold):
         raise ConfigError("--matrix and --cold time single passes: leave --around out, or them")
-    reading = ScanOptions(
+    settings = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
     paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
-    scan_input = ScanInput(reading, paths)
+    scan_input = ScanInput(settings, paths)
     for line in scan_input.said:
         console.print(line, style="yellow", soft_wrap=True)
     points = [scan_input.read(path).points for path in paths]

@@ -15,7 +15,6 @@ from asca_pillars.commands.options import (
     ProviderOption,
     ReflectanceScaleOption,
     RuntimeOptions,
-    ScanOptions,
     ScansArgument,
     SensorHeightOption,
     ThreadsOption,
@@ -50,7 +49,8 @@ def detect(
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
 
     OUT/NAME.json holds the boxes of one scan in the scan's own frame, OUT/detections.jsonl those of the whole run, one
-    line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image.
+    line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image. Labels beside
+    the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white.
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
 
@@ -71,16 +71,16 @@ def detect(
     from asca_pillars.commands import detect_tables as show
     from asca_pillars.commands.detect_files import ResultWriter
     from asca_pillars.commands.models import open_detector
-    from asca_pillars.commands.scan_input import ScanInput
+    from asca_pillars.commands.scan_input import ScanInput, scan_settings
     from asca_pillars.data.scans.find_scans import name_scans
 
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     named = name_scans(scans or [sample_scan_path()])
-    reading = ScanOptions(
+    settings = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
-    scan_input = ScanInput(reading, [path for path, _ in named])
+    scan_input = ScanInput(settings, [path for path, _ in named])
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:

@@ -7,9 +7,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from asca_deploy import Detections
 from asca_pillars.data.kitti import Calibration, read_calibration
+from asca_pillars.data.labels_beside import labels_beside
 from asca_pillars.data.scans.scan_reader import Scan
+from asca_pillars.errors import AscaError
 from asca_pillars.files import atomic_path, require_own, write_json
 from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 
@@ -51,7 +56,7 @@ class ResultWriter:
         write_json(self._named(name, ".json"), content)
         self._lines.write(json.dumps(content) + "\n")
         if self._pictures:
-            write_png(self._named(name, "_bev.png"), detections.plot(scan.points))
+            write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=self._labels(path)))
         calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
         if path.parent.name != "velodyne" or not calib_path.exists():
             return
@@ -64,6 +69,13 @@ class ResultWriter:
         if image is not None and self._pictures:
             drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
             write_png(self._named(name, "_image.png"), drawn)
+
+    def _labels(self, path: Path) -> NDArray[np.float32] | None:
+        try:
+            return labels_beside(path)
+        except AscaError as error:
+            self.remarks.append(f"labels are not drawn: {error}")
+            return None
 
     def _open(self) -> IO[str]:
         if not (self._out / RUN_FILE).exists():

@@ -5,7 +5,13 @@ from typing import Annotated, Literal
 
 import typer
 
-from asca_pillars.commands.options import PrecisionOption, ProviderOption, RuntimeOptions, ThreadsOption
+from asca_pillars.commands.options import (
+    AroundOption,
+    PrecisionOption,
+    ProviderOption,
+    RuntimeOptions,
+    ThreadsOption,
+)
 
 
 def evaluate(
@@ -69,6 +75,7 @@ def evaluate(
     provider: ProviderOption = "cpu",
     precision: PrecisionOption = None,
     threads: ThreadsOption = None,
+    around: AroundOption = False,
 ) -> None:
     """Score a model, or finished predictions, by KITTI's protocol: AP and AOS, by distance, recall and precision.
 
@@ -83,6 +90,7 @@ def evaluate(
     from asca_pillars.commands import eval_steps as steps
     from asca_pillars.commands.models import open_model
     from asca_pillars.data.kitti import KittiSplit
+    from asca_pillars.errors import ConfigError
     from asca_pillars.evaluation.predictions import read_predictions, read_truth
 
     console = Console(markup=False)
@@ -91,11 +99,13 @@ def evaluate(
     if protocol in ("iou", "distance"):
         from asca_pillars.commands import eval_boxes
 
-        box_task = eval_boxes.BoxTask(protocol, data, split, out, json, score, min_score)
+        box_task = eval_boxes.BoxTask(protocol, data, split, out, json, score, min_score, around)
         options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
         eval_boxes.check_arguments(box_task, model, predictions, labels, gallery)
         eval_boxes.evaluate_boxes(box_task, options, predictions, console)
         return
+    if around:
+        raise ConfigError("--around needs labels in every direction: give --protocol iou or distance, too")
     steps.check_arguments(model, data, predictions, labels, gallery, score)
     steps.check_protocol(protocol, data, gallery, score)
     steps.claim(out)

@@ -35,6 +35,7 @@ class BoxTask:
     json: Path | None
     score: float | None
     min_score: float
+    around: bool
 
 
 def check_arguments(
@@ -46,6 +47,8 @@ def check_arguments(
         raise ConfigError(f"{option} needs the labels: give --data ROOT")
     if predictions is not None and model is not None:
         raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
+    if task.around and predictions is not None:
+        raise ConfigError("--around runs a model; predictions are scored as they are: leave one of them out")
     if labels is not None:
         raise ConfigError(f"--labels {labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
     if gallery:
@@ -61,7 +64,7 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     split = open_split(task.data, task.split)
     about: dict[str, Any] = {"data": str(task.data), "split": task.split}
     if predictions is None:
-        model = open_model(options, task.min_score)
+        model = open_model(options, task.min_score, sensor_height_m=split.mounting.sensor_height_m, around=task.around)
         frames = _run(model, split, task, console)
         class_names = model.spec.class_names
         scores = {one.name: one.score_threshold if task.score is None else task.score for one in model.spec.classes}
@@ -89,7 +92,8 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
 def _run(model: Model, split: LabeledSplit, task: BoxTask, console: Console) -> BoxFrames:
     """Run the model and write what it finds: what is scored is read from there, so that it can be scored again."""
     with atomic_directory(task.out / "predictions", COMMAND, MADE_BY) as folder:
-        write_box_predictions(folder / PREDICTIONS, split, model.detect, console=console)
+        camera_view = split.has_camera and not task.around
+        write_box_predictions(folder / PREDICTIONS, split, model.detect, camera_view=camera_view, console=console)
         about = {"model": model.about, "data": str(split.root), "split": split.name, "files": [PREDICTIONS]}
         write_json(folder / MADE_BY, about)
     warn_of_unlike_scans(model, len(split.frame_ids), console)

@@ -100,14 +100,14 @@ def check_arguments(
 
 def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
     """KITTI's, unless the dataset has no camera."""
-    return "kitti" if data is None or open_split(data).has_camera else "iou"
+    return "kitti" if data is None or isinstance(open_split(data), KittiSplit) else "iou"
 
 
 def check_protocol(protocol: str, data: Path | None, gallery_frames: int | None, score: float | None) -> None:
     """Refuse an unknown protocol, or options of another one, with a ConfigError."""
     if protocol not in get_args(Protocol):
         raise ConfigError(f"--protocol {protocol}: choose {', '.join(get_args(Protocol))}, iou or distance")
-    if data is not None and not open_split(data).has_camera:
+    if data is not None and not isinstance(open_split(data), KittiSplit):
         raise ConfigError(f"--protocol {protocol}: {data} has no camera, which it needs; choose iou or distance")
     if protocol == "waymo" and (gallery_frames or score is not None):
         option = f"--gallery {gallery_frames}" if gallery_frames else f"--score {score:g}"

@@ -28,13 +28,26 @@ def inspect(
             "this YAML; what is inspected is then how well it fits.",
         ),
     ] = None,
+    draw: Annotated[
+        int | None,
+        typer.Option(
+            "--draw",
+            min=1,
+            help="Also draw so many training frames from above, with their labels, as training sees them: objects "
+            "inserted, augmented.",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures of --draw.")] = Path("inspection"),
     json: JsonOption = None,
 ) -> None:
     """Look at a dataset before training: objects, points, sizes and positives per class, ranges, scans.
 
     Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 2.
 
-    Examples: asca inspect data/kitti -c asca_pointpillars_kitti
+    Examples:
+
+    asca inspect data/kitti -c asca_pointpillars_kitti --draw 8
+
     asca inspect data/own -c asca_small_sim --propose own.yaml
     """
     import dataclasses
@@ -42,6 +55,7 @@ def inspect(
     from rich.console import Console
 
     from asca_pillars.commands import inspect_tables as show
+    from asca_pillars.commands.inspect_pictures import draw_frames
     from asca_pillars.commands.propose_config import propose_config
     from asca_pillars.config import load_config
     from asca_pillars.data.inspection.findings import findings
@@ -79,6 +93,8 @@ def inspect(
         show.types(inspection, spec.class_names), show.objects(inspection, min_points), show.sizes(inspection), sep="\n"
     )
     console.print(show.matching(inspection), show.scans(inspection, spec.limits, view), sep="\n")
+    if draw is not None:
+        draw_frames(data, frames_of.name, settings, draw, out, console)
     errors = [finding for finding in found if finding.level == "error"]
     for finding in found:
         if finding not in errors[:1]:  # the first one is what the command fails with, below all of them

@@ -59,20 +59,30 @@ def open_detector(
     )
 
 
-def open_model(options: RuntimeOptions, min_score: float) -> Model:
+def open_model(
+    options: RuntimeOptions, min_score: float, *, sensor_height_m: float | None = None, around: bool = False
+) -> Model:
     """Open a bundle's folder or a checkpoint file; None for the bundle that ships.
+
+    Args:
+        options: which one, and how it runs.
+        min_score: lowest score of what it reports.
+        sensor_height_m: of the scans; None: as high as in the training.
+        around: look in every direction, by turned passes.
 
     Raises:
         AscaError: missing, damaged, or not to be run as asked; one line.
     """
     if options.bundle is not None and (options.bundle.is_file() or options.bundle.suffix == ".ckpt"):
-        return _open_checkpoint(options.bundle, options, min_score)
-    return _open_bundle(options, min_score)
+        if around:
+            raise ConfigError("--around runs bundles: export the checkpoint first (asca export)")
+        return _open_checkpoint(options.bundle, options, min_score, Mounting(sensor_height_m))
+    return _open_bundle(options, min_score, Mounting(sensor_height_m), around=around)
 
 
-def _open_bundle(options: RuntimeOptions, min_score: float) -> Model:
+def _open_bundle(options: RuntimeOptions, min_score: float, mounting: Mounting, *, around: bool) -> Model:
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are collected below
-    detector = open_detector(options, min_score)
+    detector = open_detector(options, min_score, mounting, around=around)
     bundle = detector.bundle
     unlike: list[str] = []
 
@@ -86,15 +96,17 @@ def _open_bundle(options: RuntimeOptions, min_score: float) -> Model:
         "bundle": str(detector.folder),
         "sha256": {name: graph.sha256 for name, graph in bundle.graphs.items()},
         "trained_on": bundle.provenance.trained_on,
+        "passes": detector.passes,
         "provider": detector.provider,
         "precision": arithmetic(bundle.precision, detector.precision),
         "threads": detector.threads,
         "min_score": min_score,
     }
-    return Model(bundle.name, detect, bundle.spec, bundle.expected_input.camera_view, about, unlike)
+    camera_view = bundle.expected_input.camera_view and not around
+    return Model(bundle.name, detect, bundle.spec, camera_view, about, unlike)
 
 
-def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float) -> Model:
+def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float, mounting: Mounting) -> Model:
     provider, precision, threads = options.provider, options.precision, options.threads
     require("train")
     import torch
@@ -123,5 +135,7 @@ def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float) -> M
         "threads": torch.get_num_threads(),
         "min_score": min_score,
     }
-    detect = ScanDetector(network.to(device), config.model.spec.with_score_threshold(min_score))
+    expected = loaded.expected_input
+    to_model = mounting.to_model(None if expected is None else expected.sensor_height_m)
+    detect = ScanDetector(network.to(device), config.model.spec.with_score_threshold(min_score), to_model)
     return Model(config.name, detect, config.model.spec, config.data.camera_view, about)

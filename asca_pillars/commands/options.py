@@ -91,17 +91,6 @@ AroundOption = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanOptions:
-    """How scan files are to be read and where their sensor sat, as typed."""
-
-    sensor_height: str | None = None
-    axes: str = "x-forward"
-    pose: Path | None = None
-    reflectance_scale: str = "auto"
-    columns: int | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class RuntimeOptions:
     """Which model runs, and how. The arguments of `asca_deploy.Detector` by the same names."""
 

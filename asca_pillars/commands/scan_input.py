@@ -1,21 +1,30 @@
 """Scan files as the options of a command want them read, and the mounting of their sensor."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from asca_pillars.commands.options import ScanOptions
-from asca_pillars.data.ground_height import measured_mounting
-from asca_pillars.data.mounting import Mounting, read_pose
-from asca_pillars.data.scans.reflectance import checked_scale
+from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.scan_reader import FolderScale, Scan, folder_reflectance_scale, read_scan
-from asca_pillars.errors import ConfigError, ScanError
+from asca_pillars.errors import ConfigError
 
-_HEIGHT_SCANS = 8  # that `--sensor-height auto` looks at
+
+def scan_settings(
+    *, sensor_height: str | None, axes: str, pose: Path | None, reflectance_scale: str, columns: int | None
+) -> ScanSettings:
+    """The options of that name, as typed.
+
+    Raises:
+        ConfigError: one cannot be used.
+    """
+    return ScanSettings(
+        sensor_height=None if sensor_height is None else _number(sensor_height, "--sensor-height"),
+        axes=axes,
+        pose=None if pose is None else str(pose),
+        reflectance_scale=_number(reflectance_scale, "--reflectance-scale"),
+        columns=columns,
+    )
 
 
 class ScanInput:
@@ -29,14 +38,16 @@ class ScanInput:
         ConfigError, ScanError: an option cannot be used, or the height not be estimated.
     """
 
-    def __init__(self, options: ScanOptions, paths: Sequence[Path]) -> None:
-        self._columns = options.columns
+    def __init__(self, settings: ScanSettings, paths: Sequence[Path]) -> None:
+        self._columns = settings.columns
         self._scales: dict[tuple[Path, str], FolderScale] = {}
         self.said: list[str] = []
-        stated = checked_scale(_number(options.reflectance_scale, "--reflectance-scale"))
+        stated = settings.reflectance_scale
         for key, group in groupby(sorted(paths, key=_folder_and_suffix), _folder_and_suffix):
             self._scales[key] = self._decide(key[0], list(group)) if stated == "auto" else FolderScale(stated, None)
-        self.mounting = self._mounting(options, paths)
+        self.mounting, estimate = settings.mounting(paths, lambda path: self.read(path).points)
+        if estimate is not None:
+            self.said.append(f"sensor height: {estimate}")
 
     def read(self, path: Path) -> Scan:
         """One of the scans.
@@ -53,23 +64,6 @@ class ScanInput:
             what = f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"
             self.said.append(f"{where}: {decided.doubt or what}")
         return decided
-
-    def _mounting(self, options: ScanOptions, paths: Sequence[Path]) -> Mounting:
-        pose = None if options.pose is None else read_pose(options.pose)
-        height = None if options.sensor_height is None else _number(options.sensor_height, "--sensor-height")
-        if height != "auto":
-            return Mounting(height, options.axes, pose)
-        chosen = paths[:: -(-len(paths) // _HEIGHT_SCANS)]
-        mounting, estimate = measured_mounting(self._readable(chosen), Mounting(None, options.axes, pose))
-        self.said.append(f"sensor height: {estimate}")
-        return mounting
-
-    def _readable(self, paths: Iterable[Path]) -> Iterator[NDArray[np.float32]]:
-        for path in paths:
-            try:
-                yield self.read(path).points
-            except ScanError:
-                continue  # named when its turn comes
 
 
 def _folder_and_suffix(path: Path) -> tuple[Path, str]:

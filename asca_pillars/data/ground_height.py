@@ -36,6 +36,8 @@ class GroundPlane(NamedTuple):
     share_below: float
     """Of the cells whose low point lies further below it: a plane above others is no ground."""
     cells: int
+    normal: tuple[float, float, float]
+    """Of length 1, upwards."""
 
     @property
     def doubt(self) -> str | None:
@@ -127,7 +129,8 @@ def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
     above = low[:, 2] - full @ plane
     tilt = float(np.degrees(np.arctan(np.hypot(*plane[:2]))))
     share, below = float((np.abs(above) < BAND_M).mean()), float((above < -2 * BAND_M).mean())
-    return GroundPlane(float(-plane[2]), tilt, share, below, len(low))
+    x, y, z = (np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(1 + np.square(plane[:2]).sum())).tolist()
+    return GroundPlane(float(-plane[2]), tilt, share, below, len(low), (x, y, z))
 
 
 def _low_points(points: NDArray[Any]) -> NDArray[np.float64]:

@@ -11,6 +11,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.data.mounting import Mounting
+
 
 class LabeledBoxes(NamedTuple):
     """The M labelled boxes of a frame, (M, 7) float32, LiDAR frame, and the type of each."""
@@ -37,6 +39,10 @@ class LabeledSplit(Protocol):
     @property
     def has_camera(self) -> bool:
         """Whether labels stand only where a camera sees."""
+
+    @property
+    def mounting(self) -> Mounting:
+        """How the scans' own frame lies to that of `points` and `labeled_boxes`, and how high, if that is stated."""
 
     @property
     def frame_ids(self) -> tuple[str, ...]:

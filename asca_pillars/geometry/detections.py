@@ -168,12 +168,19 @@ class Detections:
         objects = objects_from_boxes(self.boxes, self.names, calibration, size, self.scores)
         return labels_text([item for item in objects if item.bbox[2] > item.bbox[0]])
 
-    def plot(self, points: NDArray[Any] | None = None, *, width_px: int = 1000) -> NDArray[np.uint8]:
+    def plot(
+        self,
+        points: NDArray[Any] | None = None,
+        *,
+        labels: NDArray[np.floating] | None = None,
+        width_px: int = 1000,
+    ) -> NDArray[np.uint8]:
         """The scan and the boxes from above: an image (H, width_px, 3), blue, green, red as in OpenCV; ahead is up.
 
         Args:
             points: (N, >=3) x, y, z in metres, LiDAR frame. None for those that a `Detector` found these boxes in:
                 it keeps a weak reference to them, so they are drawn as long as somebody else keeps the array.
+            labels: (M, 7) true boxes in the scan's frame, drawn thin and white; None without any.
             width_px: of the image.
         """
         from asca_pillars.pictures.visualize import draw_bev
@@ -185,12 +192,13 @@ class Detections:
         found = replace(self, boxes=self._level_boxes())
         if self._level is not None:
             points = self._level.points(points)
+            labels = None if labels is None else self._level.boxes(labels)
         ranges = self._ranges
         if ranges is None:
             around = np.concatenate([points[:, :2], found.boxes[:, :2], [[0.0, 0.0]]])
             low, high = around.min(axis=0) - 5.0, around.max(axis=0) + 5.0
             ranges = Ranges((low[0], high[0]), (low[1], high[1]), (-np.inf, np.inf))
-        return draw_bev(points, found, ranges, width_px=width_px)
+        return draw_bev(points, found, ranges, labels=labels, width_px=width_px)
 
     def _level_boxes(self) -> NDArray[np.float32]:
         return self.boxes if self._level is None else self._level.boxes(self.boxes)

@@ -1,4 +1,4 @@
-"""Training samples: frames of a KITTI-layout folder, augmented and prepared for a family of detectors."""
+"""Training samples: labelled frames, augmented and prepared for a family of detectors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,14 +8,10 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset
 
-from asca_pillars.config import AugmentConfig, Config
-from asca_pillars.data.augment import augment
-from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
-from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
-from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.data.open_split import open_split
+from asca_pillars.config import Config
+from asca_pillars.data.frames import LabeledFrame, within_ranges
+from asca_pillars.data.training_frames import TrainingFrames, open_frames
 from asca_pillars.errors import AscaError
-from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.models.build import build_preparation
 from asca_pillars.models.trainable import Movable, Preparation
 
@@ -76,39 +72,19 @@ class Collate:
 
 
 class LabeledDataset(Dataset[Sample | AscaError]):
-    """Frames of one ImageSets list, augmented where `augmentation` is given.
+    """Frames as samples for one family of detectors.
 
-    What a sample holds depends on the seed, the epoch and the frame alone, not on the number of workers or on what
-    was drawn before it: a resumed run sees what an unbroken one would have seen. An index is therefore a pair
-    (epoch, frame number), see `EpochSampler`.
+    What a sample holds does not depend on the number of workers or on what was drawn before it: a resumed run sees what
+    an unbroken one would have seen. An index is therefore a pair (epoch, frame number), see `EpochSampler`.
 
     Args:
-        split: the list.
-        spec: classes that are labels, and ranges outside of which a box is no target.
+        frames: read and augmented.
         preparation: of the detector that is trained.
-        camera_view: keep only the points that the camera sees.
-        min_points: an object with fewer points inside its box is IGNORED.
-        augmentation: random changes; None for validation.
-        inserter: puts objects of other frames in, before anything else is changed.
-        seed: of all that is drawn.
     """
 
-    def __init__(
-        self,
-        split: LabeledSplit,
-        spec: DetectorSpec,
-        preparation: Preparation,
-        *,
-        camera_view: bool,
-        min_points: int,
-        augmentation: AugmentConfig | None = None,
-        inserter: Inserter | None = None,
-        seed: int = 0,
-    ) -> None:
-        self.split, self.spec, self.preparation = split, spec, preparation
-        self.camera_view, self.min_points = camera_view, min_points
-        self.augmentation, self.inserter, self.seed = augmentation, inserter, seed
-        self.frame_ids = split.frame_ids
+    def __init__(self, frames: TrainingFrames, preparation: Preparation) -> None:
+        self.frames, self.preparation = frames, preparation
+        self.frame_ids = frames.frame_ids
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -126,40 +102,15 @@ class LabeledDataset(Dataset[Sample | AscaError]):
         Raises:
             DatasetError, ScanError: a file of the frame is missing or damaged.
         """
-        rng = None if self.augmentation is None else np.random.default_rng((self.seed, epoch, number))
-        frame = read_frame(
-            self.split,
-            self.frame_ids[number],
-            self.spec.class_names,
-            camera_view=self.camera_view,
-            min_points=self.min_points,
-        )
-        if self.inserter is not None:
-            # A generator of its own: all other draws stay what they are without insertion.
-            frame = insert_objects(frame, self.inserter, np.random.default_rng((self.seed, epoch, number, 1)))
-        if self.augmentation is not None and rng is not None:
-            frame = augment(frame, self.augmentation, rng)
-        return Sample(within_ranges(frame, self.spec.ranges), self.preparation.prepare(frame, rng))
+        frame, rng = self.frames.draw(epoch, number)
+        return Sample(within_ranges(frame, self.frames.spec.ranges), self.preparation.prepare(frame, rng))
 
 
 def open_dataset(root: str | Path, config: Config, *, training: bool) -> LabeledDataset:
-    """The training or the validation frames that `config` asks for; the object database is built if it is missing.
+    """The training or the validation samples that `config` asks for.
 
     Raises:
-        DatasetError: a missing list, scan, label or calibration file; a class to insert that no frame has.
+        DatasetError: as `open_frames`.
     """
-    data, spec, insert = config.data, config.model.spec, config.augment.insert
-    split = open_split(root, data.train_set if training else data.val_set)
-    inserter = None
-    if training and insert.method != "none":
-        inserter = prepare_inserter(split, spec, data, insert)
-    return LabeledDataset(
-        split,
-        spec,
-        build_preparation(config.model, split, data),
-        camera_view=data.camera_view,
-        min_points=data.min_points,
-        augmentation=config.augment if training else None,
-        inserter=inserter,
-        seed=config.train.seed,
-    )
+    frames = open_frames(root, config, training=training)
+    return LabeledDataset(frames, build_preparation(config.model, frames.split, config.data))

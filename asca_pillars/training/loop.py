@@ -85,7 +85,7 @@ def train(
         rank_zero_only(Console(markup=False, highlight=False).print)(f"{damage}: going on from {resumed}")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     L.seed_everything(config.train.seed, verbose=False)
-    module = DetectionModule(config, measure_input(out, data.training_set))
+    module = DetectionModule(config, measure_input(out, data.training_set.frames))
     if init is not None and resumed is None:
         _start_from(module, init)
     files = AtomicCheckpointIO(keep_last=damage is None)

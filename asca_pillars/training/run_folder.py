@@ -9,12 +9,12 @@ from rich.progress import track
 from asca_pillars.config import Config, load_config
 from asca_pillars.data.expected_input import ExpectedInput, measure_expected_input
 from asca_pillars.data.frames import read_frame
+from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import read_settings
 from asca_pillars.system import describe_environment
-from asca_pillars.training.dataset import LabeledDataset
 
 EXPECTED_INPUT_FRAMES = 200
 # Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.
@@ -53,7 +53,7 @@ def claim(out: Path, config: Config) -> None:
         temporary.write_text(yaml.safe_dump(resolved, sort_keys=False), encoding="utf-8")
 
 
-def measure_input(out: Path, frames: LabeledDataset) -> ExpectedInput:
+def measure_input(out: Path, frames: TrainingFrames) -> ExpectedInput:
     """What up to EXPECTED_INPUT_FRAMES evenly spaced training scans look like; kept in `out` for a resumed run.
 
     Raises:

@@ -2,6 +2,9 @@
 
     pass 0: ahead     pass 1: left     pass 2: behind     pass 3: right
 
+The scan turns about the normal of its ground. A sensor that is pitched by half a degree sees the road ahead rise, as
+the model did in its training; turned about the sensor's own axis, the road behind would sink, and less would be found.
+
 Neighbouring passes both see what stands between them. Of boxes of a class that overlap, the one stays that its pass
 sees nearest to straight ahead, where the model has seen the most in training.
 """
@@ -10,7 +13,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from asca_pillars.data.ground_height import fit_ground_plane
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.overlap import rotated_nms
@@ -20,6 +25,8 @@ CAMERA_FIELD_RAD = math.pi / 4
 """To each side of a camera's view: KITTI's sees 41 degrees to each side, and a car there is often cut."""
 SEAM_MARGIN_RAD = math.radians(10)
 """How far beyond its own sector a pass still reports, for the neighbour may place the center on the other side."""
+GROUND_POINTS = 10_000
+"""Of a scan that its ground is looked for in: the normal is then that of all points to some hundredths of a degree."""
 _HALF_TURN_RAD = math.pi
 _STEP_RAD = math.radians(1)
 
@@ -41,6 +48,25 @@ def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...
     while _HALF_TURN_RAD / passes > field + 1e-9 or not _sees(ranges, _HALF_TURN_RAD / passes, enough_m):
         passes += 1
     return tuple(FrameChange.turn(-2 * math.pi * number / passes) for number in range(passes))
+
+
+def about_ground(turns: Sequence[FrameChange], points: NDArray[np.float32]) -> tuple[FrameChange, ...]:
+    """The turns about the normal of a scan's ground, through its origin; about z where no ground is sure.
+
+    In all of them the ground then lies as it does before them. The first turn, which is none, stays as it is.
+
+    Args:
+        turns: see `turns_around`.
+        points: (N, >=3) of the scan, metres, model's frame.
+    """
+    plane = fit_ground_plane(points[:: max(1, len(points) // GROUND_POINTS)])
+    if plane is None or plane.doubt is not None:
+        return tuple(turns)
+    up = np.array(plane.normal)
+    forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    forward /= np.linalg.norm(forward)
+    level = np.stack([forward, np.cross(up, forward), up])
+    return tuple(turn if turn.is_identity else FrameChange(level.T @ turn.axes @ level, turn.shift_m) for turn in turns)
 
 
 def ranges_around(ranges: Ranges, passes: int) -> Ranges:

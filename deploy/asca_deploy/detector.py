@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
-from asca_deploy.around import merge, ranges_around, turns_around
+from asca_deploy.around import about_ground, merge, ranges_around, turns_around
 from asca_deploy.bundle import Bundle, find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
 from asca_deploy.ort_session import check_onnxruntime
@@ -45,6 +45,8 @@ class _Frame(NamedTuple):
     laps: Laps
     usable: UsablePoints
     """In the model's frame."""
+    turns: tuple[FrameChange, ...]
+    """Of the passes."""
     counts: list[ScanCounts]
     """Of each pass so far."""
     warnings: list[InputWarning]
@@ -144,7 +146,7 @@ class Detector:
         """
         frame = self._open(points)
         # Pass by pass, so that all of them need no more than one pseudo-image.
-        raw = [self.pipeline.infer(self._prepare(frame, turn), frame.laps) for turn in self._turns]
+        raw = [self.pipeline.infer(self._prepare(frame, turn), frame.laps) for turn in frame.turns]
         return self._finish(frame, raw)
 
     def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[Detections, None, None]:
@@ -163,7 +165,7 @@ class Detector:
 
         def prepare(points: NDArray[Any]) -> tuple[_Frame, list[Any]]:
             frame = self._open(points)
-            return frame, [self._prepare(frame, turn) for turn in self._turns]
+            return frame, [self._prepare(frame, turn) for turn in frame.turns]
 
         def infer(ready: tuple[_Frame, list[Any]]) -> tuple[_Frame, list[Any]]:
             frame, prepared = ready
@@ -187,7 +189,8 @@ class Detector:
             warnings.append(InputWarning("clipped", text))
         if not self._to_model.is_identity:
             usable = usable.moved(self._to_model)
-        return _Frame(start, [("input", perf_counter())], usable, [], warnings, points)
+        turns = self._turns if self.passes == 1 else about_ground(self._turns, usable.points)
+        return _Frame(start, [("input", perf_counter())], usable, turns, [], warnings, points)
 
     def _prepare(self, frame: _Frame, turn: FrameChange) -> Any:
         """All of one pass before the slowest network; the first one compares the scan with those of the training."""
@@ -206,7 +209,7 @@ class Detector:
         if self.passes == 1:
             detections, counts = found[0], frame.counts[0]
         else:
-            detections, counts = merge(found, self._turns, self.spec.post.nms_iou), summed(frame.counts)
+            detections, counts = merge(found, frame.turns, self.spec.post.nms_iou), summed(frame.counts)
         if not self._to_model.is_identity:
             detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
         frame.laps.append((self.pipeline.stages[-1], perf_counter()))

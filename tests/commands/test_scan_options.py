@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,9 @@ from typer.testing import CliRunner, Result
 
 from asca_deploy import sample_scan_path
 from asca_pillars.cli import app
-from asca_pillars.commands.options import ScanOptions
-from asca_pillars.commands.scan_input import ScanInput
+from asca_pillars.commands.scan_input import ScanInput, scan_settings
 from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError, ConfigError
 
@@ -65,10 +66,10 @@ def test_a_folder_has_one_reflectance_scale(tmp_path: Path, sample: NDArray[np.f
     for number, brightness in enumerate([255.0, 1.0]):  # the second one is dark
         write_scan(folder / f"{number}.bin", sample[::10] * np.array([1, 1, 1, brightness], np.float32))
     paths = sorted(folder.iterdir())
-    scan_input = ScanInput(ScanOptions(), paths)
+    scan_input = ScanInput(ScanSettings(), paths)
     assert any("0..255" in text for text in scan_input.said)
     assert [scan_input.read(path).notes.reflectance_scale for path in paths] == [255, 255]
-    stated = ScanInput(ScanOptions(reflectance_scale="100"), paths)
+    stated = ScanInput(ScanSettings(reflectance_scale=100.0), paths)
     assert [stated.read(path).notes.reflectance_scale for path in paths] == [100, 100]
     assert not stated.said
 
@@ -77,7 +78,7 @@ def test_the_height_of_several_scans(tmp_path: Path, sample: NDArray[np.float32]
     for number in range(3):
         write_scan(tmp_path / f"{number}.bin", sample)
     (tmp_path / "3.bin").write_bytes(b"damaged")
-    scan_input = ScanInput(ScanOptions(sensor_height="auto"), sorted(tmp_path.iterdir()))
+    scan_input = ScanInput(ScanSettings(sensor_height="auto"), sorted(tmp_path.iterdir()))
     assert scan_input.mounting.sensor_height_m == pytest.approx(1.73, abs=0.05)
     assert any("from 3 scans" in text for text in scan_input.said)
 
@@ -85,16 +86,21 @@ def test_the_height_of_several_scans(tmp_path: Path, sample: NDArray[np.float32]
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (ScanOptions(sensor_height="tall"), "--sensor-height tall: give a number or auto"),
-        (ScanOptions(reflectance_scale="bright"), "--reflectance-scale bright"),
-        (ScanOptions(reflectance_scale="-1"), "reflectance_scale"),
-        (ScanOptions(axes="up"), "axes up: give x-forward"),
-        (ScanOptions(pose=Path("none.txt")), r"none\.txt"),
+        ({"sensor_height": "tall"}, "--sensor-height tall: give a number or auto"),
+        ({"sensor_height": "40"}, "sensor height 40: give metres"),
+        ({"reflectance_scale": "bright"}, "--reflectance-scale bright"),
+        ({"reflectance_scale": "-1"}, "reflectance_scale -1: must be positive"),
+        ({"reflectance_scale": "nan"}, "reflectance_scale nan: must be positive"),
+        ({"columns": 2}, "columns 2"),
+        ({"axes": "up"}, "axes up: give x-forward"),
+        ({"pose": Path("none.txt")}, r"none\.txt"),
+        ({"pose": Path("none.txt"), "axes": "y-forward"}, "give one of them"),
     ],
 )
-def test_wrong_options(options: ScanOptions, message: str) -> None:
+def test_wrong_options(options: dict[str, Any], message: str) -> None:
+    unset = {"sensor_height": None, "axes": "x-forward", "pose": None, "reflectance_scale": "auto", "columns": None}
     with pytest.raises(AscaError, match=message):
-        ScanInput(options, [sample_scan_path()])
+        ScanInput(scan_settings(**(unset | options)), [sample_scan_path()])
 
 
 def test_bench_does_not_mix_passes_and_matrix() -> None:

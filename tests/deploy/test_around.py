@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_deploy.around import merge, ranges_around, turns_around
+from asca_deploy.around import about_ground, merge, ranges_around, turns_around
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
@@ -86,3 +86,27 @@ def test_what_a_pass_sees_far_beside_its_sector_does_not_count() -> None:
     turns = turns_around(KITTI, camera_view=True)
     beside, empty = detections((5, 20, 0, 0.9, 0)), Detections.empty(NAMES)
     assert len(merge([beside, empty, empty, empty], turns, 0.01)) == 0
+
+
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.02, 0.0), (0.01, -0.015)])
+def test_every_pass_sees_the_ground_as_the_first_one_does(slope: tuple[float, float]) -> None:
+    """A pitched sensor: turned about z, a road that rises ahead would sink in the pass that looks behind."""
+    rng = np.random.default_rng(0)
+    ground = rng.uniform(-25, 25, (40_000, 4))
+    ground[:, 2] = ground[:, :2] @ slope - 1.73 + rng.normal(0, 0.02, len(ground))
+    scan = ground.astype(np.float32)
+    turns = about_ground(turns_around(KITTI, camera_view=True), scan)
+    assert turns[0].is_identity
+    for turn in turns:
+        turned = turn.points(scan)
+        assert np.abs(turned[:, :2] @ slope - 1.73 - turned[:, 2]).mean() < 0.03
+        box = np.array([[20, -3, -1, 4, 2, 1.5, 0.4]])
+        np.testing.assert_allclose(turn.inverse.boxes(turn.boxes(box)), box, atol=2e-3)
+
+
+def test_without_a_ground_the_passes_turn_about_z() -> None:
+    turns = turns_around(KITTI, camera_view=True)
+    cloud = np.random.default_rng(0).uniform(-20, 20, (20_000, 4)).astype(np.float32)
+    for points in (cloud, cloud[:0]):
+        for turn, plain in zip(about_ground(turns, points), turns, strict=True):
+            np.testing.assert_array_equal(turn.axes, plain.axes)

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from asca_pillars.config import Config, DataConfig, TrainConfig
+from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume, remove_leftovers, save_weights
-from asca_pillars.training.dataset import LabeledDataset
 from asca_pillars.training.run_folder import claim, measure_input
 from tests.training.test_loop import CONFIG
 
@@ -127,4 +127,4 @@ def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> N
 def test_a_damaged_measurement_of_the_input_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "expected_input.yaml").write_text("points_per_scan: [")
     with pytest.raises(ConfigError, match=r"expected_input\.yaml: not valid YAML: "):
-        measure_input(tmp_path, cast("LabeledDataset", None))  # which is not asked where something was kept
+        measure_input(tmp_path, cast("TrainingFrames", None))  # which is not asked where something was kept

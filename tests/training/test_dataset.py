@@ -138,7 +138,7 @@ def test_lists_and_modes(tmp_path: Path) -> None:
 
 def test_validation_samples_are_not_augmented(tmp_path: Path) -> None:
     frames = open_dataset(write_dataset(tmp_path, 3, val_frames=2), CONFIG, training=False)
-    plain = read(frames.split, CONFIG, "000002")
+    plain = read(frames.frames.split, CONFIG, "000002")
     for epoch in (0, 5):
         sample = frames.sample(epoch, 1)
         assert np.array_equal(sample.frame.points, plain.points) and np.array_equal(sample.frame.boxes, plain.boxes)

@@ -6,6 +6,9 @@ root/dataset.yaml                 where the rest is; may be empty
      labels/<frame>.json or .csv  of each frame (`box_records`), by `labels:`
      ImageSets/train.txt, val.txt one frame id per line
 
+Labels are in the scans' own frame, as `asca detect` writes boxes. Points and boxes are given in the mounting's level
+frame: x forward, y left, z up.
+
 A frame's id is the path of its scan below `scans`, without the suffix. Frames are those that have labels; with one .csv
 for all, every scan is a frame and one without a row has no objects.
 """
@@ -15,7 +18,7 @@ from collections.abc import Container
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,40 +26,38 @@ from numpy.typing import NDArray
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, records_from
 from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.data.labeled_split import LabeledBoxes
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, find_scans
 from asca_pillars.data.scans.reflectance import ReflectanceScale
 from asca_pillars.data.scans.scan_reader import folder_reflectance_scale, read_scan, stored_points
 from asca_pillars.errors import ConfigError, DatasetError
-from asca_pillars.schema import Strict
+from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.settings import read_settings
 
 DATASET_FILE = "dataset.yaml"
+ALL_AROUND_DEG = 360.0
 
 
 @dataclass(frozen=True)
-class BoxDataset(Strict):
-    """dataset.yaml.
+class BoxDataset(ScanSettings):
+    """dataset.yaml: where scans and labels are, and the settings of the scans, one for all of them.
 
     Attributes:
         scans: folder of the scans, relative to the dataset or absolute.
         labels: a .jsonl or .csv file for all frames, or a folder with a .json or .csv for each; relative or absolute.
-        axes: of the scans: `x-forward` (x forward, y left) or `y-forward` (x right, y forward, as nuScenes' LiDAR).
-            Labels are always x forward, y left.
-        columns: float32 values per point of a .bin; None: four or five, by the values.
-        reflectance_scale: the stored value that is a reflectance of 1; auto: by the values of several scans.
+        labeled_view_deg: labels stand only within this angle, half of it to each side of straight ahead, as where a
+            camera looks: nothing is learnt from what lies outside. 360: everywhere.
     """
 
     scans: str = "scans"
     labels: str = "labels.jsonl"
-    axes: Literal["x-forward", "y-forward"] = "x-forward"
-    columns: int | None = None
-    reflectance_scale: float | Literal["auto"] = "auto"
+    labeled_view_deg: float = ALL_AROUND_DEG
 
     def __post_init__(self) -> None:
-        if self.columns is not None and self.columns < 4:
-            raise ConfigError(f"columns {self.columns}: a .bin has at least x, y, z and reflectance; give 4 or more")
-        if self.reflectance_scale != "auto" and self.reflectance_scale <= 0:
-            raise ConfigError(f"reflectance_scale {self.reflectance_scale:g}: must be positive, such as 255, or auto")
+        super().__post_init__()
+        if not 0 < self.labeled_view_deg <= ALL_AROUND_DEG:
+            raise ConfigError(f"labeled_view_deg {self.labeled_view_deg:g}: give degrees, 360 for labels everywhere")
 
 
 class BoxFrame(NamedTuple):
@@ -79,13 +80,28 @@ class BoxSplit:
     root: str | Path
     name: str = "training"
 
-    has_camera = False
     pool = "scans"
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether labels stand only within an angle ahead."""
+        return self.settings.labeled_view_deg < ALL_AROUND_DEG
 
     @cached_property
     def settings(self) -> BoxDataset:
         """The dataset's dataset.yaml; ConfigError if it cannot be used."""
         return read_settings(BoxDataset, Path(self.root) / DATASET_FILE, (), {})
+
+    @cached_property
+    def mounting(self) -> Mounting:
+        """Of the sensor; a height of "auto" is estimated when it is asked for.
+
+        Raises:
+            ConfigError: the pose cannot be read.
+            ScanError: the height cannot be estimated.
+        """
+        paths = [frame.scan for _, frame in sorted(self._frames.items())]
+        return self.settings.mounting(paths, self._read, Path(self.root))[0]
 
     @property
     def scans_folder(self) -> Path:
@@ -127,17 +143,18 @@ class BoxSplit:
         self.frame_ids  # noqa: B018
 
     def points(self, frame_id: str, *, camera_view: bool = False) -> NDArray[np.float32]:
-        """(N, 4) of the scan, turned to x forward; there is no camera whose view could be asked for."""
-        scale = self._reflectance_scale
-        points = read_scan(self.scan_path(frame_id), columns=self.settings.columns, reflectance_scale=scale).points
-        return self._turned(points)
+        """(N, 4) of the scan in the level frame; with `camera_view` those within the labelled angle."""
+        points = self._levelled(self._read(self.scan_path(frame_id)))
+        if camera_view and self.has_camera:
+            points = points[_within(points, self.settings.labeled_view_deg)]
+        return points
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
-        """(N, 4) all of the file, turned; reflectance divided by the dataset's scale."""
+        """(N, 4) all of the file in the level frame; reflectance divided by the dataset's scale."""
         points = stored_points(self.scan_path(frame_id), columns=self.settings.columns)
         if self._reflectance_scale != "auto":
             points[:, 3] /= self._reflectance_scale
-        return self._turned(points)
+        return self._levelled(points)
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:
         """Size and time of the scan, and dataset.yaml."""
@@ -149,13 +166,16 @@ class BoxSplit:
         return list(self.records(frame_id).types)
 
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
-        """The frame's boxes, all or those of `types`."""
+        """The frame's boxes in the level frame, all or those of `types`."""
         records = self.records(frame_id)
         kept = [row for row, kind in enumerate(records.types) if types is None or kind in types]
-        return LabeledBoxes(records.boxes[kept], tuple(records.types[row] for row in kept))
+        boxes = records.boxes[kept]
+        if not self._level.is_identity:
+            boxes = self._level.boxes(boxes)
+        return LabeledBoxes(boxes, tuple(records.types[row] for row in kept))
 
     def records(self, frame_id: str) -> BoxRecords:
-        """The frame's boxes as they are labelled; DatasetError if its file is damaged."""
+        """The frame's boxes as they are labelled, in the scan's own frame; DatasetError if its file is damaged."""
         return self._frames[frame_id].records
 
     @cached_property
@@ -165,17 +185,25 @@ class BoxSplit:
         paths = [frame.scan for _, frame in sorted(self._frames.items())]
         return folder_reflectance_scale(paths, columns=self.settings.columns).scale
 
-    def _turned(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        if self.settings.axes == "x-forward":
-            return points
-        right, forward = points[:, 0].copy(), points[:, 1].copy()
-        points[:, 0], points[:, 1] = forward, -right
-        return points
+    @cached_property
+    def _level(self) -> FrameChange:
+        """From the scans' own frame; needs no height."""
+        return self.settings.stated_mounting(Path(self.root)).level
+
+    def _read(self, path: Path) -> NDArray[np.float32]:
+        return read_scan(path, columns=self.settings.columns, reflectance_scale=self._reflectance_scale).points
+
+    def _levelled(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        return points if self._level.is_identity else self._level.points(points)
 
     @cached_property
     def _frames(self) -> dict[str, BoxFrame]:
         """Every labelled frame of the dataset, by its id."""
         return find_frames(self.labels_path, self.scans_folder)
+
+
+def _within(points: NDArray[np.float32], view_deg: float) -> NDArray[np.bool_]:
+    return np.abs(np.arctan2(points[:, 1], points[:, 0])) <= np.radians(view_deg / 2)
 
 
 def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:

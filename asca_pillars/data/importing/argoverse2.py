@@ -14,6 +14,8 @@ from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.scans.feather import feather_table
 from asca_pillars.errors import DatasetError
 
+AXLE_HEIGHT_M = 0.33
+"""Of the vehicle's frame above the ground: a wheel's radius. The sweeps themselves show 0.35."""
 _CENTER = ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 _TURN = ("qw", "qx", "qy", "qz")
@@ -30,7 +32,8 @@ def read_argoverse2(root: Path) -> Imported:
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
     frames = [frame for log in logs for frame in _frames(log)]
-    return Imported(BoxDataset(scans=str(root.resolve()), reflectance_scale=255.0), frames)
+    settings = BoxDataset(sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root.resolve()))
+    return Imported(settings, frames)
 
 
 def _frames(log: Path) -> list[ImportedFrame]:

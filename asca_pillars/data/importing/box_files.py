@@ -4,19 +4,29 @@ from pathlib import Path
 
 from asca_pillars.data.boxes.box_split import BoxDataset, find_frames
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
+from asca_pillars.data.scan_settings import ScanSettings
+from asca_pillars.schema import parse, to_dict
 
 
-def read_box_files(labels: Path, scans: Path) -> Imported:
+def read_box_files(labels: Path, scans: Path, settings: ScanSettings) -> Imported:
     """Every frame of a .jsonl or .csv file, or of a folder with a .json or .csv for each scan.
 
     A recording is a folder of scans.
 
+    Args:
+        labels: the file or folder.
+        scans: folder of the scans.
+        settings: of the scans; labels are in the scans' own frame.
+
     Raises:
+        ConfigError: the pose cannot be read.
         DatasetError: as `find_frames`.
     """
+    settings.stated_mounting()
     scans = scans.resolve()
     frames = [
         ImportedFrame(frame.scan, frame.records, frame.scan.parent.relative_to(scans).as_posix())
         for frame in find_frames(labels, scans).values()
     ]
-    return Imported(BoxDataset(scans=str(scans)), frames)
+    stated = to_dict(settings) | {"pose": None if settings.pose is None else str(Path(settings.pose).resolve())}
+    return Imported(parse(BoxDataset, stated | {"scans": str(scans)}, "import"), frames)

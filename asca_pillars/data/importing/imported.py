@@ -18,6 +18,8 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict
 
+COMMAND = "asca import"
+
 
 class ImportedFrame(NamedTuple):
     """A scan, its boxes in the LiDAR frame (x forward), and the recording that it is of."""
@@ -57,14 +59,15 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
     frames = sorted(imported.frames, key=lambda frame: (frame.recording, frame.scan))
     if not frames:
         raise DatasetError(f"{scans}: no labelled scan there; give the folder that holds the recordings")
-    require_own(out, "asca import", DATASET_FILE)
+    require_own(out, COMMAND, DATASET_FILE)
     with atomic_path(out / "labels.jsonl") as temporary, temporary.open("w", encoding="utf-8") as file:
         for frame in frames:
             file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records))
     train, val = _lists(frames, val_share)
     for name, own in (("train", train), ("val", val)):
         write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
-    content = {key: value for key, value in to_dict(imported.settings).items() if key != "labels" and value is not None}
+    usual = to_dict(BoxDataset())
+    content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
     with atomic_path(out / DATASET_FILE) as temporary:
         temporary.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     boxes = Counter(kind for frame in frames for kind in frame.records.types)

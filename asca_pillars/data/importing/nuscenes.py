@@ -1,7 +1,8 @@
 """nuScenes: the tables of v1.0-*/ and the key frames of samples/LIDAR_TOP/.
 
 A box is given in the world and goes through the vehicle's pose at the scan's time into the sensor's frame, which is x
-right, y forward, z up; labels are then turned to x forward, y left, and `axes: y-forward` has the scans turned, too.
+right, y forward, z up (`axes: y-forward`). The sensor's height is that above the vehicle's frame, whose origin lies on
+the ground.
 Tables by their published schema, https://www.nuscenes.org/nuscenes#data-format: a rotation is a quaternion w, x, y, z,
 a size width, length, height. Categories of the detection task get its class names, others keep their own.
 """
@@ -52,10 +53,20 @@ def read_nuscenes(root: Path) -> Imported:
     tables = _tables_folder(root)
     data = tables.parent.resolve()
     try:
+        height_m = _sensor_height_m(tables)
         frames = _frames(tables, data)
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{tables}: the tables do not fit together (at {error}); download them again") from None
-    return Imported(BoxDataset(scans=str(data), axes="y-forward", columns=5, reflectance_scale=255.0), frames)
+    settings = BoxDataset(sensor_height=height_m, axes="y-forward", reflectance_scale=255.0, columns=5, scans=str(data))
+    return Imported(settings, frames)
+
+
+def _sensor_height_m(tables: Path) -> float | None:
+    """The median over the vehicles' calibrations; None without any."""
+    channels = {token: row["channel"] for token, row in _table(tables, "sensor").items()}
+    sensors = _table(tables, "calibrated_sensor").values()
+    heights = [row["translation"][2] for row in sensors if channels[row["sensor_token"]] == CHANNEL]
+    return round(float(np.median(heights)), 3) if heights else None
 
 
 def _frames(tables: Path, data: Path) -> list[ImportedFrame]:
@@ -88,8 +99,7 @@ def _records(
             back = rotation(frame["rotation"]).T
             center, turn = back @ (center - frame["translation"]), back @ turn
         width, length, height = label["size"]
-        (right, forward, up), heading = center, turn[:, 0]
-        boxes.append([forward, -right, up, length, width, height, np.arctan2(-heading[0], heading[1])])
+        boxes.append([*center, length, width, height, np.arctan2(turn[1, 0], turn[0, 0])])
         kind = kinds[label["instance_token"]]
         types.append(DETECTION_CLASSES.get(kind, kind))
         tracks.append(label["instance_token"])

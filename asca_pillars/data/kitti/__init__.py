@@ -14,6 +14,7 @@ from asca_pillars.data.kitti.kitti_labels import (
     labels_text,
     objects_3d,
     objects_from_boxes,
+    parse_object,
     read_labels,
     write_labels,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "labels_text",
     "objects_3d",
     "objects_from_boxes",
+    "parse_object",
     "read_calibration",
     "read_labels",
     "write_calibration",

@@ -69,7 +69,7 @@ def read_labels(path: str | Path) -> list[KittiObject]:
             f"{path}: cannot read the labels ({error.strerror}); a frame without objects needs an empty file"
         ) from error
     lines = enumerate(text.splitlines(), start=1)
-    return [_parse_object(line.split(), f"{path}:{number}") for number, line in lines if line.strip()]
+    return [parse_object(line.split(), f"{path}:{number}") for number, line in lines if line.strip()]
 
 
 def write_labels(path: str | Path, objects: Iterable[KittiObject]) -> None:
@@ -150,7 +150,12 @@ def _headings_lidar_from_rect(calib: Calibration) -> NDArray[np.float64]:
     return calib.lidar_from_rect_matrix[np.ix_([0, 1], [0, 2])]
 
 
-def _parse_object(words: list[str], place: str) -> KittiObject:
+def parse_object(words: Sequence[str], place: str) -> KittiObject:
+    """The object of a line's words, 15 or 16; `place` is named in errors.
+
+    Raises:
+        DatasetError: it is not one of KITTI's.
+    """
     if len(words) not in (15, 16):
         raise DatasetError(
             f"{place}: {len(words)} fields; a KITTI object label has 15 and a detection 16; convert the file"

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, in_image, read_calibration
 from asca_pillars.data.kitti.kitti_labels import KittiObject, boxes_from_objects, objects_3d, read_labels
 from asca_pillars.data.labeled_split import LabeledBoxes
+from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan, stored_points
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
@@ -38,6 +39,7 @@ class KittiSplit:
     name: str = "training"
 
     has_camera = True
+    mounting = Mounting()
 
     @property
     def pool(self) -> str:

@@ -39,26 +39,30 @@ def write_box_predictions(
     split: LabeledSplit,
     detect: Callable[[NDArray[np.float32]], Detections],
     *,
+    camera_view: bool,
     console: Console | None = None,
 ) -> None:
-    """Run a detector over a split and write a line for each frame (`data.boxes.box_records`).
+    """Run a detector over a split and write a line for each frame (`data.boxes.box_records`), in the scan's own frame.
 
-    The detector gets points (N, 4), only those in the camera's view where labels stand nowhere else.
+    The detector gets points (N, 4), only those in the camera's view if `camera_view`.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
     """
+    level = split.mounting.level
     with path.open("w", encoding="utf-8") as file:
         for frame_id in track(split.frame_ids, "Detecting", console=console, disable=console is None):
-            found = detect(split.points(frame_id, camera_view=split.has_camera))
-            records = records_from(found.boxes, found.names, found.scores)
+            found = detect(split.points(frame_id, camera_view=camera_view))
+            boxes = found.boxes if level.is_identity else level.inverse.boxes(found.boxes)
+            records = records_from(boxes, found.names, found.scores)
             file.write(json_line(f"{frame_id}{split.scan_path(frame_id).suffix}", records))
 
 
 def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | None = None) -> BoxFrames:
     """Pair the labels of a split with the predictions of a *.jsonl or *.csv file.
 
-    A line belongs to the frame whose id is the longest end of its scan's path; lines of other frames are left out.
+    Boxes are in the scan's own frame, as labels are. A line belongs to the frame whose id is the longest end of its
+    scan's path; lines of other frames are left out.
 
     Args:
         path: the file, or a folder that `asca detect` wrote.
@@ -70,13 +74,15 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
     """
     path = path / "detections.jsonl" if path.is_dir() else path
     predictions, known = _by_frame(path, set(split.frame_ids))
+    level = split.mounting.level
     frames = []
     for frame_id in track(known, "Points in boxes", console=console, disable=console is None):
         objects, types = split.labeled_boxes(frame_id)
         points = split.points(frame_id, camera_view=False)
         visible = np.asarray(points_in_boxes(points, objects).any(axis=0))
         records = predictions[frame_id]
-        frames.append(EvaluatedFrame(frame_id, objects, types, visible, records.boxes, records.types, records.scores))
+        found = records.boxes if level.is_identity else level.boxes(records.boxes)
+        frames.append(EvaluatedFrame(frame_id, objects, types, visible, found, records.types, records.scores))
     missing = tuple(frame_id for frame_id in split.frame_ids if frame_id not in predictions)
     return BoxFrames(tuple(frames), missing)
 

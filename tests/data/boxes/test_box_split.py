@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from asca_pillars.config import Config, DataConfig, InsertConfig
+from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError, DatasetError
@@ -86,10 +88,29 @@ def test_points_are_turned_and_scaled_as_the_dataset_says(root: Path) -> None:
     plain = read_scan(root / "scans" / "000000.bin").points
     columns = np.column_stack([-plain[:, 1], plain[:, 0], plain[:, 2], plain[:, 3] * 100, np.zeros(len(plain))])
     columns.astype("<f4").tofile(root / "scans" / "000000.bin")
+    boxes = BoxSplit(root).labeled_boxes("000000").boxes
+    level = Mounting(axes="y-forward").level
+    line = json_line("000000.bin", records_from(level.inverse.boxes(boxes), ["Car", "Forklift"]))
+    (root / "labels.jsonl").write_text(line + "".join((root / "labels.jsonl").read_text().splitlines(True)[1:]))
     (root / "dataset.yaml").write_text("{axes: y-forward, columns: 5, reflectance_scale: 100}\n")
     split = BoxSplit(root)
     np.testing.assert_allclose(split.points("000000"), plain, atol=1e-6)
     np.testing.assert_allclose(split.stored_points("000000"), plain, atol=1e-6)
+    np.testing.assert_allclose(split.labeled_boxes("000000").boxes, boxes, atol=1e-3)
+
+
+def test_the_mounting_has_the_words_of_the_options(root: Path) -> None:
+    pose = np.array([[0, 1, 0, 0.5], [-1, 0, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1.0]])
+    plain = BoxSplit(root).points("000000")
+    (root / "pose.txt").write_text("\n".join(" ".join(map(str, row)) for row in pose))
+    (root / "dataset.yaml").write_text("{pose: pose.txt, sensor_height: auto}\n")
+    split = BoxSplit(root)
+    expected = plain[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(split.points("000000")[:, :3], expected, atol=1e-5)
+    assert split.mounting.sensor_height_m == pytest.approx(0, abs=0.1)  # the scenes' sensor sits at 1.73 m
+    (root / "dataset.yaml").write_text("sensor_height: 1.5\n")
+    stated = BoxSplit(root)
+    assert stated.mounting == Mounting(1.5) and np.array_equal(stated.points("000000"), plain)
 
 
 @pytest.mark.parametrize(
@@ -112,9 +133,11 @@ def test_wrong_labels_are_named(root: Path, text: str, message: str) -> None:
     ("text", "message"),
     [
         ("scan: x", "scans"),
-        ("columns: 3", "columns 3"),
+        ("columns: 2", "columns 2"),
         ("reflectance_scale: 0", "must be positive"),
-        ("axes: up", "axes"),
+        ("axes: up", "axes up: give x-forward"),
+        ("sensor_height: 40", "sensor height 40"),
+        ("{axes: y-forward, pose: p.txt}", "give one of them"),
     ],
 )
 def test_wrong_settings_are_named(root: Path, text: str, message: str) -> None:

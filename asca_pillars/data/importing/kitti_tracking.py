@@ -1,0 +1,71 @@
+"""KITTI's tracking benchmark: velodyne/<sequence>/<frame>.bin, label_02/<sequence>.txt, calib/<sequence>.txt.
+
+A line of a label file is one of the detection benchmark's with the frame and the track's number before it, in the
+rectified camera's frame; labels stand only where the camera looks. Format: the benchmark's development kit,
+https://www.cvlibs.net/datasets/kitti/eval_tracking.php
+"""
+
+from collections import defaultdict
+from pathlib import Path
+
+from asca_pillars.data.boxes.box_records import BoxRecords, records_from
+from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.imported import Imported, ImportedFrame
+from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects, parse_object, read_calibration
+from asca_pillars.errors import DatasetError
+
+LABELED_VIEW_DEG = 81.0
+"""Of KITTI's left color camera: 1242 pixels at a focal length of 721."""
+_Tracked = tuple[KittiObject, str]
+
+
+def read_kitti_tracking(root: Path) -> Imported:
+    """Every scan of every sequence that has labels.
+
+    Args:
+        root: the folder that holds training/, or training/ itself.
+
+    Raises:
+        DatasetError: no sequence, or a file that is not of this format.
+    """
+    folder = root / "training" if (root / "training").is_dir() else root
+    labels = sorted((folder / "label_02").glob("*.txt"))
+    if not labels:
+        raise DatasetError(f"{folder}: no label_02/*.txt there; give the folder of KITTI's tracking benchmark")
+    frames = [frame for path in labels for frame in _frames(folder.resolve(), path)]
+    return Imported(BoxDataset(scans=str(folder.resolve() / "velodyne"), labeled_view_deg=LABELED_VIEW_DEG), frames)
+
+
+def _frames(folder: Path, labels: Path) -> list[ImportedFrame]:
+    sequence = labels.stem
+    calibration = read_calibration(folder / "calib" / f"{sequence}.txt")
+    tracked = _read_tracked(labels)
+    frames = []
+    for scan in sorted((folder / "velodyne" / sequence).glob("*.bin")):
+        number = int(scan.stem) if scan.stem.isdecimal() else -1
+        own = [(item, track) for item, track in tracked.get(number, []) if item.has_box_3d]
+        frames.append(ImportedFrame(scan, _records(own, calibration), sequence))
+    return frames
+
+
+def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
+    objects = [item for item, _ in own]
+    boxes = boxes_from_objects(objects, calibration)
+    return records_from(boxes, [item.type for item in objects], None, [track for _, track in own])
+
+
+def _read_tracked(path: Path) -> dict[int, list[_Tracked]]:
+    """The objects of each frame with their track's number."""
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None
+    tracked = defaultdict(list)
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) < 2 or not words[0].isdecimal():
+            raise DatasetError(f"{path}:{number}: does not begin with a frame's number; give KITTI's tracking labels")
+        tracked[int(words[0])].append((parse_object(words[2:], f"{path}:{number}"), words[1]))
+    return dict(tracked)

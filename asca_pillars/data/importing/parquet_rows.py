@@ -1,0 +1,39 @@
+"""Rows of Apache Parquet files, some columns at a time; lists come as arrays."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from asca_pillars.errors import AscaError, DatasetError
+
+_BATCH = 8  # rows that are in memory at once: a range image has millions of numbers
+
+
+def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """The rows of a file by column: numbers and texts as they are, lists as NumPy arrays, None where there is nothing.
+
+    Raises:
+        DatasetError: no parquet file, or one without these columns.
+        AscaError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ModuleNotFoundError:
+        raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
+    try:
+        with parquet.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            if missing := [name for name in columns if name not in names]:
+                raise DatasetError(f"{path}: no column `{missing[0]}`; give a file of Waymo's parquet form")
+            for batch in file.iter_batches(_BATCH, columns=list(columns)):
+                for row in range(batch.num_rows):
+                    yield {name: _plain(batch.column(name)[row]) for name in columns}
+    except (pyarrow.ArrowException, OSError) as reason:
+        text = " ".join(str(reason).split())[:100]
+        raise DatasetError(f"{path}: no readable parquet file ({text}); copy it again") from None
+
+
+def _plain(value: Any) -> Any:
+    items = getattr(value, "values", None)  # of a list; None of a list that is null
+    return value.as_py() if items is None else items.to_numpy(zero_copy_only=False)

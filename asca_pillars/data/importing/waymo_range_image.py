@@ -1,0 +1,74 @@
+"""Waymo's range images as points in the vehicle's frame, by the formulas of its published tools (v2, `lidar_utils`).
+
+A row is a laser, from the highest down; a column is an azimuth, the first one behind the sensor, turning clockwise. A
+pixel holds range (m), intensity, elongation and whether it lies in a no-label zone; a range of 0 is no return.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Doubles = NDArray[np.float64]
+
+
+class LidarCalibration(NamedTuple):
+    """Of one sensor."""
+
+    vehicle_from_lidar: Doubles
+    """(4, 4)."""
+    inclinations_rad: Doubles | None
+    """(H,) of the lasers from the lowest up; None: evenly spaced."""
+    lowest_rad: float
+    highest_rad: float
+
+
+def range_image_points(
+    image: NDArray[np.float32],
+    calibration: LidarCalibration,
+    pixel_poses: NDArray[np.float32] | None = None,
+    world_from_vehicle: Doubles | None = None,
+) -> NDArray[np.float32]:
+    """Points (N, 4) x, y, z in metres, vehicle's frame of the label time, and intensity squeezed into 0..1 by tanh.
+
+    Args:
+        image: (H, W, 4).
+        calibration: of the sensor.
+        pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of the vehicle in the world when a pixel was measured; None:
+            it stood still.
+        world_from_vehicle: (4, 4) at the label time; with `pixel_poses`.
+    """
+    rows, columns = np.nonzero(image[..., 0] > 0)
+    height, width = image.shape[:2]
+    extrinsic = calibration.vehicle_from_lidar
+    upwards = calibration.inclinations_rad
+    if upwards is None:
+        span = calibration.highest_rad - calibration.lowest_rad
+        upwards = (np.arange(height) + 0.5) / height * span + calibration.lowest_rad
+    inclination = upwards[::-1][rows]
+    turned = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
+    azimuth = (2 * (width - columns - 0.5) / width - 1) * np.pi - turned
+    distance = image[rows, columns, 0].astype(np.float64)
+    flat = np.cos(inclination) * distance
+    points = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(inclination) * distance], axis=1)
+    points = points @ extrinsic[:3, :3].T + extrinsic[:3, 3]
+    if pixel_poses is not None and world_from_vehicle is not None:
+        poses = pixel_poses[rows, columns].astype(np.float64)
+        world = np.einsum("nij,nj->ni", _rotations(*poses[:, :3].T), points) + poses[:, 3:]
+        points = (world - world_from_vehicle[:3, 3]) @ world_from_vehicle[:3, :3]
+    reflectance = np.tanh(np.maximum(image[rows, columns, 1], 0))
+    return np.column_stack([points, reflectance]).astype(np.float32)
+
+
+def _rotations(roll: Doubles, pitch: Doubles, yaw: Doubles) -> Doubles:
+    """(N, 3, 3) about x by roll, then about y by pitch, then about z by yaw; radians (N,)."""
+    (sr, sp, sy), (cr, cp, cy) = (
+        (np.sin(roll), np.sin(pitch), np.sin(yaw)),
+        (np.cos(roll), np.cos(pitch), np.cos(yaw)),
+    )
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

@@ -1,0 +1,94 @@
+"""How scan files are read and where their sensor sat: the options of commands and the keys of a dataset.yaml, alike."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.ground_height import HeightEstimate, measured_mounting
+from asca_pillars.data.mounting import Mounting, read_pose
+from asca_pillars.data.scans.reflectance import ReflectanceScale
+from asca_pillars.errors import ConfigError, ScanError
+from asca_pillars.schema import Strict
+
+FEWEST_COLUMNS = 3
+_HEIGHT_SCANS = 8  # that a height of "auto" looks at
+
+
+@dataclass(frozen=True)
+class ScanSettings(Strict):
+    """What a scan file does not say of itself.
+
+    Attributes:
+        sensor_height: metres above the ground of the scans' origin, after `axes` or `pose`; "auto": estimated from the
+            scans. None: as high as in the training.
+        axes: as `Mounting.axes`.
+        pose: file with a 4x4 matrix, instead of axes (`mounting.read_pose`).
+        reflectance_scale: the stored value that is a reflectance of 1; "auto": by the values.
+        columns: float32 values per point of a .bin; None: four or five, by the values.
+
+    Raises:
+        ConfigError: a value that cannot be used.
+    """
+
+    sensor_height: float | Literal["auto"] | None = None
+    axes: str = "x-forward"
+    pose: str | None = None
+    reflectance_scale: ReflectanceScale = "auto"
+    columns: int | None = None
+
+    def __post_init__(self) -> None:
+        Mounting(self._stated_height_m, self.axes)  # refuses what it cannot use
+        if self.pose is not None and self.axes != "x-forward":
+            raise ConfigError(f"axes {self.axes} and a pose: the pose turns the axes already; give one of them")
+        if self.columns is not None and self.columns < FEWEST_COLUMNS:
+            raise ConfigError(f"columns {self.columns}: a .bin has at least x, y and z; give {FEWEST_COLUMNS} or more")
+        if self.reflectance_scale != "auto" and not 0 < self.reflectance_scale < inf:
+            raise ConfigError(f"reflectance_scale {self.reflectance_scale:g}: must be positive, such as 255, or auto")
+
+    def stated_mounting(self, folder: Path | None = None) -> Mounting:
+        """The mounting as far as it is stated: an "auto" height is left open.
+
+        Args:
+            folder: that a relative `pose` is looked for in; None: the working directory.
+
+        Raises:
+            ConfigError: the pose cannot be read, or does not go with the axes.
+        """
+        pose = None if self.pose is None else read_pose((folder or Path()) / self.pose)
+        return Mounting(self._stated_height_m, self.axes, pose)
+
+    def mounting(
+        self, paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]], folder: Path | None = None
+    ) -> tuple[Mounting, HeightEstimate | None]:
+        """The mounting, and how a height of "auto" was estimated; None if it was stated.
+
+        Args:
+            paths: of the scans; up to eight of them, evenly spaced, are read where the height is "auto".
+            read: gives the points (N, >=3) of one of them; those that raise a ScanError are left out.
+            folder: as for `stated_mounting`.
+
+        Raises:
+            ConfigError: as `stated_mounting`.
+            ScanError: the height cannot be estimated.
+        """
+        stated = self.stated_mounting(folder)
+        if self.sensor_height != "auto":
+            return stated, None
+        return measured_mounting(_readable(paths[:: -(-len(paths) // _HEIGHT_SCANS)], read), stated)
+
+    @property
+    def _stated_height_m(self) -> float | None:
+        return None if self.sensor_height == "auto" else self.sensor_height
+
+
+def _readable(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
+    for path in paths:
+        try:
+            yield read(path)
+        except ScanError:
+            continue  # named when its turn comes

@@ -1,0 +1,55 @@
+"""Training frames as pictures: what a network is shown, with the boxes that it is to find."""
+
+from pathlib import Path
+
+import numpy as np
+
+from asca_pillars.data.frames import LabeledFrame, Motion, within_ranges
+from asca_pillars.data.training_frames import TrainingFrames
+from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.pictures.drawing import Image
+from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_layers, write_png
+
+_IGNORED_COLOR = (150, 150, 150)
+
+
+def draw_training_frames(folder: Path, frames: TrainingFrames, count: int) -> list[str]:
+    """Write NAME.png of up to `count` frames, evenly spaced, as the first epoch has them; a sentence about each.
+
+    Raises:
+        DatasetError, ScanError: a frame cannot be read.
+    """
+    total = len(frames.frame_ids)
+    said = []
+    for position in range(min(count, total)):
+        number = position * total // min(count, total)
+        frame, _ = frames.draw(0, number)
+        frame = within_ranges(frame, frames.spec.ranges)
+        path = folder / f"{position:02d}_{frame.frame_id.replace('/', '_')}.png"
+        write_png(path, draw_training_frame(frame, frames))
+        said.append(f"{path}: {len(frame.boxes)} boxes{_moved(frame.motion)}")
+    return said
+
+
+def draw_training_frame(frame: LabeledFrame, frames: TrainingFrames) -> Image:
+    """One frame from above, (H, W, 3) BGR: boxes in their class's color, those that are ignored gray."""
+    layers = [
+        BoxLayer(name, frame.boxes[frame.labels == label], class_color(name))
+        for label, name in enumerate(frames.spec.class_names)
+    ]
+    ignored = frame.boxes[frame.labels == IGNORED]
+    if len(ignored):
+        layers.append(BoxLayer("ignored", ignored, _IGNORED_COLOR, thickness_px=2))
+    return draw_layers(frame.points, layers, frames.spec.ranges)
+
+
+def _moved(motion: Motion) -> str:
+    """How augmentation moved the frame as a whole, in words."""
+    changes = ["mirrored"] if motion.flipped else []
+    if motion.rotation_rad:
+        changes.append(f"turned by {np.degrees(motion.rotation_rad):.0f} degrees")
+    if motion.scale != 1:
+        changes.append(f"scaled by {motion.scale:.2f}")
+    if motion.shift_z_m:
+        changes.append(f"raised by {motion.shift_z_m:.2f} m")
+    return f"; {', '.join(changes)}" if changes else ""

@@ -1,0 +1,127 @@
+"""Imports of KITTI's tracking benchmark and raw recordings, small ones in their published formats, made here."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from asca_pillars.cli import app
+from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.frames import read_frame
+from asca_pillars.data.importing.kitti_raw import read_kitti_raw
+from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
+from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.boxes import points_in_boxes
+
+# The LiDAR's axes in the camera's: x right is -y, y down is -z, z ahead is x.
+CALIBRATION = """P2: 700 0 600 0 0 700 180 0 0 0 1 0
+R_rect 1 0 0 0 1 0 0 0 1
+Tr_velo_cam 0 -1 0 0 0 0 -1 0 1 0 0 0
+"""
+TRACKLETS = """<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
+<!DOCTYPE boost_serialization>
+<boost_serialization signature="serialization::archive" version="9">
+<tracklets class_id="0" tracking_level="0" version="0">
+<count>1</count><item_version>1</item_version>
+<item class_id="1" tracking_level="0" version="1">
+<objectType>Van</objectType><h>2</h><w>1.8</w><l>4.5</l><first_frame>1</first_frame>
+<poses class_id="2" tracking_level="0" version="0"><count>2</count><item_version>2</item_version>
+<item class_id="3" tracking_level="0" version="2">
+<tx>12</tx><ty>3</ty><tz>-1.7</tz><rx>0</rx><ry>0</ry><rz>0.4</rz></item>
+<item><tx>13</tx><ty>3</ty><tz>-1.7</tz><rx>0</rx><ry>0</ry><rz>0.4</rz></item>
+</poses><finished>1</finished></item></tracklets></boost_serialization>
+"""
+
+
+def write_scan(path: Path) -> None:
+    """Points in a box at 12 m and as many right behind the sensor."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    near = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
+    points = np.concatenate([near + np.array([12, 3, -0.7]), near + np.array([-12, 0, -0.7])])
+    np.column_stack([points, np.full(80, 0.3)]).astype("<f4").tofile(path)
+
+
+def write_tracking(root: Path) -> Path:
+    training = root / "training"
+    for sequence in ("0000", "0001"):
+        for number in range(2):
+            write_scan(training / "velodyne" / sequence / f"{number:06d}.bin")
+        # KITTI gives the middle of the bottom in the camera's frame: x -3, y 1.7, z 12, facing the camera's x.
+        lines = [
+            "1 7 Van 0 0 0.1 500 100 600 200 2 1.8 4.5 -3 1.7 12 -1.5707963",
+            "1 -1 DontCare -1 -1 -10 1 1 9 9 -1 -1 -1 -1000 -1000 -1000 -10",
+        ]
+        for folder, text in (("label_02", "\n".join(lines)), ("calib", CALIBRATION)):
+            (training / folder).mkdir(exist_ok=True)
+            (training / folder / f"{sequence}.txt").write_text(text)
+    return root
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["import", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_tracking(tmp_path: Path) -> None:
+    assert "boxes: Van 2" in run(write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking")
+    split = BoxSplit(tmp_path / "out", "train")
+    assert split.frame_ids == ("0000/000000", "0000/000001")
+    assert len(split.labeled_boxes("0000/000000").boxes) == 0
+    boxes, types = split.labeled_boxes("0000/000001")
+    assert types == ("Van",) and split.records("0000/000001").track_ids == ("7",)
+    assert boxes[0].tolist() == pytest.approx([12, 3, -0.7, 4.5, 1.8, 2, 0], abs=1e-4)
+
+
+def test_only_what_is_labelled_is_learnt_from(tmp_path: Path) -> None:
+    """Nothing is labelled behind the car, so that nothing there may be taken for background."""
+    run(write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking")
+    split = BoxSplit(tmp_path / "out", "train")
+    assert split.has_camera
+    assert len(split.points("0000/000001")) == 80
+    assert len(split.points("0000/000001", camera_view=True)) == 40
+    assert len(read_frame(split, "0000/000001", ("Van",)).points) == 40
+
+
+def test_raw(tmp_path: Path) -> None:
+    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    for number in range(3):
+        write_scan(drive / "velodyne_points" / "data" / f"{number:010d}.bin")
+    (drive / "tracklet_labels.xml").write_text(TRACKLETS)
+    imported = read_kitti_raw(tmp_path)
+    assert [len(frame.records.types) for frame in imported.frames] == [0, 1, 1]
+    records = imported.frames[1].records
+    assert records.boxes[0].tolist() == pytest.approx([12, 3, -0.7, 4.5, 1.8, 2, 0.4])
+    assert records.types == ("Van",) and records.track_ids == ("0",)
+    points = np.fromfile(imported.frames[1].scan, "<f4").reshape(-1, 4)
+    assert points_in_boxes(points, records.boxes).sum() == 40
+    run(tmp_path, tmp_path / "out", "--from", "kitti-raw", "--val-share", 0.3)
+    assert BoxSplit(tmp_path / "out", "train").settings.labeled_view_deg == 81
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<h>2</h>", "<h>-2</h>", "tracklet 0 has no type or no size"),
+        ("<tx>12</tx>", "<tx>nan</tx>", "tracklet 0 has a number that is not finite"),
+        ("<l>4.5</l>", "", "could not convert"),
+        ("</tracklets>", "", "mismatched tag"),
+        ("<!DOCTYPE boost_serialization>", "<!DOCTYPE b [<!ENTITY a 'b'>]>", "it declares entities"),
+    ],
+)
+def test_damaged_tracklets_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    (tmp_path / "tracklet_labels.xml").write_text(TRACKLETS.replace(old, new))
+    with pytest.raises(DatasetError, match=f"tracklet_labels.xml: no tracklets of KITTI .*{message}"):
+        read_kitti_raw(tmp_path)
+
+
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"no tracklet_labels\.xml below"):
+        read_kitti_raw(tmp_path)
+    with pytest.raises(DatasetError, match=r"no label_02/\*\.txt there"):
+        read_kitti_tracking(tmp_path)
+    labels = write_tracking(tmp_path) / "training" / "label_02" / "0000.txt"
+    labels.write_text("Car 0 0 0")
+    with pytest.raises(DatasetError, match=r"0000\.txt:1: does not begin with a frame's number"):
+        read_kitti_tracking(tmp_path)

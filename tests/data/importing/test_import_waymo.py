@@ -1,0 +1,148 @@
+"""Import of Waymo's parquet form: a small segment in the published columns, made here from known points."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from asca_pillars.cli import app
+from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.importing.waymo import read_waymo
+from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.boxes import points_in_boxes
+
+TIMES = (1000, 2000)
+HEIGHT, WIDTH = 4, 360
+INCLINATIONS = np.radians([-12.0, -7.0, -4.0, -2.0])  # from the lowest up
+EXTRINSIC_YAW, SENSOR_M = 0.6, np.array([1.4, 0.0, 2.0])
+BOX = (10.0, 4.0, 1.0, 4.6, 1.9, 2.0, 0.3)
+
+
+def extrinsic() -> np.ndarray:
+    cos, sin = np.cos(EXTRINSIC_YAW), np.sin(EXTRINSIC_YAW)
+    matrix = np.eye(4)
+    matrix[:2, :2], matrix[:3, 3] = [[cos, -sin], [sin, cos]], SENSOR_M
+    return matrix
+
+
+def range_image(aim_m: np.ndarray) -> np.ndarray:
+    """(H, W, 4): one return, of the pixel that looks nearest to a point of the vehicle's frame, at its distance."""
+    image = np.zeros((HEIGHT, WIDTH, 4), np.float32)
+    seen = extrinsic()[:3, :3].T @ (aim_m - SENSOR_M)
+    distance = np.linalg.norm(seen)
+    row = HEIGHT - 1 - np.abs(INCLINATIONS - np.arcsin(seen[2] / distance)).argmin()
+    # The first column looks behind the vehicle and the next ones further to the right: azimuth pi falls to -pi.
+    azimuth = np.arctan2(seen[1], seen[0]) + EXTRINSIC_YAW
+    column = int((np.pi - azimuth) / (2 * np.pi) * WIDTH)
+    image[row, column] = distance, 0.5, 0, -1
+    return image
+
+
+def write_segment(root: Path, *, moved_m: float = 0.0) -> Path:
+    """One segment with a vehicle at BOX; with `moved_m` every pixel was measured that much further back."""
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+
+    def write(name: str, columns: Mapping[str, Any]) -> None:
+        (root / name).mkdir(parents=True, exist_ok=True)
+        parquet.write_table(pyarrow.table(columns), root / name / "segment.parquet")
+
+    keys: dict[str, list[Any]] = {"key.frame_timestamp_micros": [], "key.laser_name": []}
+    first = "[LiDARComponent].range_image_return1"
+    images: dict[str, Any] = {f"{first}.values": [], f"{first}.shape": []}
+    for time in TIMES:
+        for laser in (1, 2):
+            keys["key.frame_timestamp_micros"].append(time)
+            keys["key.laser_name"].append(laser)
+            image = range_image(np.array([10.0 + moved_m, 4.0, 1.0]))
+            images[f"{first}.values"].append(image.ravel().tolist() if laser == 1 else None)
+            images[f"{first}.shape"].append(list(image.shape) if laser == 1 else None)
+    for name in ("values", "shape"):
+        kind = pyarrow.list_(pyarrow.float32() if name == "values" else pyarrow.int32())
+        images[f"[LiDARComponent].range_image_return2.{name}"] = pyarrow.array([None] * 4, kind)
+    write("lidar", keys | images)
+    box = ("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading")
+    write(
+        "lidar_box",
+        {"key.frame_timestamp_micros": [1000], "key.laser_object_id": ["a"], "[LiDARBoxComponent].type": [1]}
+        | {f"[LiDARBoxComponent].box.{name}": [value] for name, value in zip(box, BOX, strict=True)},
+    )
+    calibration = "[LiDARCalibrationComponent]"
+    write(
+        "lidar_calibration",
+        {
+            "key.laser_name": [1, 2],
+            f"{calibration}.extrinsic.transform": [extrinsic().ravel().tolist()] * 2,
+            f"{calibration}.beam_inclination.values": [INCLINATIONS.tolist(), None],
+            f"{calibration}.beam_inclination.min": [-0.2, -0.2],
+            f"{calibration}.beam_inclination.max": [0.0, 0.0],
+        },
+    )
+    if moved_m:
+        world = np.eye(4)
+        world[:2, :2], world[:3, 3] = [[0, -1], [1, 0]], [100, 50, 3]  # the car drives along the world's y
+        write(
+            "vehicle_pose",
+            {
+                "key.frame_timestamp_micros": list(TIMES),
+                "[VehiclePoseComponent].world_from_vehicle.transform": [world.ravel().tolist()] * 2,
+            },
+        )
+        pose = np.zeros((HEIGHT, WIDTH, 6), np.float32)
+        pose[..., 2:] = [np.pi / 2, 100, 50 - moved_m, 3]
+        write(
+            "lidar_pose",
+            {
+                "key.frame_timestamp_micros": list(TIMES),
+                "key.laser_name": [1, 1],
+                "[LiDARPoseComponent].range_image_return1.values": [pose.ravel().tolist()] * 2,
+                "[LiDARPoseComponent].range_image_return1.shape": [list(pose.shape)] * 2,
+            },
+        )
+    return root
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["import", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("moved_m", [0.0, 1.5])
+def test_points_lie_in_the_boxes(tmp_path: Path, moved_m: float) -> None:
+    source = write_segment(tmp_path / "waymo", moved_m=moved_m)
+    assert "boxes: Vehicle 1" in run(source, tmp_path / "out", "--from", "waymo", "--val-share", 0.5)
+    split = BoxSplit(tmp_path / "out")
+    assert split.frame_ids == ("segment/1000", "segment/2000") and split.mounting.sensor_height_m == 0
+    boxes, types = split.labeled_boxes("segment/1000")
+    assert types == ("Vehicle",) and boxes[0].tolist() == pytest.approx(BOX)
+    points = split.points("segment/1000")
+    assert len(points) == 1 and points_in_boxes(points, boxes).all()
+    np.testing.assert_allclose(points[0, :2], [10, 4], atol=0.15)  # a pixel is 1 degree wide
+    assert points[0, 3] == pytest.approx(np.tanh(0.5))
+
+
+def test_an_import_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    source = write_segment(tmp_path / "waymo")
+    scan = tmp_path / "out" / "scans" / "segment" / "1000.npy"
+    run(source, tmp_path / "out", "--from", "waymo")
+    first = scan.stat().st_mtime_ns
+    (scan.parent / "2000.npy").unlink()
+    run(source, tmp_path / "out", "--from", "waymo")
+    assert scan.stat().st_mtime_ns == first and (scan.parent / "2000.npy").exists()
+
+
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    source = write_segment(tmp_path / "waymo")
+    with pytest.raises(DatasetError, match=r"no lidar/\*\.parquet there"):
+        read_waymo(tmp_path, tmp_path / "out")
+    (source / "lidar_calibration" / "segment.parquet").write_bytes(b"no parquet")
+    with pytest.raises(DatasetError, match=r"lidar_calibration/segment\.parquet: no readable parquet file"):
+        read_waymo(source, tmp_path / "out")
+    (source / "lidar_calibration" / "segment.parquet").write_bytes(
+        (source / "lidar_box" / "segment.parquet").read_bytes()
+    )
+    with pytest.raises(DatasetError, match=r"no column `key\.laser_name`"):
+        read_waymo(source, tmp_path / "out")
