@@ -25,7 +25,7 @@ from tests.training.test_loop import CONFIG
 
 DOCS = Path(__file__).parent.parent / "docs"
 _BLOCK = re.compile(
-    r"(?:<!-- not run: (?P<reason>[^\n]+?) -->\n)?(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)\n(?P=indent)```",
+    r"(?: *<!-- not run: (?P<reason>[^\n]+?) -->\n)?(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)\n(?P=indent)```",
     re.DOTALL,
 )
 
