@@ -1,4 +1,4 @@
-"""`asca export`: a checkpoint in, a bundle out that was compared with it."""
+"""`asca export`: a checkpoint in, a bundle out that was compared with it; or from a bundle what other runtimes need."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,12 +9,19 @@ from asca_pillars.commands.extras import require
 
 
 def export(
-    checkpoint: Annotated[Path, typer.Argument(help="RUN/checkpoints/best.ckpt or last.ckpt.")],
+    checkpoint: Annotated[
+        Path,
+        typer.Argument(help="RUN/checkpoints/best.ckpt or last.ckpt; with --golden or --browser a bundle."),
+    ],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the bundle.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to be written.")],
     scans: Annotated[
         Path | None,
-        typer.Option("--scans", help="Scans like those trained on, to compare on. Default: 8 simulated ones."),
+        typer.Option(
+            "--scans",
+            help="Scans like those trained on, to compare on. Default: 8 simulated ones. With --golden or --browser "
+            "the one that is run. Default: the sample that comes with asca.",
+        ),
     ] = None,
     trained_on: Annotated[
         str, typer.Option("--trained-on", help="What the weights have seen, for the manifest.")
@@ -35,14 +42,40 @@ def export(
             help="Scans like those trained on, to calibrate with; 96 of the folder, evenly spaced. Default: simulated.",
         ),
     ] = None,
+    golden: Annotated[
+        bool, typer.Option("--golden", help="Write every stage's arrays for one scan, to check other runtimes by.")
+    ] = False,
+    browser: Annotated[
+        bool, typer.Option("--browser", help="Write a static web page that runs the bundle in the browser.")
+    ] = False,
+    ort_web: Annotated[
+        Path | None,
+        typer.Option(
+            "--ort-web",
+            help="For --browser: npm's package onnxruntime-web, a .tgz or its folder. Default: what `npm pack` or `npm "
+            "install` left in this folder.",
+        ),
+    ] = None,
 ) -> None:
     """Export to ONNX and compare with PyTorch on scans, head maps and boxes; fails if they differ.
 
     With --int8 the graphs that passed become 8-bit ones; bundle.json says how far they are from the float ones, layer
     by layer, and which layers stay in floating point because of it.
 
-    Example: asca export runs/small/checkpoints/last.ckpt -o my_bundle --score Car=0.4
+    With --golden or --browser a finished bundle is read instead of a checkpoint, and PyTorch is not needed.
+
+    Examples:
+
+    asca export runs/small/checkpoints/last.ckpt -o my_bundle --score Car=0.4
+
+    asca export my_bundle --golden -o golden
     """
+    if golden or browser or ort_web is not None:
+        from asca_pillars.commands.export_runtime import export_for_runtime
+
+        of_a_checkpoint = {"--score": score, "--int8": int8, "--calibrate": calibrate}
+        export_for_runtime(checkpoint, out, scans, of_a_checkpoint, golden=golden, browser=browser, ort_web=ort_web)
+        return
     require("train")
     from dataclasses import replace
 

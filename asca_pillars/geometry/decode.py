@@ -53,6 +53,19 @@ class HeadMaps(NamedTuple, Generic[Map]):
     """(2A, H, W) logits of the direction bins; those of anchor a are channels 2a and 2a+1."""
 
 
+class Candidates(NamedTuple):
+    """Decoded boxes that enter suppression, class by class, the best of each class first."""
+
+    boxes: NDArray[np.float32]
+    """(n, 7), LiDAR frame."""
+    logits: NDArray[np.float32]
+    """(n,)"""
+    labels: NDArray[np.int64]
+    """(n,) indices into the classes."""
+    non_finite: int
+    """Anchors that were left out because their numbers are not finite."""
+
+
 def decode(
     maps: HeadMaps[NDArray[np.float32]],
     anchors: NDArray[np.float32],
@@ -70,6 +83,21 @@ def decode(
         maps: logits and residuals on the head's map.
         anchors: (H, W, A, 7) from `make_anchors` for the same grid and classes.
         cells: (M,) flat index of the head cell of each of the maps' rows, ascending; None if they are maps.
+
+    Raises:
+        ValueError: if maps, anchors and classes do not belong together.
+    """
+    return suppress(decode_candidates(maps, anchors, classes, post, cells), classes, post)
+
+
+def decode_candidates(
+    maps: HeadMaps[NDArray[np.float32]],
+    anchors: NDArray[np.float32],
+    classes: tuple[ClassSpec, ...],
+    post: PostProcess,
+    cells: NDArray[np.integer[Any]] | None = None,
+) -> Candidates:
+    """The first half of `decode`: what reaches its class's threshold, (n, 7) boxes in the LiDAR frame.
 
     Raises:
         ValueError: if maps, anchors and classes do not belong together.
@@ -93,8 +121,17 @@ def decode(
         boxes = decode_boxes(residuals, directions.argmax(axis=-1), anchors.reshape(-1, count, 7)[cell, anchor])
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)
     dropped = np.count_nonzero(~usable & np.isfinite(logits))
-    boxes, logits, labels = boxes[usable], logits[usable], anchor[usable] // len(ANCHOR_YAWS_RAD)
+    return Candidates(
+        boxes[usable],
+        logits[usable],
+        anchor[usable] // len(ANCHOR_YAWS_RAD),
+        int(maps.scores.size - np.count_nonzero(np.isfinite(maps.scores)) + dropped),
+    )
 
+
+def suppress(candidates: Candidates, classes: tuple[ClassSpec, ...], post: PostProcess) -> Detections:
+    """The second half of `decode`: (n, 7) candidates -> those that the rotated NMS of their class keeps, best first."""
+    boxes, logits, labels, non_finite = candidates
     kept = []
     for label in range(len(classes)):
         own = np.flatnonzero(labels == label)
@@ -106,7 +143,7 @@ def decode(
         sigmoid(logits[best]),
         labels[best],
         tuple(spec.name for spec in classes),
-        non_finite=int(maps.scores.size - np.count_nonzero(np.isfinite(maps.scores)) + dropped),
+        non_finite=non_finite,
     )
 
 

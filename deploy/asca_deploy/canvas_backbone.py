@@ -32,7 +32,8 @@ class Canvas:
         self._cells = self.image.reshape(-1, channels)
         self._cells[:] = self._empty
         self._nx = columns
-        self._occupied = np.empty(0, np.int64)
+        self.occupied: NDArray[np.int64] = np.empty(0, np.int64)
+        """(n,) rows of `image.reshape(-1, C)` that hold a pillar."""
 
     def scatter(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> NDArray[Any]:
         """Write each pillar's features into its cell; every other cell is empty.
@@ -44,10 +45,10 @@ class Canvas:
         Returns:
             The pseudo-image (1, ny + 1, nx + 1, C). It is this object's own memory: valid until the next call.
         """
-        self._cells[self._occupied] = self._empty
+        self._cells[self.occupied] = self._empty
         rows, columns = np.divmod(cells, self._nx)
-        self._occupied = (rows + 1) * (self._nx + 1) + columns + 1
-        self._cells[self._occupied] = pillar_features
+        self.occupied = (rows + 1) * (self._nx + 1) + columns + 1
+        self._cells[self.occupied] = pillar_features
         return self.image
 
 

@@ -11,7 +11,8 @@ import pytest
 from asca_deploy import Detections, Detector, load_bundle
 from asca_deploy.benchmark import benchmark
 from asca_deploy.bundle import CanvasFormat, PillarSection
-from asca_deploy.pillar_pipeline import open_backbone
+from asca_deploy.golden import golden_stages
+from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
 from asca_export.exporter import export_bundle
 from asca_pillars.errors import ConfigError, ProviderError
 from asca_pillars.models.checkpoint import Checkpoint
@@ -68,6 +69,16 @@ def test_the_bundle_finds_what_pytorch_finds(float_bundle: tuple[Path, Checkpoin
         np.testing.assert_allclose(found.scores, expected.scores, atol=1e-4)
         np.testing.assert_array_equal(found.labels, expected.labels)
     assert len(runtime(NOTHING)) == len(torch_detector(NOTHING)) == 0
+
+
+def test_golden_vectors_hold_the_tables(float_bundle: tuple[Path, Checkpoint]) -> None:
+    detector = Detector(float_bundle[0], threads=1)
+    assert isinstance(detector.pipeline, PillarPipeline)
+    stages = golden_stages(detector.pipeline, SCANS[0])
+    assert {"pillar_features", "strided_0", "same_2", "places_1"} < set(stages["tables"])
+    head = stages["neck+head"]
+    assert len(head["scores"]) == len(head["cells"]) == len(stages["tables"]["places_0"])
+    np.testing.assert_array_equal(stages["suppress"]["boxes"], detector(SCANS[0]).boxes)
 
 
 def test_eight_bits_report_how_near_they_are(int8_bundle: Path) -> None:

@@ -1,0 +1,109 @@
+"""A static page that runs a bundle in the browser: our modules, the bundle, a scan, and ONNX Runtime's WebAssembly.
+
+The page is a flat folder and needs no network and no program on the server. ONNX Runtime comes from npm's package
+onnxruntime-web, which is read where `npm pack` or `npm install` put it and never fetched from here.
+"""
+
+import json
+import tarfile
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+
+from asca_deploy.bundle import MANIFEST
+from asca_deploy.manifest import load_bundle
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
+from asca_pillars.errors import BundleError, ConfigError
+from asca_pillars.files import atomic_directory, write_json
+
+PAGE = "page.json"
+SAMPLE = "sample.bin"
+START = "Open it from a file server: python -m http.server --directory {out}"
+ORT_FILES = ("ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm")
+"""Of the package's `dist`: ONNX Runtime for the CPU alone, 14 MB."""
+ORT_VERSION = "1.30.0"
+"""What the tests run."""
+
+_GET_IT = f"get it with `npm pack onnxruntime-web@{ORT_VERSION}` and give the .tgz with --ort-web"
+
+
+def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
+    """Write the page for one bundle; its size in bytes.
+
+    Args:
+        out: folder: absent, empty, or an earlier output of this function.
+        bundle: folder of a bundle of kind pillar with a dense neck on a warped map.
+        scan: what the page shows first; any format that `read_scan` reads.
+        ort_web: npm's package onnxruntime-web, a .tgz or its folder.
+
+    Raises:
+        BundleError: the bundle is damaged, or of a kind that the page does not run.
+        ConfigError: the package is not one.
+        OutputError: `out` holds something else.
+    """
+    manifest = load_bundle(bundle)
+    if manifest.kind != "pillar" or manifest.pillar.neck != "dense" or manifest.spec.grid.pools:
+        raise BundleError(
+            f"{bundle}: kind {manifest.kind}, {manifest.pillar.neck} neck, {manifest.spec.grid.map} map; the page runs "
+            "kind pillar with a dense neck on a warped map"
+        )
+    version, read = _open_package(ort_web)
+    points = read_scan(scan).points
+    with atomic_directory(out, "asca export --browser", PAGE) as folder:
+        for file in _modules():
+            (folder / file.name).write_bytes(file.read_bytes())
+        for name in (MANIFEST, *(graph.file for graph in manifest.graphs.values())):
+            (folder / name).write_bytes((bundle / name).read_bytes())
+        for name in ORT_FILES:
+            (folder / name).write_bytes(read(f"dist/{name}"))
+        write_scan(folder / SAMPLE, points)
+        files = sorted(path.name for path in folder.iterdir())
+        content = {"bundle": manifest.name, "scan": scan.name, "onnxruntime_web": version, "files": files}
+        write_json(folder / PAGE, content)
+        return sum(path.stat().st_size for path in folder.iterdir())
+
+
+def find_ort_web(given: Path | None) -> Path:
+    """The package that was given, or what `npm pack` or `npm install` left in the working directory.
+
+    Raises:
+        ConfigError: there is none; says how to get it.
+    """
+    here = [Path("node_modules/onnxruntime-web"), *sorted(Path().glob("onnxruntime-web-*.tgz"))]
+    for path in [given] if given else here:
+        if path.exists():
+            return path
+    where = f"{given}: no such file or folder" if given else "npm's package onnxruntime-web is not in this folder"
+    raise ConfigError(f"{where}; {_GET_IT}")
+
+
+def _modules() -> list[Path]:
+    folder = Path(str(resources.files("asca_deploy") / "browser"))
+    return sorted(path for path in folder.iterdir() if path.suffix in (".html", ".css", ".js"))
+
+
+def _open_package(path: Path) -> tuple[str, Callable[[str], bytes]]:
+    """Version of the package, and what reads one of its files."""
+    try:
+        if path.is_dir():
+            files = {name: (path / name).read_bytes() for name in ("package.json", *(f"dist/{n}" for n in ORT_FILES))}
+        else:
+            files = _unpacked(path)
+        package = json.loads(files["package.json"])
+        if package["name"] != "onnxruntime-web":
+            raise ConfigError(f"{path}: npm's package {package['name']}; {_GET_IT}")
+        return str(package["version"]), files.__getitem__
+    except (OSError, KeyError, ValueError, tarfile.TarError) as error:
+        raise ConfigError(f"{path}: is not npm's package onnxruntime-web ({error}); {_GET_IT}") from None
+
+
+def _unpacked(path: Path) -> dict[str, bytes]:
+    wanted = {f"package/{name}" for name in ("package.json", *(f"dist/{n}" for n in ORT_FILES))}
+    files = {}
+    with tarfile.open(path) as archive:
+        for member in archive:
+            if member.name in wanted and (stream := archive.extractfile(member)) is not None:
+                files[member.name.removeprefix("package/")] = stream.read()
+    if missing := wanted - {f"package/{name}" for name in files}:
+        raise KeyError(min(missing))
+    return files

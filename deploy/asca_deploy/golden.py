@@ -1,0 +1,138 @@
+"""Golden vectors: what every stage of a bundle takes and gives for one scan, to check a runtime in another language by.
+
+    golden.json                 the bundle, the scan, and of each stage the arrays by name, with their files
+    STAGE.NAME.npy              one array each, NumPy's format 1.0, little-endian, C order
+
+A stage's inputs are the outputs of the stages before it. docs/BUNDLE.md says what each array is and how near a runtime
+should come.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.bundle import Bundle
+from asca_deploy.canvas_backbone import Canvas
+from asca_deploy.detector import Detector
+from asca_deploy.pillar_backbone import HeadAnswer
+from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import BundleError
+from asca_pillars.files import atomic_directory, write_json
+from asca_pillars.geometry.decode import HeadMaps, decode_candidates, sigmoid, suppress
+from asca_pillars.system import cpu_model, package_versions
+from asca_pillars.tables.neck_tables import table_inputs
+
+GOLDEN = "golden.json"
+SCHEMA_VERSION = 1
+
+Stages: TypeAlias = Mapping[str, Mapping[str, NDArray[Any]]]
+
+
+def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
+    """Run a bundle on one scan and write what every stage gave.
+
+    Args:
+        out: folder: absent, empty, or an earlier output of this function.
+        bundle: folder, or name of one that ships; None for the default one.
+        scan: a file that `read_scan` reads.
+
+    Returns:
+        What was written, see `golden_stages`.
+
+    Raises:
+        BundleError: the bundle cannot be used, or is of kind pillar_refine.
+        ScanError: the scan cannot be read.
+        OutputError: `out` holds something else.
+    """
+    detector = Detector(bundle, threads=1)
+    if not isinstance(detector.pipeline, PillarPipeline):
+        raise BundleError(
+            f"{detector.folder}: kind {detector.bundle.kind}; golden vectors are written for kind pillar, such as its "
+            "first stage"
+        )
+    stages = golden_stages(detector.pipeline, read_scan(scan).points)
+    with atomic_directory(out, "asca export --golden", GOLDEN) as folder:
+        for stage, arrays in stages.items():
+            for name, array in arrays.items():
+                np.save(folder / _file(stage, name), np.ascontiguousarray(array), allow_pickle=False)
+        write_json(folder / GOLDEN, _contents(detector.bundle, scan, stages))
+    return stages
+
+
+def golden_stages(pipeline: PillarPipeline, points: NDArray[np.float32]) -> Stages:
+    """The arrays of each stage, by stage and name, for the finite points (N, 4), metres, and reflectance within 0..1.
+
+    Stages, for M points in P pillars: `input`, `pillarize`, `encode`, `scatter` (or `tables` of a sparse neck),
+    `neck+head`, `decode` (n boxes above their thresholds) and `suppress` (those that stay). Maps are channels last, as
+    the graph gives them.
+    """
+    bundle, spec = pipeline.bundle, pipeline.spec
+    pillars = pipeline.pillarize(points)
+    features = pipeline.encode(pillars)
+    placed = pipeline.backbone.place(features, pillars.cells)
+    given = _placed(placed)  # before the canvas is used for the next scan
+    answer = pipeline.backbone.run(placed)
+    candidates = decode_candidates(answer.maps, spec.anchors, spec.classes, spec.post, answer.cells)
+    found = suppress(candidates, spec.classes, spec.post)
+    return {
+        "input": {"points": points},
+        "pillarize": {
+            "features": pillars.features,
+            "pillar_index": pillars.pillar_index,
+            "point_counts": pillars.point_counts,
+            "cells": pillars.cells,
+        },
+        "encode": {"pillar_features": features},
+        ("scatter" if bundle.pillar.neck == "dense" else "tables"): given,
+        "neck+head": _answered(answer),
+        "decode": {
+            "boxes": candidates.boxes,
+            "scores": sigmoid(candidates.logits),
+            "labels": candidates.labels,
+        },
+        "suppress": {"boxes": found.boxes, "scores": found.scores, "labels": found.labels},
+    }
+
+
+def _placed(placed: Any) -> dict[str, NDArray[Any]]:
+    """Of a canvas the cells that are not empty: `rows` (n,) of the canvas as (cells, C), and their `values` (n, C)."""
+    if isinstance(placed, Canvas):
+        values = placed.image.reshape(-1, placed.image.shape[-1])[placed.occupied]
+        return {"rows": placed.occupied.copy(), "values": values}
+    return {"pillar_features": placed.features, **table_inputs(placed.tables)}
+
+
+def _answered(answer: HeadAnswer) -> dict[str, NDArray[Any]]:
+    if answer.cells is None:
+        return {name: part.transpose(1, 2, 0) for name, part in zip(HeadMaps._fields, answer.maps, strict=True)}
+    return {**dict(zip(HeadMaps._fields, answer.maps, strict=True)), "cells": answer.cells}
+
+
+def _contents(bundle: Bundle, scan: Path, stages: Stages) -> dict[str, Any]:
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "bundle": bundle.name,
+        "precision": bundle.precision,
+        "graphs": {name: graph.sha256 for name, graph in bundle.graphs.items()},
+        "scan": scan.name,
+        "stages": [
+            {
+                "stage": stage,
+                "arrays": {
+                    name: {"file": _file(stage, name), "type": str(array.dtype), "shape": list(array.shape)}
+                    for name, array in arrays.items()
+                },
+            }
+            for stage, arrays in stages.items()
+        ],
+        "versions": package_versions(),
+        "machine": cpu_model(),
+    }
+
+
+def _file(stage: str, name: str) -> str:
+    return f"{stage.replace('+', '_')}.{name}.npy"

@@ -1,0 +1,171 @@
+"""The page's JavaScript in node: its stages on golden vectors, overlaps and readers against Python's."""
+
+import base64
+import json
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from asca_deploy import sample_scan_path, shipped_bundles
+from asca_deploy.golden import write_golden
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
+from asca_pillars.errors import ScanError
+from asca_pillars.geometry.overlap import bev_iou
+from tests.deploy import conftest as tiny
+
+ROOT = Path(__file__).parents[2]
+MODULES = ROOT / "deploy" / "asca_deploy" / "browser"
+SCRIPTS = Path(__file__).parent / "javascript"
+NODE = shutil.which("node")
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="needs node")
+
+
+def node(*arguments: str | Path, given: str = "") -> Any:
+    command = [str(NODE), *map(str, arguments)]
+    result = subprocess.run(command, input=given, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def call(module: str, function: str, *calls: list[Any]) -> list[dict[str, Any]]:
+    """What a function of a module answers to each of some lists of arguments: its result, or its error."""
+    return node(SCRIPTS / "call.mjs", MODULES / module, function, given=json.dumps(calls, default=_bytes))
+
+
+def _bytes(value: bytes) -> dict[str, str]:
+    return {"base64": base64.b64encode(value).decode("ascii")}
+
+
+def test_stages_on_the_golden_vectors_of_the_models_that_ship(tmp_path: Path) -> None:
+    for name, folder in shipped_bundles().items():
+        write_golden(tmp_path / name, folder, sample_scan_path())
+        assert_same_stages(node(SCRIPTS / "golden.mjs", MODULES, tmp_path / name, folder))
+
+
+def test_stages_on_a_grid_of_three_zones_beyond_both_limits(tiny_bundle: Path, tmp_path: Path) -> None:
+    write_scan(tmp_path / "scan.bin", tiny.make_scan(3, 6000))
+    stages = write_golden(tmp_path / "golden", tiny_bundle, tmp_path / "scan.bin")
+    limits, pillars = tiny.SPEC.limits, stages["pillarize"]
+    assert len(pillars["cells"]) == limits.max_pillars and pillars["point_counts"].max() == limits.max_points
+    assert len(stages["suppress"]["boxes"]) > 2
+    assert_same_stages(node(SCRIPTS / "golden.mjs", MODULES, tmp_path / "golden", tiny_bundle))
+
+
+def assert_same_stages(differences: dict[str, str]) -> None:
+    for name, difference in differences.items():
+        # Boxes are computed in float64 on both sides; exp and the like may differ in the last digit.
+        assert float(difference) <= (1e-5 if name.endswith((".boxes", ".scores")) else 0), (name, difference)
+    assert len(differences) == 12
+
+
+def test_overlaps_of_random_boxes() -> None:
+    rng = np.random.default_rng(4)
+    boxes = np.column_stack([rng.uniform(-4, 4, (200, 3)), rng.uniform(0.4, 5, (200, 3)), rng.uniform(-4, 4, 200)])
+    boxes[1::10] = boxes[::10]  # the same box
+    boxes[2::10, 6] = boxes[::10, 6] + np.pi / 2
+    expected = bev_iou(boxes, boxes)
+    pairs = [[boxes[i].tolist(), boxes[j].tolist()] for i in range(0, 200, 5) for j in range(200)]
+    found = [answer["result"] for answer in call("boxes.js", "bevIou", *pairs)]
+    np.testing.assert_allclose(found, expected[::5].reshape(-1), atol=1e-9)
+    assert np.count_nonzero(expected[::5]) > 1000
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_pcd_files_read_as_python_reads_them(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "scan.pcd"
+    path.write_bytes(pcd(tiny.make_scan(count=50), encoding))
+    assert_reads_alike(path)
+
+
+def test_bin_files_read_as_python_reads_them(tmp_path: Path) -> None:
+    points = tiny.make_scan(count=400)
+    rings = np.column_stack([points, np.arange(400) % 32]).astype(np.float32)
+    rings[:, 3] *= 255
+    rings[rings[:, 3] == 0, 3] = 1
+    points[3, 0], points[4, 3] = np.nan, 1.5
+    for name, values in (("four", points), ("five", rings[:399]), ("dark", np.float32(0.1) * points)):
+        values.astype("<f4").tofile(tmp_path / f"{name}.bin")
+        assert_reads_alike(tmp_path / f"{name}.bin")
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    good = pcd(tiny.make_scan(count=5), "binary")
+    packed = pcd(tiny.make_scan(count=5), "binary_compressed")
+    cases = {
+        "a.bin": b"torn",
+        "b.bin": b"",
+        "c.pcd": good[:-3],
+        "d.pcd": good.replace(b"FIELDS x", b"FIELDS w"),
+        "e.pcd": packed[:-4],
+        "f.pcd": b"nothing",
+        "g.txt": good,
+        "h.pcd": good.replace(b"TYPE F", b"TYPE Q"),
+    }
+    answers = call("readers.js", "readScan", *([name, data] for name, data in cases.items()))
+    for (name, data), answer in zip(cases.items(), answers, strict=True):
+        (tmp_path / name).write_bytes(data)
+        assert answer["error"].startswith(f"{name}: "), answer
+        with pytest.raises(ScanError):
+            read_scan(tmp_path / name)
+
+
+def assert_reads_alike(path: Path) -> None:
+    (answer,) = call("readers.js", "readScan", [path.name, path.read_bytes()])
+    found = np.array(answer["result"]["points"], np.float32).reshape(-1, 4)
+    expected = read_scan(path).points
+    assert len(expected) > 40
+    np.testing.assert_array_equal(found, expected)
+
+
+def pcd(points: NDArray[np.float32], encoding: str) -> bytes:
+    """A PCD with a field between the ones that are read, and the reflectance as bytes."""
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x ring y z intensity\nSIZE 4 2 4 8 1\nTYPE F U F F U\nCOUNT 1 2 1 1 1\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {encoding}\n"
+    ).encode()
+    fields = [("x", "<f4"), ("ring", "<u2", 2), ("y", "<f4"), ("z", "<f8"), ("intensity", "u1")]
+    table = np.zeros(len(points), fields)
+    for column, name in enumerate(("x", "y", "z")):
+        table[name] = points[:, column]
+    table["intensity"], table["ring"] = points[:, 3] * 255, 7
+    if encoding == "ascii":
+        lines = [f"{r['x']:.9g} 7 7 {r['y']:.9g} {r['z']:.17g} {r['intensity']}" for r in table]
+        return header + "\n".join(lines).encode()
+    if encoding == "binary":
+        return header + table.tobytes()
+    body = b"".join(np.ascontiguousarray(table[field[0]]).tobytes() for field in fields)
+    packed = lzf(body)
+    return header + struct.pack("<2I", len(packed), len(body)) + packed
+
+
+def lzf(data: bytes) -> bytes:
+    """A naive LZF: runs of a repeated pair of bytes as references that overlap themselves, literals otherwise."""
+    packed, at, literals = bytearray(), 0, bytearray()
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            part = literals[start : start + 32]
+            packed.extend([len(part) - 1, *part])
+        literals.clear()
+
+    while at < len(data):
+        run = 0
+        while at >= 2 and run < 264 and at + run < len(data) and data[at + run] == data[at - 2 + run]:
+            run += 1
+        if run < 3:
+            literals.append(data[at])
+            at += 1
+            continue
+        flush()
+        length = run - 2
+        packed.extend([length << 5, 1] if length < 7 else [7 << 5, length - 7, 1])
+        at += run
+    flush()
+    return bytes(packed)

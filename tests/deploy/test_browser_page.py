@@ -1,0 +1,151 @@
+"""The page in a browser, from a plain file server and without a network: it finds the boxes that Python finds."""
+
+import json
+import os
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from asca_deploy import Detector, load_bundle, sample_scan_path, shipped_bundles
+from asca_deploy.browser_page import ORT_FILES, find_ort_web, write_page
+from asca_pillars.cli import app
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
+from asca_pillars.errors import BundleError, ConfigError, OutputError
+from tests.deploy.chromium import CHROMIUM, Tab, file_server, open_tab
+
+ORT_WEB = os.environ.get("ASCA_ORT_WEB")
+"""npm's package onnxruntime-web, a .tgz or its folder."""
+NEAR_M = 0.02
+
+needs_ort_web = pytest.mark.skipif(not ORT_WEB, reason="needs ASCA_ORT_WEB, a .tgz of `npm pack onnxruntime-web`")
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+
+
+@pytest.fixture
+def made_up_package(tmp_path: Path) -> Path:
+    """A folder that looks like npm's package."""
+    folder = tmp_path / "onnxruntime-web"
+    (folder / "dist").mkdir(parents=True)
+    (folder / "package.json").write_text('{"name": "onnxruntime-web", "version": "9.9.9"}')
+    for name in ORT_FILES:
+        (folder / "dist" / name).write_bytes(b"code")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with open_tab(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+@needs_ort_web
+@needs_chromium
+@pytest.mark.parametrize("name", ["asca_small_sim", "asca_small_sim_int8"])
+def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path, tab: Tab) -> None:
+    page = tmp_path / "page"
+    write_page(page, shipped_bundles()[name], sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
+    points = read_scan(sample_scan_path()).points
+    write_scan(tmp_path / "half.bin", points[::2])
+    detector = Detector(name, threads=1)
+    with file_server(page) as address:
+        tab.call("Page.navigate", url=address)
+        assert_same(finished(tab, "sample.bin"), detector(points))
+        tab.evaluate("document.getElementById('again').click()")
+        warm = finished(tab, "sample.bin")
+        tab.choose_file("#file", tmp_path / "half.bin")
+        assert_same(finished(tab, "half.bin"), detector(points[::2]))
+        tab.choose_file("#file", page / "bundle.json")
+        assert "scans are .bin and .pcd files" in failure(tab)
+    print(f"{name} in {CHROMIUM}: {sum(warm['times_ms'].values()):.0f} ms per scan", warm["times_ms"])
+
+
+def finished(tab: Tab, scan: str) -> Any:
+    """What the link `Save boxes` gives, once the page has finished this scan."""
+    wait_for(tab, "done")
+    saved = json.loads(tab.evaluate("fetch(document.getElementById('save').href).then((file) => file.text())"))
+    assert saved["scan"] == scan
+    return saved
+
+
+def failure(tab: Tab) -> str:
+    wait_for(tab, "failed")
+    return str(tab.evaluate("document.getElementById('status').textContent"))
+
+
+def wait_for(tab: Tab, state: str) -> None:
+    time.sleep(0.1)  # a click is on its way
+    end = time.monotonic() + 60
+    found = None
+    while found not in ("done", "failed"):
+        assert time.monotonic() < end, "the page does not come to an end"
+        found = tab.evaluate("document.body?.dataset.state")
+        time.sleep(0.05)
+    assert found == state, tab.evaluate("document.getElementById('status').textContent")
+
+
+def assert_same(saved: Any, expected: Any) -> None:
+    assert len(expected) > 3
+    assert [box["class"] for box in saved["boxes"]] == list(expected.names)
+    centers = [[box["x_m"], box["y_m"], box["z_m"]] for box in saved["boxes"]]
+    assert np.linalg.norm(centers - expected.boxes[:, :3], axis=1).max() < NEAR_M
+    np.testing.assert_allclose([box["score"] for box in saved["boxes"]], expected.scores, atol=0.02)
+    assert saved["pillars"] == expected.report.counts.pillars
+
+
+def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_path: Path) -> None:
+    page, bundle = tmp_path / "page", shipped_bundles()["asca_small_sim_int8"]
+    options = ["--browser", "-o", str(page), "--ort-web", str(made_up_package)]
+    for _ in range(2):  # and may be written again
+        result = CliRunner().invoke(app, ["export", bundle.name, *options])
+        assert result.exit_code == 0, result.output
+    assert f"python -m http.server --directory {page}" in " ".join(result.output.split())
+    contents = json.loads((page / "page.json").read_text())
+    assert contents["onnxruntime_web"] == "9.9.9" and contents["bundle"] == bundle.name
+    files = {path.name: path for path in page.iterdir()}
+    assert {*contents["files"], "page.json"} == set(files)
+    assert files["sample.bin"].read_bytes() == sample_scan_path().read_bytes()
+    for path in bundle.iterdir():
+        assert files[path.name].read_bytes() == path.read_bytes()
+    for name, path in files.items():  # what a module or the page loads lies beside it
+        if name.endswith((".js", ".html")):
+            text = path.read_text()
+            loaded = re.findall(r'"([^" ]+\.(?:js|mjs|css|wasm))"', text)
+            assert {Path(word).name for word in loaded} <= set(files), name
+            assert "://" not in text, f"{name} loads something from elsewhere"
+
+
+def test_a_package_that_is_none(made_up_package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bundle = shipped_bundles()["asca_small_sim_int8"]
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="not in this folder; get it with `npm pack onnxruntime-web@"):
+        find_ort_web(None)
+    with pytest.raises(ConfigError, match=r"gone\.tgz: no such file"):
+        find_ort_web(Path("gone.tgz"))
+    (made_up_package / "package.json").write_text('{"name": "other", "version": "1"}')
+    (tmp_path / "torn.tgz").write_bytes(b"torn")
+    for package, said in ((made_up_package, "npm's package other"), (tmp_path / "torn.tgz", "is not npm's package")):
+        with pytest.raises(ConfigError, match=said):
+            write_page(tmp_path / "page", bundle, sample_scan_path(), package)
+    assert not (tmp_path / "page").exists()
+
+
+def test_a_folder_of_something_else_is_left_alone(made_up_package: Path, tmp_path: Path) -> None:
+    (tmp_path / "page").mkdir()
+    (tmp_path / "page" / "thesis.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"thesis\.txt"):
+        write_page(tmp_path / "page", shipped_bundles()["asca_small_sim"], sample_scan_path(), made_up_package)
+
+
+def test_a_bundle_that_the_page_cannot_run(made_up_package: Path, tmp_path: Path, monkeypatch) -> None:
+    bundle = load_bundle(shipped_bundles()["asca_small_sim"])
+    sparse = replace(bundle, pillar=replace(bundle.pillar, neck="sparse", active_cells="sub"))
+    monkeypatch.setattr("asca_deploy.browser_page.load_bundle", lambda _: sparse)
+    with pytest.raises(BundleError, match="sparse neck, warped map; the page runs"):
+        write_page(tmp_path / "page", tmp_path, sample_scan_path(), made_up_package)

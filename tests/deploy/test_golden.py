@@ -1,0 +1,105 @@
+"""Golden vectors: complete, true to the detector, readable without us, and refused where they would say less."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from asca_deploy import Detector, load_bundle
+from asca_deploy.golden import write_golden
+from asca_pillars.cli import app
+from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.errors import BundleError, ConfigError, OutputError
+from tests.deploy import conftest as tiny
+
+
+@pytest.fixture
+def scan_path(tmp_path: Path) -> Path:
+    write_scan(tmp_path / "scans" / "a.bin", tiny.make_scan())
+    return tmp_path / "scans" / "a.bin"
+
+
+def read(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays as golden.json names them."""
+    stages = json.loads((folder / "golden.json").read_text())["stages"]
+    return {
+        entry["stage"]: {name: np.load(folder / array["file"]) for name, array in entry["arrays"].items()}
+        for entry in stages
+    }
+
+
+def test_each_stage_follows_from_the_one_before(tiny_bundle: Path, scan_path: Path, tmp_path: Path) -> None:
+    write_golden(tmp_path / "golden", tiny_bundle, scan_path)
+    stages = read(tmp_path / "golden")
+    assert list(stages) == ["input", "pillarize", "encode", "scatter", "neck+head", "decode", "suppress"]
+    points, pillars = stages["input"]["points"], stages["pillarize"]
+    np.testing.assert_array_equal(points, tiny.make_scan())
+    assert len(pillars["features"]) == pillars["point_counts"].sum() == len(pillars["pillar_index"])
+    # docs/BUNDLE.md: canvas[0, 1 + cell // nx, 1 + cell % nx] = pillar_features[pillar]
+    grid = tiny.SPEC.grid
+    row, column = np.divmod(stages["scatter"]["rows"], grid.nx + 1)
+    np.testing.assert_array_equal((row - 1) * grid.nx + column - 1, pillars["cells"])
+    np.testing.assert_array_equal(stages["scatter"]["values"], stages["encode"]["pillar_features"])
+    assert stages["neck+head"]["boxes"].shape == (*grid.head_shape, 7 * 6)
+    assert set(map(tuple, stages["suppress"]["boxes"])) < set(map(tuple, stages["decode"]["boxes"]))
+    expected = Detector(tiny_bundle, threads=1)(points)
+    assert len(expected) > 2
+    for name in ("boxes", "scores", "labels"):
+        np.testing.assert_array_equal(stages["suppress"][name], getattr(expected, name))
+
+
+def test_the_manifest_says_which_bundle_and_scan(tiny_bundle: Path, scan_path: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        app, ["export", str(tiny_bundle), "--golden", "-o", str(tmp_path / "golden"), "--scans", str(scan_path.parent)]
+    )
+    assert result.exit_code == 0, result.output
+    assert "boxes of a.bin" in " ".join(result.output.split())
+    contents = json.loads((tmp_path / "golden" / "golden.json").read_text())
+    assert (contents["bundle"], contents["scan"], contents["precision"]) == ("tiny", "a.bin", "float32")
+    assert contents["graphs"] == {name: graph.sha256 for name, graph in load_bundle(tiny_bundle).graphs.items()}
+    for entry in contents["stages"]:
+        for array in entry["arrays"].values():
+            stored = np.load(tmp_path / "golden" / array["file"])
+            assert (str(stored.dtype), list(stored.shape)) == (array["type"], array["shape"])
+            assert stored.flags.c_contiguous
+
+
+def test_a_scan_without_points(tiny_bundle: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "empty.npy", np.empty((0, 4), np.float32))
+    stages = write_golden(tmp_path / "golden", tiny_bundle, tmp_path / "empty.npy")
+    assert stages["encode"]["pillar_features"].shape == (0, tiny.CHANNELS)
+    assert stages["scatter"]["rows"].shape == (0,)
+
+
+def test_written_again_and_only_over_itself(tiny_bundle: Path, scan_path: Path, tmp_path: Path) -> None:
+    write_golden(tmp_path / "golden", tiny_bundle, scan_path)
+    write_golden(tmp_path / "golden", tiny_bundle, scan_path)
+    (tmp_path / "golden" / "thesis.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"thesis\.txt"):
+        write_golden(tmp_path / "golden", tiny_bundle, scan_path)
+
+
+def test_another_kind_is_refused(tiny_bundle: Path, scan_path: Path, tmp_path: Path, monkeypatch) -> None:
+    detector = Detector(tiny_bundle)
+    detector.pipeline, detector.bundle = object(), replace(detector.bundle, name="x")  # type: ignore[assignment]
+    monkeypatch.setattr("asca_deploy.golden.Detector", lambda *_, **__: detector)
+    with pytest.raises(BundleError, match="golden vectors are written for kind pillar"):
+        write_golden(tmp_path / "golden", tiny_bundle, scan_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--golden", "--int8"], "--int8 is for a checkpoint"),
+        (["--golden", "--score", "Car=0.3"], "--score is for a checkpoint"),
+        (["--golden", "--browser"], "one of --golden and --browser"),
+        (["--ort-web", "x.tgz"], "--ort-web goes with --browser"),
+    ],
+)
+def test_options_that_do_not_go_together(tiny_bundle: Path, tmp_path: Path, options: list[str], said: str) -> None:
+    result = CliRunner().invoke(app, ["export", str(tiny_bundle), "-o", str(tmp_path / "out"), *options])
+    assert isinstance(result.exception, ConfigError)
+    assert said in str(result.exception)
