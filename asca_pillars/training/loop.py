@@ -104,9 +104,11 @@ def train(
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         # Advice on workers and logging that does not fit two cores and small data.
         warnings.filterwarnings("ignore", category=PossibleUserWarning)
-        trainer.fit(module, data, ckpt_path=None if resumed is None else str(resumed), weights_only=True)
-    if trainer.is_global_zero:
-        save_weights(checkpoints / LAST)
+        try:
+            trainer.fit(module, data, ckpt_path=None if resumed is None else str(resumed), weights_only=True)
+        finally:  # a run that was stopped has weights to take elsewhere, too
+            if trainer.is_global_zero and (checkpoints / LAST).is_file():
+                save_weights(checkpoints / LAST)
     return checkpoints / LAST
 
 

@@ -185,7 +185,8 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(TrainingInterruptedError, match="saved at step 2; the same command goes on"):
         train(config, data, tmp_path / "run")
     assert signal.getsignal(signal.SIGINT) is before
-    assert load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").steps == 2
+    checkpoints = tmp_path / "run" / "checkpoints"
+    assert load_checkpoint(checkpoints / "last.ckpt").steps == load_checkpoint(checkpoints / "weights.ckpt").steps == 2
 
 
 def test_killed_run_resumes_exactly(tmp_path: Path) -> None:
