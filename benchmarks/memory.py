@@ -8,8 +8,7 @@ them go through single calls and half through streams that are opened and closed
 
 Resident memory goes up and down with what the allocator gives back, by some MiB and for each thread's arena on its own,
 so a difference of two moments says little. The crops come again in the same order, and after CYCLE scans also at the
-same places in a stream: compared is the least of each cycle, below which the memory never fell while it lasted. What is
-kept for ever raises it from cycle to cycle; what the allocator holds now and then does not.
+same places in a stream: compared are the medians of whole cycles. What is kept for ever raises them.
 """
 
 import json
@@ -55,10 +54,10 @@ def main(
     counts, resident = np.array(samples).T
     warm = counts >= WARM_SHARE * scans
     slope = np.polyfit(counts[warm], resident[warm], 1)[0] * 1000
-    floors = cycle_floors(counts[warm], resident[warm])
+    levels = cycle_levels(counts[warm], resident[warm])
     console.print(
-        f"{scans} scans, {provider} {precision}: resident at least {floors[0]:.1f} MiB in the first cycle after "
-        f"{counts[warm][0]:.0f} scans, {floors[-1]:.1f} in the last of {len(floors)} ({floors[-1] - floors[0]:+.2f}); "
+        f"{scans} scans, {provider} {precision}: resident after the first {counts[warm][0]:.0f}, median of each cycle, "
+        f"{', '.join(f'{level:.1f}' for level in levels)} MiB ({levels[-1] - levels[0]:+.2f}); "
         f"{resident[warm][0]:.1f} to {resident[-1]:.1f} from moment to moment, peak {peak_memory_mib():.1f}; "
         f"slope {slope:+.3f} MiB per 1,000 scans after the first {WARM_SHARE:.0%}",
         soft_wrap=True,
@@ -68,15 +67,15 @@ def main(
             path.write_text(json.dumps({"scans": scans, "slope_mib_per_1000": slope, "samples": samples}) + "\n")
 
 
-def cycle_floors(counts: NDArray[np.floating], resident: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The least resident memory, MiB, of each cycle of scans; of halves of what there is if it holds less than two.
+def cycle_levels(counts: NDArray[np.floating], resident: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The median resident memory, MiB, of each cycle of scans; of halves of what there is if it holds less than two.
 
     Args:
         counts: (N,) scans done at each sample, ascending.
         resident: (N,) MiB at each sample.
     """
     cycles = max(2, round(float(counts[-1] - counts[0]) / CYCLE))
-    return np.array([part.min() for part in np.array_split(resident, cycles)])
+    return np.array([np.median(part) for part in np.array_split(resident, cycles)])
 
 
 def _run(detector: Detector, count: int, only: str | None, console: Console) -> Iterator[int]:

@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, Bundle, CanvasFormat, PillarSection, Provenance
+from asca_deploy.bundle import (
+    BACKBONE,
+    ENCODER,
+    MANIFEST,
+    Bundle,
+    CanvasFormat,
+    Parity,
+    PillarSection,
+    Provenance,
+    RefineSection,
+)
 from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs
@@ -60,46 +70,78 @@ def export_bundle(
     """
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
-    config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
+    config, detector = checkpoint.config, checkpoint.detector
     if not (isinstance(config.model, PillarModel) and isinstance(detector, PillarDetector)):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
     progress("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         graphs.export_encoder(detector, graphs.graph_path(folder, ENCODER))
         gmac = _export_backbone(detector, graphs.graph_path(folder, BACKBONE), scans)
-        draft = Bundle(
-            name=config.name,
-            kind="pillar",
-            spec=config.model.spec,
-            pillar=PillarSection(
-                config.model.network.cpa,
-                config.model.network.pillar_channels,
-                CanvasFormat(),
-                config.model.network.neck,
-                detector.preparation.active_cells,
-            ),
-            precision="float32",
-            backbone_gmac=gmac,
-            graphs={},
-            parity=None,
-            quantization=None,
-            expected_input=expected or measure_expected_input(scans, config.data.camera_view),
-            expected_input_from="training" if expected else "export",
-            provenance=provenance(checkpoint, trained_on, command),
-            license=LICENSE,
+        network = config.model.network
+        section = PillarSection(
+            network.cpa, network.pillar_channels, CanvasFormat(), network.neck, detector.preparation.active_cells
         )
-        draft = graphs.sign(folder, draft)
-        write_bundle_manifest(folder, draft)
-        pipeline = PillarPipeline(folder, load_bundle(folder), threads=default_threads())
-        bundle = dataclasses.replace(draft, parity=prove_parity(detector, pipeline, scans))
-        write_bundle_manifest(folder, bundle)
+        draft = draft_bundle(checkpoint, scans, trained_on, command, pillar=section, backbone_gmac=gmac)
+
+        def prove(signed: Bundle) -> Parity:
+            return prove_parity(detector, PillarPipeline(folder, signed, threads=default_threads()), scans)
+
+        bundle = write_proven(folder, draft, prove)
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, progress)
     return bundle
 
 
-def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provenance:
-    """Where the weights of a checkpoint come from; see `export_bundle` for the arguments."""
+def draft_bundle(
+    checkpoint: Checkpoint,
+    scans: Sequence[NDArray[np.float32]],
+    trained_on: str,
+    command: str,
+    *,
+    pillar: PillarSection,
+    backbone_gmac: float,
+    refine: RefineSection | None = None,
+) -> Bundle:
+    """The manifest of a checkpoint in float32, without graphs and proof; scans (N, 4) and words as in `export_bundle`.
+
+    Args:
+        pillar: of the graphs.
+        backbone_gmac: multiply-accumulates of the backbone, 10^9.
+        refine: of the second stage, if there is one.
+    """
+    config, expected = checkpoint.config, checkpoint.expected_input
+    return Bundle(
+        name=config.name,
+        kind="pillar" if refine is None else "pillar_refine",
+        spec=config.model.spec,
+        pillar=pillar,
+        precision="float32",
+        backbone_gmac=backbone_gmac,
+        graphs={},
+        parity=None,
+        quantization=None,
+        expected_input=expected or measure_expected_input(scans, config.data.camera_view),
+        expected_input_from="training" if expected else "export",
+        provenance=_provenance(checkpoint, trained_on, command),
+        license=LICENSE,
+        refine=refine,
+    )
+
+
+def write_proven(folder: Path, draft: Bundle, prove: Callable[[Bundle], Parity]) -> Bundle:
+    """Sign the graphs in `folder`, and write their manifest with the parity that `prove` finds as the runtime opens it.
+
+    Raises:
+        ExportError: there is none.
+    """
+    signed = graphs.sign(folder, draft)
+    write_bundle_manifest(folder, signed)
+    bundle = dataclasses.replace(signed, parity=prove(load_bundle(folder)))
+    write_bundle_manifest(folder, bundle)
+    return bundle
+
+
+def _provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provenance:
     return Provenance(
         command=command,
         created=datetime.datetime.now(datetime.UTC).date().isoformat(),

@@ -10,15 +10,14 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Bundle, RefineSection, find_bundle
-from asca_deploy.manifest import load_bundle, write_bundle_manifest
+from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Bundle, Parity, RefineSection, find_bundle
+from asca_deploy.manifest import load_bundle
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_export import graphs
-from asca_export.exporter import LICENSE, MIN_SCANS, export_bundle, provenance
+from asca_export.exporter import MIN_SCANS, draft_bundle, export_bundle, write_proven
 from asca_export.neck_output import add_neck_output
 from asca_export.refine_graph import export_refine
 from asca_export.refine_parity import prove_refine_parity
-from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
@@ -46,7 +45,7 @@ def export_refine_bundle(
     """
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
-    config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
+    config, detector = checkpoint.config, checkpoint.detector
     if not isinstance(detector, RefineDetector):
         raise ExportError(f"model.kind {config.model.kind}: not a second stage")
     model = with_first_stage(dataclasses.replace(detector.model, spec=config.model.spec))
@@ -60,28 +59,21 @@ def export_refine_bundle(
         progress("Exporting the second stage and proving parity")
         path, classes = graphs.graph_path(folder, REFINE), len(model.spec.classes)
         export_refine(detector.refiner, model.refine.neighbors, model.bev_channels, classes, path)
-        draft = Bundle(
-            name=config.name,
-            kind="pillar_refine",
-            spec=model.spec,
+        draft = draft_bundle(
+            checkpoint._replace(config=dataclasses.replace(config, model=model)),
+            scans,
+            trained_on,
+            command,
             pillar=proposing.pillar,
-            precision="float32",
             backbone_gmac=proposing.backbone_gmac,
-            graphs={},
-            parity=None,
-            quantization=None,
-            expected_input=expected or measure_expected_input(scans, config.data.camera_view),
-            expected_input_from="training" if expected else "export",
-            provenance=provenance(checkpoint, trained_on, command),
-            license=LICENSE,
             refine=RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors),
         )
-        draft = graphs.sign(folder, draft)
-        write_bundle_manifest(folder, draft)
-        pipeline = RefinePipeline(folder, load_bundle(folder), threads=default_threads())
-        bundle = dataclasses.replace(draft, parity=prove_refine_parity(detector.refiner, stage, pipeline, model, scans))
-        write_bundle_manifest(folder, bundle)
-    return bundle
+
+        def prove(signed: Bundle) -> Parity:
+            pipeline = RefinePipeline(folder, signed, threads=default_threads())
+            return prove_refine_parity(detector.refiner, stage, pipeline, model, scans)
+
+        return write_proven(folder, draft, prove)
 
 
 def _first_bundle(

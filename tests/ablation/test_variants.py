@@ -83,10 +83,10 @@ def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(
     assert "| K=3 pooled | channel | - | fine | - |" in (tmp_path / "out" / "results.md").read_text()
 
 
-def test_a_failed_run_names_its_log(tmp_path: Path, config: str) -> None:
+def test_a_failed_run_names_its_log(tmp_path: Path) -> None:
     todo = runs(tmp_path / "out", [0], [VARIANTS["baseline"]])
     with pytest.raises(TrainingError, match=r"train\.log: `asca train` of baseline, seed 0 failed: .*nowhere"):
-        train_runs(todo, config, tmp_path / "nowhere", jobs=1)
+        train_runs(todo, str(tmp_path / "nowhere.yaml"), tmp_path, jobs=1)  # refused before torch is imported
     assert not todo[0].trained.exists()
 
 

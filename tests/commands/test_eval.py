@@ -16,13 +16,11 @@ from numpy.testing import assert_allclose
 from asca_deploy import default_bundle_path, load_bundle
 from asca_pillars.commands import eval as command
 from asca_pillars.commands.eval_steps import Protocol
-from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.models.build import build_model
 from asca_pillars.schema import to_dict
-from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
 BASE_INSTALL = """
@@ -84,21 +82,6 @@ def refusal(tmp_path: Path, **arguments) -> str:
     message = str(caught.value)
     assert "\n" not in message and not (tmp_path / "out" / "report.json").exists()
     return message.replace(f"{tmp_path}/", "")
-
-
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    return write_dataset(tmp_path / "kitti", 3, val_frames=2)
-
-
-@pytest.fixture
-def texts(root: Path) -> dict[str, Any]:
-    """The labels of all three frames, and as predictions the labels themselves."""
-    labels = root / "training" / "label_2"
-    for frame_id in KittiSplit(root).frame_ids:
-        scored = [KittiObject(**(vars(item) | {"score": 0.9})) for item in KittiSplit(root).objects(frame_id)]
-        write_labels(root.parent / "det" / f"{frame_id}.txt", scored)
-    return {"predictions": root.parent / "det", "labels": labels}
 
 
 def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,45 +227,6 @@ def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Pat
         "out: holds predictions and nothing that `asca eval` wrote; choose another folder, or empty it"
     )
     assert len(list(theirs.glob("*.txt"))) == 3
-
-
-def test_waymos_metric_of_labels_against_themselves(
-    tmp_path: Path, root: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """With scans at both levels, without them at LEVEL_2; every class and range that has objects gets 100."""
-    (texts["predictions"] / "000000.txt").unlink()
-    arguments: dict[str, Any] = {"predictions": texts["predictions"], "out": tmp_path / "out", "protocol": "waymo"}
-    report = evaluate(**arguments, data=root, json_path=tmp_path / "waymo.json")
-    assert json.loads((tmp_path / "waymo.json").read_text()) == report
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"waymo.json", "waymo.md"}
-    assert report["frames"] == 2 and {item["class_name"] for item in report["results"]} == set(CLASS_NAMES)
-    for item in report["results"]:
-        expected = [pytest.approx(100)] * 2 if item["objects"] else [None] * 2
-        assert [item["AP"], item["APH"]] == expected
-    means = [item["mAP"] for item in report["means"] if item["low_m"] == 0 and item["high_m"] is None]
-    assert means == pytest.approx([100, 100])
-    assert "LEVEL_1 is not evaluated" not in capsys.readouterr().out
-    blind = evaluate(**arguments, labels=texts["labels"])
-    assert blind["results"][0]["AP"] is None and blind["results"][4]["AP"] == pytest.approx(100)
-    assert blind["frames_without_predictions"] == ["000000"]
-    assert "LEVEL_1 is not evaluated" in capsys.readouterr().out
-
-
-def test_waymos_metric_of_the_shipped_bundle(tmp_path: Path, root: Path) -> None:
-    report = evaluate(data=root, out=tmp_path / "out", protocol="waymo")
-    assert "asca_small_sim_int8 on" in report["subject"] and report["model"]["min_score"] == 0.05
-    assert len(list((tmp_path / "out" / "predictions").glob("*.txt"))) == 2
-    again = evaluate(predictions=tmp_path / "out" / "predictions", data=root, out=tmp_path / "again", protocol="waymo")
-    assert again["results"] == report["results"]
-
-
-def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
-    waymo = {**texts, "protocol": "waymo"}
-    assert refusal(tmp_path, **waymo, score=0.5) == (
-        "--score 0.5 belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
-    )
-    assert "--gallery 2 belongs to --protocol kitti" in refusal(tmp_path, **waymo, data=root, gallery=2)
-    assert refusal(tmp_path, **texts, protocol="coco") == "--protocol coco: choose kitti, waymo, iou or distance"
 
 
 def test_a_class_that_kitti_does_not_know_is_left_out_and_named(

@@ -18,10 +18,11 @@ import yaml
 from asca_pillars.config import AugmentConfig, Config, DataConfig, TrainConfig
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ScanError, TrainingError
-from asca_pillars.evaluation.recall import RecallTally
+from asca_pillars.evaluation.recall import RecallRow, RecallTally
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.trainable import Trainable
 from asca_pillars.pillar_config import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.pillars.pillarize import PillarLimits
 from asca_pillars.schema import to_dict
@@ -57,18 +58,24 @@ def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: CpaReading, neck: L
     assert sum(len(boxes) for boxes in batch.boxes) == 8
     detector = build_model(config.model)
     optimizer = torch.optim.Adam(detector.parameters(), lr=3e-3)
-    for _ in range(150):
+    for step in range(1, 151):
         optimizer.zero_grad()
         torch.stack(list(detector.loss(detector.predict(batch.inputs), batch.inputs).values())).sum().backward()
         optimizer.step()
-    tally = RecallTally(spec.class_names)
+        if step % 25 == 0 and not (mistakes := _mistakes(detector, batch)):
+            break
+    assert not mistakes
+
+
+def _mistakes(detector: Trainable, batch: Batch) -> dict[str, RecallRow]:
+    """Rows of the classes of which an object is missed or made up."""
+    tally = RecallTally(SPEC.class_names)
     # Running statistics of the normalization lag behind so few steps: judge with those of the batch.
     with torch.no_grad():
-        found = detector.detect(detector.predict(batch.inputs), spec)
+        found = detector.detect(detector.predict(batch.inputs), SPEC)
     for detections, boxes, labels in zip(found, batch.boxes, batch.labels, strict=True):
         tally.add(detections, boxes, labels)
-    for name, row in tally.rows().items():
-        assert (row.recall, row.false) == (1.0, 0), f"{name}: {row}"
+    return {name: row for name, row in tally.rows().items() if (row.recall, row.false) != (1.0, 0)}
 
 
 def test_run_folder_and_checkpoint(tmp_path: Path) -> None:
