@@ -60,7 +60,7 @@ def import_dataset(
     from asca_pillars.data.importing.kitti_raw import read_kitti_raw
     from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
     from asca_pillars.data.importing.nuscenes import read_nuscenes
-    from asca_pillars.data.importing.waymo import read_waymo
+    from asca_pillars.data.importing.waymo_parquet import read_waymo
     from asca_pillars.data.scan_settings import ScanSettings
     from asca_pillars.errors import ConfigError
 

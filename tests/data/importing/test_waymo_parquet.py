@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from asca_pillars.cli import app
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.importing.waymo import read_waymo
+from asca_pillars.data.importing.waymo_parquet import read_waymo
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 
