@@ -168,11 +168,8 @@ def _of_axes(inspection: Inspection) -> Iterator[str]:
         return
     (_, axes), _ = Counter((doubt.about, doubt.axes) for doubt in inspection.doubts).most_common(1)[0]
     first = next(doubt for doubt in inspection.doubts if doubt.axes == axes)
-    remedy = (
-        "state how the sensor is tilted, `pose` in dataset.yaml"
-        if axes is None
-        else f"if so, state `axes: {axes}` in dataset.yaml"
-    )
+    key, what = ("pose: FILE", "how the sensor is tilted") if axes is None else (f"axes: {axes}", "the axes")
+    remedy = f"if so, state {what}, `{key}` in dataset.yaml"
     yield f"{len(inspection.doubts)} of {inspection.frames} scans are odd, the first: {first.text}: {remedy}"
 
 

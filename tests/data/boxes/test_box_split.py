@@ -180,7 +180,7 @@ def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
     (root / "labels.jsonl").write_text("".join(turned))
     wrong = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
     (text,) = [finding.text for finding in wrong if finding.about == "axes"]
-    assert "state `axes: y,-x,z` in dataset.yaml" in text
+    assert "state the axes, `axes: y,-x,z` in dataset.yaml" in text
     (root / "dataset.yaml").write_text("axes: y,-x,z\n")
     mended = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
     assert [finding.about for finding in mended] == [finding.about for finding in right]
