@@ -177,13 +177,15 @@ class Detections:
     ) -> NDArray[np.uint8]:
         """The scan and the boxes from above: an image (H, width_px, 3), blue, green, red as in OpenCV; ahead is up.
 
+        A notebook shows it as a picture.
+
         Args:
             points: (N, >=3) x, y, z in metres, LiDAR frame. None for those that a `Detector` found these boxes in:
                 it keeps a weak reference to them, so they are drawn as long as somebody else keeps the array.
             labels: (M, 7) true boxes in the scan's frame, drawn thin and white; None without any.
             width_px: of the image.
         """
-        from asca_pillars.pictures.visualize import draw_bev
+        from asca_pillars.pictures.visualize import Picture, draw_bev
 
         if points is None:
             points = self._source() if self._source is not None else None
@@ -198,7 +200,7 @@ class Detections:
             around = np.concatenate([points[:, :2], found.boxes[:, :2], [[0.0, 0.0]]])
             low, high = around.min(axis=0) - 5.0, around.max(axis=0) + 5.0
             ranges = Ranges((low[0], high[0]), (low[1], high[1]), (-np.inf, np.inf))
-        return draw_bev(points, found, ranges, labels=labels, width_px=width_px)
+        return draw_bev(points, found, ranges, labels=labels, width_px=width_px).view(Picture)
 
     def _level_boxes(self) -> NDArray[np.float32]:
         return self.boxes if self._level is None else self._level.boxes(self.boxes)

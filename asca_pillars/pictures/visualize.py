@@ -5,6 +5,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -49,6 +50,13 @@ def write_png(path: str | Path, image: Image) -> None:
 def png_bytes(image: Image) -> bytes:
     """An image (H, W, 3), blue, green, red, as the bytes of a PNG file."""
     return cv2.imencode(".png", image)[1].tobytes()
+
+
+class Picture(np.ndarray[Any, np.dtype[np.uint8]]):
+    """An image array (H, W, 3), blue, green, red, that a notebook shows as what it is."""
+
+    def _repr_png_(self) -> bytes | None:
+        return png_bytes(self) if self.ndim == 3 and self.dtype == np.uint8 else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,11 +3,15 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from asca_deploy import sample_scan_path
 from asca_pillars.cli import app
-from asca_pillars.data.boxes.box_records import json_line, read_frames
+from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import write_dataset
@@ -64,6 +68,32 @@ def test_a_model_is_run_and_scores_the_same_again(root: Path, tmp_path: Path) ->
     run("--data", root, "--out", first)  # replaces its own
 
 
+def test_scans_of_another_mounting_are_brought_to_the_models(tmp_path: Path) -> None:
+    """The sample, x to the right and z = 0 on the ground: predictions are in the scans' own frame, as labels are."""
+    sample = read_scan(sample_scan_path()).points
+    mounting = Mounting(axes="y-forward")
+    lift = np.array([0, 0, 1.7, 0], np.float32)
+    found = []
+    for name, points, text in (
+        ("plain", sample, "sensor_height: 1.7\n"),
+        ("other", mounting.level.inverse.points(sample) + lift, "{sensor_height: 0.0, axes: y-forward}\n"),
+    ):
+        root = tmp_path / name
+        write_scan(root / "scans" / "1.bin", points)
+        box = np.array([[12.0, 3, -1, 4, 1.6, 1.5, 0.3]])
+        own = box if name == "plain" else mounting.level.inverse.boxes(box) + np.array([0, 0, 1.7, 0, 0, 0, 0])
+        (root / "labels.jsonl").write_text(json_line("1.bin", records_from(own, ["Car"])))
+        (root / "dataset.yaml").write_text(text)
+        run("--data", root, "--split", "training", "--out", tmp_path / f"{name}_out", "--around")
+        ((_, records, _),) = read_frames(tmp_path / f"{name}_out" / "predictions" / "detections.jsonl")
+        found.append(records)
+    plain, other = found
+    sure = plain.scores > 0.5
+    here = mounting.level.inverse.boxes(plain.boxes[sure])[:, :3] + lift[:3]
+    assert sure.sum() > 8 and (plain.boxes[sure, 0] < -5).any()
+    assert (np.linalg.norm(here[:, None] - other.boxes[None, :, :3], axis=2).min(axis=1) < 0.2).all()
+
+
 def test_kitti_data_is_scored_too(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "kitti", 2)
     run("--data", root, "--out", tmp_path / "out", "--protocol", "distance")
@@ -87,6 +117,9 @@ def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_pat
     [
         (["--protocol", "iou"], "needs the labels: give --data"),
         (["--protocol", "kitti", "--data", "{root}"], "has no camera, which it needs; choose iou or distance"),
+        (["--data", "{root}", "--around", "--predictions", "x"], "--around runs a model"),
+        (["--data", "{root}", "--around", "--protocol", "waymo"], "--around needs labels in every direction"),
+        (["run.ckpt", "--data", "{root}", "--around"], "--around runs bundles: export the checkpoint first"),
         (["--data", "{root}", "--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),
         (["--data", "{root}", "--labels", "x"], "--labels x belongs to"),
         (["--data", "{root}", "--score", "nan"], "--score nan must be a number"),

@@ -1,5 +1,6 @@
 """What is wrong with a dataset before anything is trained on it, each with its remedy."""
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
@@ -18,6 +19,7 @@ BOXES_MISSED = 0.02
 POINTS_OUTSIDE = 0.75  # a grid that looks forward loses half of what a sensor sees in a full turn
 POINTS_CUT = 0.2
 SCANS_OVER_MAX_PILLARS = 0.05
+ODD_SCANS = 0.5  # single scans of other sensors look turned: on wide streets and at crossings
 FEWEST_BOXES = 10  # with fewer a share or a mean says nothing
 DIM_REFLECTANCE = 0.1  # the brightest point of all scans; the reflectance was scaled down twice
 
@@ -55,6 +57,7 @@ def findings(inspection: Inspection, spec: PillarSpec, min_points: int) -> list[
                 Finding("warning", facts.name, f"{facts.name}: {text}") for text in _of_class(facts, spec, min_points)
             ]
     scans = inspection.scans
+    found += [Finding("warning", "axes", text) for text in _of_axes(inspection)]
     found += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
     found += [Finding("warning", "height", text) for text in _of_height(inspection)]
     found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, spec)]
@@ -158,6 +161,16 @@ def _of_reflectance(scans: ScanFacts, frames: int) -> Iterator[str]:
             f"reflectance reaches {high:.4g} and is divided by 255 when read: training sees 0 to {high / 255:.2f}; "
             "divide it by its full scale in the files, then no dark scan is taken for one of 0..1"
         )
+
+
+def _of_axes(inspection: Inspection) -> Iterator[str]:
+    if len(inspection.doubts) <= ODD_SCANS * inspection.frames:
+        return
+    (_, axes), _ = Counter((doubt.about, doubt.axes) for doubt in inspection.doubts).most_common(1)[0]
+    first = next(doubt for doubt in inspection.doubts if doubt.axes == axes)
+    key, what = ("pose: FILE", "how the sensor is tilted") if axes is None else (f"axes: {axes}", "the axes")
+    remedy = f"if so, state {what}, `{key}` in dataset.yaml"
+    yield f"{len(inspection.doubts)} of {inspection.frames} scans are odd, the first: {first.text}: {remedy}"
 
 
 def _of_height(inspection: Inspection) -> Iterator[str]:

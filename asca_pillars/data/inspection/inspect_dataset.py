@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from asca_pillars.config import DataConfig
+from asca_pillars.data.frame_check import FrameDoubt
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError, ScanError
@@ -111,7 +112,7 @@ class Inspection:
     """What was found in `frames` of a split's frames.
 
     `types` counts the labels by type, those of no class included; `damaged` holds a line for each frame that was
-    wanted and cannot be read.
+    wanted and cannot be read, `doubts` what is odd about the axes of a scan, for each scan where something is.
     """
 
     data: str
@@ -123,6 +124,7 @@ class Inspection:
     classes: tuple[ClassFacts, ...]
     scans: ScanFacts
     damaged: tuple[str, ...]
+    doubts: tuple[FrameDoubt, ...]
 
     @property
     def sampled(self) -> bool:
@@ -169,6 +171,7 @@ def inspect_dataset(
         classes=tuple(_class_facts(measured, index, spec, data.min_points) for index in range(len(spec.classes))),
         scans=_scan_facts([frame.scan for frame in measured], spec),
         damaged=tuple(map(str, damaged)),
+        doubts=tuple(frame.doubt for frame in measured if frame.doubt is not None),
     )
 
 

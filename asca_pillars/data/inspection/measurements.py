@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import DataConfig
-from asca_pillars.data.frame_check import ground_z_m
+from asca_pillars.data.frame_check import FrameDoubt, doubt_frame, ground_z_m
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.anchors import IGNORED
@@ -17,6 +17,9 @@ from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.pillars.pillar_spec import PillarSpec
+
+DOUBT_POINTS = 8_192
+"""Of a scan that its axes are judged by."""
 
 
 class MatchOutcome(IntEnum):
@@ -57,7 +60,7 @@ class FrameMeasure(NamedTuple):
     """A frame: its labels by type, the M objects of the C classes, and its scan.
 
     `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `outcomes` (M,), `positives` (C,) positive
-    anchors of each class.
+    anchors of each class, `doubt` what is odd about the scan's axes.
     """
 
     types: Counter[str]
@@ -67,6 +70,7 @@ class FrameMeasure(NamedTuple):
     outcomes: NDArray[np.int64]
     positives: NDArray[np.int64]
     scan: ScanMeasure
+    doubt: FrameDoubt | None
 
 
 def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: DataConfig) -> FrameMeasure:
@@ -81,6 +85,8 @@ def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: Da
     to_find = replace(frame, labels=np.where(points < data.min_points, IGNORED, frame.labels))
     outcomes, positives = match(to_find, spec)
     own = frame.labels != IGNORED
+    scan = measure_scan(split.stored_points(frame_id), frame.points, spec)
+    sample = frame.points[:: max(1, len(frame.points) // DOUBT_POINTS)]
     return FrameMeasure(
         types=Counter(split.label_types(frame_id)),
         boxes=frame.boxes[own],
@@ -88,7 +94,8 @@ def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: Da
         points=points[own],
         outcomes=outcomes[own],
         positives=positives,
-        scan=measure_scan(split.stored_points(frame_id), frame.points, spec),
+        scan=scan,
+        doubt=doubt_frame(sample, None if np.isnan(scan.ground_z_m) else scan.ground_z_m) if len(sample) else None,
     )
 
 

@@ -29,7 +29,7 @@ from asca_pillars.geometry.boxes import wrap_angle
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
 ERROR_DISTANCE_M = 2.0
 RECALLS = np.linspace(0, 1, 101)
-_FIRST = 11  # the first recall above the floor of 0.1
+_FIRST = 11  # the first recall above the floor of 0.1, as in the devkit: its index is one beyond the floor's
 _FLOOR = 0.1  # of precision
 
 

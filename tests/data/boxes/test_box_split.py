@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.config import Config, DataConfig, InsertConfig
-from asca_pillars.data.boxes.box_records import json_line, records_from
+from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
@@ -16,7 +16,7 @@ from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.open_split import open_split
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.pillar_config import PillarModel
@@ -164,3 +164,24 @@ def test_inspection_and_insertion_read_it(root: Path) -> None:
     grown = insert_objects(frame, inserter, np.random.default_rng(0))
     assert len(grown.boxes) > len(frame.boxes)
     assert inserter.free_space("000000").free.any()
+
+
+def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
+    """The scenes are ahead of the sensor only: with x to the right they stand to the left."""
+    spec = CONFIG.model.spec
+    right = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
+    assert not [finding for finding in right if finding.about == "axes"]
+    level = Mounting(axes="y-forward").level
+    for path in (root / "scans").iterdir():
+        write_scan(path, level.inverse.points(read_scan(path).points))
+    turned = [
+        json_line(scan, records_from(level.inverse.boxes(records.boxes), records.types))
+        for scan, records, _ in list(read_frames(root / "labels.jsonl"))
+    ]
+    (root / "labels.jsonl").write_text("".join(turned))
+    wrong = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
+    (text,) = [finding.text for finding in wrong if finding.about == "axes"]
+    assert "state the axes, `axes: y,-x,z` in dataset.yaml" in text
+    (root / "dataset.yaml").write_text("axes: y,-x,z\n")
+    mended = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
+    assert [finding.about for finding in mended] == [finding.about for finding in right]

@@ -126,6 +126,16 @@ def test_nuscenes_floors() -> None:
     )
 
 
+def test_nuscenes_counts_from_the_first_recall_above_the_floor_on() -> None:
+    # 11 of 100 found, all at score 0.9 and 0.3 m off: of the 90 samples from recall 0.11 on the first one alone counts.
+    objects = [box(10.0 * k) for k in range(1, 101)]
+    found = [(0.9, box(10.0 * k + 0.3)) for k in range(1, 12)]
+    score = nuscenes_scores([frame(objects, found)], ["Car"])[0]
+    assert score.ap == pytest.approx(100 / 90) and score.ate_m == pytest.approx(0.3)
+    score = nuscenes_scores([frame(objects, found[:10])], ["Car"])[0]
+    assert score.ap == 0 and score.ate_m == 1
+
+
 def test_argoverse_by_hand() -> None:
     # One of two found, 1.5 m off in z: a true positive at 2 and 4 m. Recall 1/2: 51 of 101 samples.
     low = [10, 0, -2.5, 4, 2, 1.5, math.pi / 2]
