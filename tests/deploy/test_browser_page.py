@@ -81,7 +81,7 @@ def failure(tab: Tab) -> str:
 
 def wait_for(tab: Tab, state: str) -> None:
     time.sleep(0.1)  # a click is on its way
-    end = time.monotonic() + 60
+    end = time.monotonic() + 200
     found = None
     while found not in ("done", "failed"):
         assert time.monotonic() < end, "the page does not come to an end"
