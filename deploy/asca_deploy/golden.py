@@ -90,7 +90,11 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
         return {**stages, **_second_stage(pipeline, pipeline.backbone.infer_with_neck(placed), points)}
     spec, answer = pipeline.spec, pipeline.backbone.run(placed)
     candidates = decode_candidates(answer.maps, spec.anchors, spec.classes, spec.post, answer.cells)
-    boxes = {"boxes": candidates.boxes, "scores": sigmoid(candidates.logits), "labels": candidates.labels}
+    boxes: dict[str, NDArray[Any]] = {
+        "boxes": candidates.boxes,
+        "scores": sigmoid(candidates.logits),
+        "labels": candidates.labels,
+    }
     found = suppress(candidates, spec.classes, spec.post)
     return {**stages, "neck+head": _answered(answer), "decode": boxes, "suppress": _detections(found)}
 
