@@ -17,6 +17,8 @@ from tests.documentation import DOCS, Block, blocks, run, write_files
 PAGES = {str(page.relative_to(DOCS)): page for page in sorted(DOCS.rglob("*.md"))}
 RECORDS = {"MODEL_CARD.md", "PERFORMANCE.md", "RESULTS.md"}
 """Pages of measurements: their commands are the hours that the figures took."""
+MADE_HERE = {"DATA.md": ("data/own", "runs")}
+"""What the blocks of a page make themselves, beside the files that all pages take for granted."""
 JOURNEYS = ("index.md", "guide/own_scans.md", "SENSORS.md", "DATA.md", "guide/deploy.md", "EVALUATION.md")
 
 
@@ -34,6 +36,8 @@ def runs(name: str) -> list[Block]:
 @pytest.mark.parametrize("name", [name for name in PAGES if runs(name)])
 def test_every_block_runs(name: str, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(files, tmp_path, dirs_exist_ok=True, symlinks=True)
+    for folder in MADE_HERE.get(name, ()):
+        shutil.rmtree(tmp_path / folder)
     monkeypatch.chdir(tmp_path)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)
     for block in runs(name):

@@ -19,10 +19,14 @@ from asca_deploy.canvas_backbone import Canvas
 from asca_deploy.detector import Detector
 from asca_deploy.pillar_backbone import HeadAnswer
 from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.refine_pipeline import RefinePipeline, refine_inputs
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import BundleError
 from asca_pillars.files import atomic_directory, write_json
 from asca_pillars.geometry.decode import HeadMaps, decode_candidates, sigmoid, suppress
+from asca_pillars.geometry.detections import Detections
+from asca_pillars.points.first_stage import FirstPass, proposed_from
+from asca_pillars.points.refine_geometry import refine_scan
+from asca_pillars.points.refined_detections import reported_detections
 from asca_pillars.system import cpu_model, package_versions
 from asca_pillars.tables.neck_tables import table_inputs
 
@@ -44,16 +48,12 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
         What was written, see `golden_stages`.
 
     Raises:
-        BundleError: the bundle cannot be used, or is of kind pillar_refine.
+        BundleError: the bundle cannot be used.
         ScanError: the scan cannot be read.
         OutputError: `out` holds something else.
     """
     detector = Detector(bundle, threads=1)
-    if not isinstance(detector.pipeline, PillarPipeline):
-        raise BundleError(
-            f"{detector.folder}: kind {detector.bundle.kind}; golden vectors are written for kind pillar, such as its "
-            "first stage"
-        )
+    assert isinstance(detector.pipeline, PillarPipeline | RefinePipeline), "there are no other kinds"
     stages = golden_stages(detector.pipeline, read_scan(scan).points)
     with atomic_directory(out, "asca export --golden", GOLDEN) as folder:
         for stage, arrays in stages.items():
@@ -63,22 +63,18 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
     return stages
 
 
-def golden_stages(pipeline: PillarPipeline, points: NDArray[np.float32]) -> Stages:
+def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.float32]) -> Stages:
     """The arrays of each stage, by stage and name, for the finite points (N, 4), metres, and reflectance within 0..1.
 
     Stages, for M points in P pillars: `input`, `pillarize`, `encode`, `scatter` (or `tables` of a sparse neck),
-    `neck+head`, `decode` (n boxes above their thresholds) and `suppress` (those that stay). Maps are channels last, as
-    the graph gives them.
+    `neck+head`, `decode` (n boxes above their thresholds) and `suppress` (those that stay). With a second stage, after
+    `neck+head`: `propose`, `neighbors`, `refine` and `suppress`. Maps are channels last, as the graph gives them.
     """
-    bundle, spec = pipeline.bundle, pipeline.spec
-    pillars = pipeline.pillarize(points)
-    features = pipeline.encode(pillars)
-    placed = pipeline.backbone.place(features, pillars.cells)
-    given = _placed(placed)  # before the canvas is used for the next scan
-    answer = pipeline.backbone.run(placed)
-    candidates = decode_candidates(answer.maps, spec.anchors, spec.classes, spec.post, answer.cells)
-    found = suppress(candidates, spec.classes, spec.post)
-    return {
+    first = pipeline if isinstance(pipeline, PillarPipeline) else pipeline.first
+    pillars = first.pillarize(points)
+    features = first.encode(pillars)
+    placed = first.backbone.place(features, pillars.cells)
+    stages: dict[str, Mapping[str, NDArray[Any]]] = {
         "input": {"points": points},
         "pillarize": {
             "features": pillars.features,
@@ -87,15 +83,38 @@ def golden_stages(pipeline: PillarPipeline, points: NDArray[np.float32]) -> Stag
             "cells": pillars.cells,
         },
         "encode": {"pillar_features": features},
-        ("scatter" if bundle.pillar.neck == "dense" else "tables"): given,
-        "neck+head": _answered(answer),
-        "decode": {
-            "boxes": candidates.boxes,
-            "scores": sigmoid(candidates.logits),
-            "labels": candidates.labels,
-        },
-        "suppress": {"boxes": found.boxes, "scores": found.scores, "labels": found.labels},
+        # Before the canvas is used for the next scan.
+        ("scatter" if first.bundle.pillar.neck == "dense" else "tables"): _placed(placed),
     }
+    if isinstance(pipeline, RefinePipeline):
+        return {**stages, **_second_stage(pipeline, pipeline.backbone.infer_with_neck(placed), points)}
+    spec, answer = pipeline.spec, pipeline.backbone.run(placed)
+    candidates = decode_candidates(answer.maps, spec.anchors, spec.classes, spec.post, answer.cells)
+    boxes: dict[str, NDArray[Any]] = {
+        "boxes": candidates.boxes,
+        "scores": sigmoid(candidates.logits),
+        "labels": candidates.labels,
+    }
+    found = suppress(candidates, spec.classes, spec.post)
+    return {**stages, "neck+head": _answered(answer), "decode": boxes, "suppress": _detections(found)}
+
+
+def _second_stage(pipeline: RefinePipeline, first: FirstPass, points: NDArray[np.float32]) -> Stages:
+    proposed = proposed_from(first, points, pipeline.spec, pipeline.section.seen)
+    scan = refine_scan(points, proposed, proposed.proposals, pipeline.section.neighbors)
+    confidence, residuals = pipeline.refine(scan)
+    found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec)
+    return {
+        "neck+head": {**_answered(HeadAnswer(first.maps, None)), "neck": first.neck},
+        "propose": _detections(proposed.proposals),
+        "neighbors": refine_inputs(scan),
+        "refine": {"confidence": confidence, "residuals": residuals},
+        "suppress": _detections(found),
+    }
+
+
+def _detections(found: Detections) -> dict[str, NDArray[Any]]:
+    return {"boxes": found.boxes, "scores": found.scores, "labels": found.labels}
 
 
 def _placed(placed: Any) -> dict[str, NDArray[Any]]:

@@ -78,11 +78,11 @@ class RefinePipeline:
         for kernels in (ball_query.KERNELS, columns.KERNELS):
             load_kernels(kernels)  # here rather than in the first scan
         self.spec: PillarSpec = bundle.spec
-        self._section = bundle.refine
-        self._first = PillarPipeline(folder, bundle, provider, precision, threads)
-        backbone = self._first.backbone
+        self.section = bundle.refine
+        self.first = PillarPipeline(folder, bundle, provider, precision, threads)
+        backbone = self.first.backbone
         assert isinstance(backbone, CanvasBackbone), "`load_bundle` lets no sparse neck through"
-        self._backbone = backbone
+        self.backbone = backbone
         path = folder / bundle.graphs[REFINE].file
         session = providers.open_session(path, "cpu", "float32", threads)
         inputs, outputs = refine_interface(bundle.refine, len(bundle.spec.classes))
@@ -90,19 +90,19 @@ class RefinePipeline:
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedScan:
         """Points (N, 4) -> the first stage's pseudo-image."""
-        return PreparedScan(self._first.prepare(points, laps), points)
+        return PreparedScan(self.first.prepare(points, laps), points)
 
     def infer(self, prepared: PreparedScan, laps: Laps) -> FirstAnswer:
         """The pseudo-image -> the first stage's head maps and its neck's map."""
-        found = self._backbone.infer_with_neck(prepared.pillars.placed)
+        found = self.backbone.infer_with_neck(prepared.pillars.placed)
         laps.append(("neck+head", perf_counter()))
         return FirstAnswer(found, prepared.points)
 
     def finish(self, raw: FirstAnswer, laps: Laps) -> Detections:
         """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
-        proposed = proposed_from(raw.found, raw.points, self.spec, self._section.seen)
+        proposed = proposed_from(raw.found, raw.points, self.spec, self.section.seen)
         laps.append(("propose", perf_counter()))
-        scan = refine_scan(raw.points, proposed, proposed.proposals, self._section.neighbors)
+        scan = refine_scan(raw.points, proposed, proposed.proposals, self.section.neighbors)
         laps.append(("neighbors", perf_counter()))
         confidence, residuals = self.refine(scan)
         laps.append(("refine", perf_counter()))

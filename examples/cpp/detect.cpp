@@ -54,7 +54,9 @@ json read_manifest(const std::string& folder) {
 
 Ort::Session open(const Ort::Env& env, const std::string& folder, const json& manifest, const char* graph) {
     Ort::SessionOptions options;
-    options.SetIntraOpNumThreads(1);  // the encoder needs that, see docs/BUNDLE.md
+    // See docs/BUNDLE.md: the encoder needs one thread; the optimizer would quantize layers that are kept in floating point.
+    options.SetIntraOpNumThreads(1);
+    options.AddConfigEntry("optimization.disable_specified_optimizers", "WeightBiasQuantization");
     const std::string path = folder + "/" + manifest.at("graphs").at(graph).at("file").get<std::string>();
     return Ort::Session(env, path.c_str(), options);
 }

@@ -99,7 +99,7 @@ def open_tab(profile: Path) -> Iterator[Tab]:
     )
     os.close(browser_reads)
     os.close(browser_writes)
-    watchdog = threading.Timer(120, process.kill)
+    watchdog = threading.Timer(600, process.kill)
     watchdog.start()
     tab = None
     try:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -57,6 +58,7 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
     with file_server(page) as address:
         tab.call("Page.navigate", url=address)
         assert_same(finished(tab, "sample.bin"), detector(points))
+        assert_drawn(tab, tmp_path / "page.png")
         tab.evaluate("document.getElementById('again').click()")
         warm = finished(tab, "sample.bin")
         tab.choose_file("#file", tmp_path / "half.bin")
@@ -81,7 +83,7 @@ def failure(tab: Tab) -> str:
 
 def wait_for(tab: Tab, state: str) -> None:
     time.sleep(0.1)  # a click is on its way
-    end = time.monotonic() + 60
+    end = time.monotonic() + 200
     found = None
     while found not in ("done", "failed"):
         assert time.monotonic() < end, "the page does not come to an end"
@@ -97,6 +99,18 @@ def assert_same(saved: Any, expected: Any) -> None:
     assert np.linalg.norm(centers - expected.boxes[:, :3], axis=1).max() < NEAR_M
     np.testing.assert_allclose([box["score"] for box in saved["boxes"]], expected.scores, atol=0.02)
     assert saved["pillars"] == expected.report.counts.pillars
+
+
+def assert_drawn(tab: Tab, path: Path) -> None:
+    """Points, boxes in the color of cars, and a label for each box."""
+    tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    tab.screenshot(path)
+    scene = cv2.imread(str(path))[: int(tab.evaluate("document.getElementById('scene').clientHeight"))].astype(int)
+    background, car = np.array([26, 20, 15]), np.array([41, 166, 255])  # blue, green, red
+    assert (np.abs(scene - background).max(axis=2) > 30).mean() > 0.02
+    assert (np.abs(scene - car).max(axis=2) < 12).sum() > 50
+    labels = tab.evaluate("document.getElementById('labels').innerText").split("\n")
+    assert sum(label.startswith("Car ") for label in labels) == 6
 
 
 def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_path: Path) -> None:

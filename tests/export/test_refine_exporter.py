@@ -15,7 +15,9 @@ import torch
 
 from asca_deploy import Detector
 from asca_deploy.bundle import GRAPHS, MANIFEST
+from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_bundle
+from asca_deploy.refine_pipeline import RefinePipeline
 from asca_export import refine_exporter
 from asca_export.exporter import export_bundle
 from asca_export.refine_exporter import export_refine_bundle
@@ -60,6 +62,16 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         patch.setattr(refine_exporter, "export_bundle", export_and_keep)
         export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
     return last, folder / "bundle"
+
+
+def test_golden_vectors_of_both_stages(trained: tuple[Path, Path]) -> None:
+    detector = Detector(trained[1], score_threshold=0.0, threads=1)
+    assert isinstance(detector.pipeline, RefinePipeline)
+    stages = golden_stages(detector.pipeline, SCANS[0])
+    assert list(stages)[-5:] == ["neck+head", "propose", "neighbors", "refine", "suppress"]
+    assert stages["neck+head"]["neck"].shape[:2] == stages["neck+head"]["scores"].shape[:2]
+    assert len(stages["refine"]["confidence"]) == len(stages["propose"]["boxes"]) > 0
+    np.testing.assert_array_equal(stages["suppress"]["boxes"], detector(SCANS[0]).boxes)
 
 
 def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None:

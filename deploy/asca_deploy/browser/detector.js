@@ -4,6 +4,9 @@ import { decodeCandidates, suppress } from "./boxes.js";
 import { makeGrid } from "./grid.js";
 import { Canvas, pillarize } from "./pillars.js";
 
+// It would quantize layers that an 8-bit bundle keeps in floating point (docs/BUNDLE.md).
+const OPTIONS = { extra: { optimization: { disable_specified_optimizers: "WeightBiasQuantization" } } };
+
 export class Detector {
   /**
    * @param {object} manifest bundle.json
@@ -19,8 +22,8 @@ export class Detector {
     detector.ort = ort;
     detector.manifest = manifest;
     detector.grid = makeGrid(manifest.spec.grid);
-    detector.encoder = await ort.InferenceSession.create(graphs.encoder);
-    detector.backbone = await ort.InferenceSession.create(graphs.backbone);
+    detector.encoder = await ort.InferenceSession.create(graphs.encoder, OPTIONS);
+    detector.backbone = await ort.InferenceSession.create(graphs.backbone, OPTIONS);
     detector.canvas = new Canvas(detector.grid, manifest.pillar.channels, manifest.pillar.canvas);
     return detector;
   }

@@ -14,10 +14,11 @@ let scene;
 let classes = [];
 let last; // the file that is shown
 let busy = false;
+let asked = 0;
 
 /** Let the worker do one of its tasks. */
 function ask(task, given = {}) {
-  const id = crypto.getRandomValues(new Uint32Array(1))[0];
+  const id = asked++;
   worker.postMessage({ id, task, ...given });
   return new Promise((resolve, reject) => waiting.set(id, { resolve, reject }));
 }
