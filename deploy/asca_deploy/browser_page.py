@@ -79,7 +79,7 @@ def find_ort_web(given: Path | None) -> Path:
 
 def _modules() -> list[Path]:
     folder = Path(str(resources.files("asca_deploy") / "browser"))
-    return sorted(path for path in folder.iterdir() if path.suffix in (".html", ".css", ".js"))
+    return sorted(path for path in folder.iterdir() if path.suffix in (".html", ".css", ".js", ".json"))
 
 
 def _open_package(path: Path) -> tuple[str, Callable[[str], bytes]]:
