@@ -34,14 +34,15 @@ def corrupt_objects(
         return points
     points = points.copy()
     kept = np.ones(len(points), dtype=bool)
-    for own in points_in_boxes(points, boxes).T:
+    for inside in points_in_boxes(points, boxes).T:
+        own = np.flatnonzero(inside)
         if brighten:
             gain = np.exp(rng.uniform(np.log(low), np.log(high)))  # twice as bright is as likely as half
             points[own, 3] = np.minimum(points[own, 3] * gain, 1)
         if shake:
-            points[own, :3] += rng.normal(0, config.object_jitter_m, (np.count_nonzero(own), 3))
+            points[own, :3] += rng.normal(0, config.object_jitter_m, (len(own), 3))
         if config.object_cut_probability and rng.random() < config.object_cut_probability:
-            rows = np.flatnonzero(own & kept)
+            rows = own[kept[own]]
             cut = _cut(points[rows, :3], rng)
             if len(rows) - np.count_nonzero(cut) >= FEWEST_POINTS:
                 kept[rows[cut]] = False

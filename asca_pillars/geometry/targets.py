@@ -73,11 +73,12 @@ def assign_targets(
             if iou.size and iou.max() > 0:
                 offset = [part.start for part in window]
                 forced.append((np.argwhere(iou == iou.max()) + offset, box_index))
-    state = np.zeros((rows, columns, per_cell), dtype=np.int8)
-    for class_index, spec in enumerate(classes):
-        own = (..., _anchors_of(class_index))
-        state[own] = np.where(best_iou[own] >= spec.negative_iou, -1, 0)
-        state[own] = np.where(best_iou[own] >= spec.positive_iou, 1, state[own])
+    positive_iou, negative_iou = (
+        np.repeat([getattr(spec, name) for spec in classes], len(ANCHOR_YAWS_RAD))
+        for name in ("positive_iou", "negative_iou")
+    )
+    state = -(best_iou >= negative_iou).astype(np.int8)
+    state[best_iou >= positive_iou] = 1
     state[ignored & (state == 0)] = -1
     for places, box_index in forced:
         state[tuple(places.T)] = 1

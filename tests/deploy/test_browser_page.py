@@ -105,7 +105,9 @@ def assert_drawn(tab: Tab, path: Path) -> None:
     """Points, boxes in the color of cars, and a label for each box."""
     tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     tab.screenshot(path)
-    scene = cv2.imread(str(path))[: int(tab.evaluate("document.getElementById('scene').clientHeight"))].astype(int)
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    scene = picture[: int(tab.evaluate("document.getElementById('scene').clientHeight"))].astype(int)
     background, car = np.array([26, 20, 15]), np.array([41, 166, 255])  # blue, green, red
     assert (np.abs(scene - background).max(axis=2) > 30).mean() > 0.02
     assert (np.abs(scene - car).max(axis=2) < 12).sum() > 50
