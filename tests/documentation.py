@@ -88,7 +88,7 @@ def write_files(root: Path) -> None:
     lines = [_with_score(json_line(frame.scan, records)) for frame, records in zip(frames, scored, strict=True)]
     (root / "results" / "detections.jsonl").write_text("".join(lines))
 
-    for name in ("kitti", "sim"):
+    for name in ("kitti", "sim", "around"):
         write_dataset(root / "data" / name, 2)
     labels = root / "data" / "kitti" / "training" / "label_2"
     (root / "label_2").symlink_to(labels)
