@@ -29,6 +29,10 @@ def import_dataset(
         ),
     ] = "boxes",
     scans: Annotated[Path | None, typer.Option("--scans", help="Folder of the scans; with --from boxes.")] = None,
+    rename: Annotated[
+        list[str] | None,
+        typer.Option("--rename", help="OLD=NEW, a class by another name; several may get one name. Repeatable."),
+    ] = None,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
     pose: PoseOption = None,
@@ -56,7 +60,7 @@ def import_dataset(
     from asca_pillars.commands.scan_input import scan_settings
     from asca_pillars.data.importing.argoverse2 import read_argoverse2
     from asca_pillars.data.importing.box_files import read_box_files
-    from asca_pillars.data.importing.imported import Importer, write_imported
+    from asca_pillars.data.importing.imported import Importer, renamed, write_imported
     from asca_pillars.data.importing.kitti_raw import read_kitti_raw
     from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
     from asca_pillars.data.importing.nuscenes import read_nuscenes
@@ -88,7 +92,10 @@ def import_dataset(
         imported = read_waymo(source, out)
     else:
         imported = importers[source_format](source)
-    counts = write_imported(out, imported, val_share)
+    if wrong := [text for text in rename or () if not all(text.partition("="))]:
+        raise ConfigError(f"--rename {wrong[0]}: write OLD=NEW, such as --rename REGULAR_VEHICLE=Car")
+    names = dict(text.split("=", 1) for text in rename or ())
+    counts = write_imported(out, renamed(imported, names), val_share)
     boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"
     console = Console(markup=False, highlight=False)
     console.print(f"{out}: {counts.train} frames to train on, {counts.val} to validate; boxes: {boxes}", soft_wrap=True)

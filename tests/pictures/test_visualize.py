@@ -202,9 +202,7 @@ def test_boxes_on_the_image_take_given_colors():
 
 
 def test_a_plot_is_a_picture_in_a_notebook() -> None:
-    found = Detections(
-        np.array([[10, 2, -1, 4, 1.6, 1.5, 0.3]], np.float32), np.ones(1, np.float32), np.zeros(1, np.int64), ("Car",)
-    )
+    found = detections([10, 2, -1, 4, 1.6, 1.5, 0.3])
     picture = found.plot(np.random.default_rng(0).uniform(-20, 20, (500, 4)), labels=found.boxes + 1)
     shown = cv2.imdecode(np.frombuffer(picture._repr_png_(), np.uint8), cv2.IMREAD_COLOR)  # type: ignore[attr-defined]
     np.testing.assert_array_equal(shown, picture)

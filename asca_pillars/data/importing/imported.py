@@ -5,7 +5,7 @@ Nothing is copied that can be referred to.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ import yaml
 from asca_pillars.data.boxes.box_records import BoxRecords, json_line
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, frame_id_of
 from asca_pillars.data.kitti import write_image_set
-from asca_pillars.errors import DatasetError
+from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict
 
@@ -46,6 +46,26 @@ class ImportCounts(NamedTuple):
     train: int
     val: int
     boxes: dict[str, int]
+
+
+def renamed(imported: Imported, names: Mapping[str, str]) -> Imported:
+    """The same with classes of other names; several may get one name.
+
+    Raises:
+        ConfigError: a class that no box has.
+    """
+    there = {kind for frame in imported.frames for kind in frame.records.types}
+    if unknown := sorted(set(names) - there):
+        raise ConfigError(
+            f"--rename {unknown[0]}: no box has that class; there are {', '.join(sorted(there)) or 'none'}"
+        )
+    frames = [
+        frame._replace(
+            records=frame.records._replace(types=tuple(names.get(kind, kind) for kind in frame.records.types))
+        )
+        for frame in imported.frames
+    ]
+    return imported._replace(frames=frames)
 
 
 def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCounts:

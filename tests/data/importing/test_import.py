@@ -13,7 +13,7 @@ from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.nuscenes import read_nuscenes, rotation
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import AscaError, DatasetError, ScanError
+from asca_pillars.errors import AscaError, ConfigError, DatasetError, ScanError
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.data.boxes.box_scenes import write_box_dataset
 
@@ -41,6 +41,16 @@ def test_boxes_of_ones_own(tmp_path: Path) -> None:
     assert split.records("000002").track_ids == ("t2",)
     assert split.scan_path("000002").parent == own / "scans"  # referred to, not copied
     run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")  # replaces its own
+
+
+def test_classes_by_other_names(tmp_path: Path) -> None:
+    own = write_box_dataset(tmp_path / "own", 4)
+    source = (own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
+    output = run(*source, "--rename", "Forklift=Truck", "--rename", "Car=Truck")
+    assert "boxes: Truck 8" in output
+    for text, message in (("Bus=Truck", "no box has that class; there are Car, Forklift"), ("Car", "write OLD=NEW")):
+        with pytest.raises(ConfigError, match=message):
+            run(*source, "--rename", text)
 
 
 def test_recordings_are_not_torn_apart(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Import of Waymo's parquet form: a small segment in the published columns, made here from known points."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +44,11 @@ def write_segment(root: Path, *, moved_m: float = 0.0) -> Path:
     """One segment with a vehicle at BOX; with `moved_m` every pixel was measured that much further back."""
     pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
 
-    def write(name: str, columns: Mapping[str, Any]) -> None:
+    def write(name: str, columns: dict[str, Any]) -> None:
         (root / name).mkdir(parents=True, exist_ok=True)
         parquet.write_table(pyarrow.table(columns), root / name / "segment.parquet")
 
-    keys: dict[str, list[Any]] = {"key.frame_timestamp_micros": [], "key.laser_name": []}
+    keys: dict[str, Any] = {"key.frame_timestamp_micros": [], "key.laser_name": []}
     first = "[LiDARComponent].range_image_return1"
     images: dict[str, Any] = {f"{first}.values": [], f"{first}.shape": []}
     for time in TIMES:
