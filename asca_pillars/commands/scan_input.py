@@ -1,6 +1,6 @@
 """Scan files as the options of a command want them read, and the mounting of their sensor."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from asca_pillars.commands.options import ScanOptions
 from asca_pillars.data.ground_height import measured_mounting
 from asca_pillars.data.mounting import Mounting, read_pose
-from asca_pillars.data.scans.reflectance import checked_scale
+from asca_pillars.data.scans.reflectance import ReflectanceScale, checked_scale
 from asca_pillars.data.scans.scan_reader import FolderScale, Scan, folder_reflectance_scale, read_scan
 from asca_pillars.errors import ConfigError, ScanError
 
-_HEIGHT_SCANS = 8  # that `--sensor-height auto` looks at
+HEIGHT_SCANS = 8  # that `--sensor-height auto` looks at
 
 
 class ScanInput:
@@ -33,10 +33,12 @@ class ScanInput:
         self._columns = options.columns
         self._scales: dict[tuple[Path, str], FolderScale] = {}
         self.said: list[str] = []
-        stated = checked_scale(_number(options.reflectance_scale, "--reflectance-scale"))
+        stated = stated_scale(options)
         for key, group in groupby(sorted(paths, key=_folder_and_suffix), _folder_and_suffix):
             self._scales[key] = self._decide(key[0], list(group)) if stated == "auto" else FolderScale(stated, None)
-        self.mounting = self._mounting(options, paths)
+        chosen = paths[:: max(-(-len(paths) // HEIGHT_SCANS), 1)]
+        self.mounting, said = stated_mounting(options, lambda: self._readable(chosen))
+        self.said += said
 
     def read(self, path: Path) -> Scan:
         """One of the scans.
@@ -49,20 +51,8 @@ class ScanInput:
     def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
         where = folder if len(paths) > 1 else paths[0]
         decided = folder_reflectance_scale(paths, columns=self._columns)
-        if decided.scale not in (1.0, "auto"):
-            what = f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"
-            self.said.append(f"{where}: {decided.doubt or what}")
+        self.said += [f"{where}: {line}" for line in said_of_scale(decided)]
         return decided
-
-    def _mounting(self, options: ScanOptions, paths: Sequence[Path]) -> Mounting:
-        pose = None if options.pose is None else read_pose(options.pose)
-        height = None if options.sensor_height is None else _number(options.sensor_height, "--sensor-height")
-        if height != "auto":
-            return Mounting(height, options.axes, pose)
-        chosen = paths[:: -(-len(paths) // _HEIGHT_SCANS)]
-        mounting, estimate = measured_mounting(self._readable(chosen), Mounting(None, options.axes, pose))
-        self.said.append(f"sensor height: {estimate}")
-        return mounting
 
     def _readable(self, paths: Iterable[Path]) -> Iterator[NDArray[np.float32]]:
         for path in paths:
@@ -70,6 +60,38 @@ class ScanInput:
                 yield self.read(path).points
             except ScanError:
                 continue  # named when its turn comes
+
+
+def stated_scale(options: ScanOptions) -> ReflectanceScale:
+    """The reflectance scale as typed; ScanError or ConfigError if it is none."""
+    return checked_scale(_number(options.reflectance_scale, "--reflectance-scale"))
+
+
+def said_of_scale(decided: FolderScale) -> list[str]:
+    """What a user is to know of a scale that the values decided: a sentence, or none."""
+    if decided.scale in (1.0, "auto"):
+        return []
+    return [decided.doubt or f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"]
+
+
+def stated_mounting(
+    options: ScanOptions, sample: Callable[[], Iterable[NDArray[np.float32]]]
+) -> tuple[Mounting, list[str]]:
+    """The mounting as typed, and sentences for the user.
+
+    Args:
+        options: as typed.
+        sample: points (N, 4) in metres of some scans, for a height that is to be estimated.
+
+    Raises:
+        ConfigError, ScanError: an option cannot be used, or the height not be estimated.
+    """
+    pose = None if options.pose is None else read_pose(options.pose)
+    height = None if options.sensor_height is None else _number(options.sensor_height, "--sensor-height")
+    if height != "auto":
+        return Mounting(height, options.axes, pose), []
+    mounting, estimate = measured_mounting(sample(), Mounting(None, options.axes, pose))
+    return mounting, [f"sensor height: {estimate}"]
 
 
 def _folder_and_suffix(path: Path) -> tuple[Path, str]:
