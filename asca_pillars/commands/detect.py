@@ -61,9 +61,7 @@ def detect(
     ] = None,
     calib: Annotated[
         Path | None,
-        typer.Option(
-            "--calib", help="Of a recording: KITTI calibration; also write tracks.txt, KITTI's tracking text."
-        ),
+        typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
     ] = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
@@ -73,8 +71,8 @@ def detect(
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
 
-    A recording (.mcap, .db3, .bag, a rosbag2 folder) is detected scan by scan; OUT/detections.jsonl has a line for each,
-    with its time. After a kill the same command goes on where it was.
+    A recording (.mcap, .db3, .bag, a rosbag2 folder) is detected scan by scan; OUT/detections.jsonl has a line for
+    each, with its time. After a kill the same command goes on where it was.
 
     Examples:
 
