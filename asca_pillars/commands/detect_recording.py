@@ -23,7 +23,7 @@ from asca_pillars.commands.foxglove_file import FoxgloveFile
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions, ScanOptions
 from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
-from asca_pillars.commands.recording_results import JsonLines, KittiTracks, ResultFile, open_text, write_results
+from asca_pillars.commands.recording_results import JsonLines, KittiTracks, ResultFile, open_text, tracked
 from asca_pillars.commands.rerun_file import RerunFile
 from asca_pillars.commands.scan_input import HEIGHT_SCANS, said_of_scale, stated_mounting, stated_scale
 from asca_pillars.data.kitti import read_calibration
@@ -34,7 +34,7 @@ from asca_pillars.files import atomic_path, require_own
 
 KITTI_FILE = "tracks.txt"
 ABOUT_FILE = "recording.json"
-WEAK_SHARE = 0.6
+WEAK_SHARE = 0.7
 """Detections from this share of the lowest threshold on carry tracks on that better ones began."""
 
 
@@ -84,9 +84,10 @@ def detect_recording(task: RecordingTask, reading: ScanOptions, options: Runtime
             pass
         seconds = process_time() - start
         tracker = Tracker(birth_score=births) if task.track else None
-        count, damage = _write(task, journal, tracker, scans, calibration, about), recording.damage
-        if not count:
+        damage = recording.damage
+        if all(one.detections is None for one in journal.results()):
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{run.first()}")
+        _write(task, journal, tracker, scans, calibration, about)
         journal.remove()
     _tell(task, run, detector, seconds, console)
     if damage or run.troubles:
@@ -177,8 +178,8 @@ def _write(
     scans: RecordedScans,
     calibration: Any,
     about: dict[str, Any],
-) -> int:
-    """All files, none of which appears before all are complete; how many scans they hold."""
+) -> None:
+    """All files, none of which appears before all are complete."""
     with ExitStack() as places, ExitStack() as handles:
         text = places.enter_context(atomic_path(task.out / RUN_FILE))
         files: list[ResultFile] = [JsonLines(open_text(handles, text), task.path.name)]
@@ -196,9 +197,10 @@ def _write(
             files.append(rerun)
         with atomic_path(task.out / ABOUT_FILE) as temporary:
             temporary.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")
-        count = write_results(journal, tracker, files)
+        for found in tracked(journal, tracker):
+            for file in files:
+                file.write(found)
         handles.close()  # before the names are changed
-        return count
 
 
 def _tell(task: RecordingTask, run: _Run, detector: Detector, seconds: float, console: Console) -> None:

@@ -78,16 +78,6 @@ class KittiTracks:
                 self._file.write(f"{found.number} {number} {labels_text([item])}")
 
 
-def write_results(journal: Journal, tracker: Tracker | None, files: list[ResultFile]) -> int:
-    """Write everything to all files; how many scans were written."""
-    count = 0
-    for found in tracked(journal, tracker):
-        count += 1
-        for file in files:
-            file.write(found)
-    return count
-
-
 def open_text(stack: ExitStack, path: Path) -> IO[str]:
     """A text file to write that is closed with the stack."""
     return stack.enter_context(path.open("w", encoding="utf-8"))

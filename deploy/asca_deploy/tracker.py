@@ -78,7 +78,7 @@ class Tracker:
         self,
         *,
         birth_score: float | Mapping[str, float] = 0.3,
-        report_score: float = 0.4,
+        report_score: float = 0.6,
         death_score: float = 0.1,
         max_unseen_s: float = 0.8,
     ) -> None:

@@ -71,7 +71,7 @@ def test_a_track_survives_a_gap_and_ends_after_a_longer_one() -> None:
 
 def test_births_and_reports_by_score() -> None:
     tracker = Tracker(birth_score={"Car": 0.3, "Pedestrian": 0.5}, report_score=0.4)
-    weak = found((10, 0, 0.32, 0), (10, 9, 0.4, 1))
+    weak = found((10, 0, 0.35, 0), (10, 9, 0.4, 1))
     assert len(tracker(weak, 0.0)) == 0, "the car waits for a second look, the person is not believed"
     second = tracker(weak, 0.1)
     assert second.detections.names == ["Car"] and second.track_ids.tolist() == [0]
