@@ -25,8 +25,8 @@ class ScanQueue:
     A stream takes up to two scans ahead of the one that it hands out; those are no longer in the queue.
 
     Args:
-        when_full: what a scan does that finds the queue full. "drop": the oldest waiting scan is dropped and counted, so
-            that boxes are of the latest scans. "wait": `put` waits until there is room, so that none is lost.
+        when_full: what a scan does that finds the queue full. "drop": the oldest waiting scan is dropped and counted,
+            so that boxes are of the latest scans. "wait": `put` waits until there is room, so that none is lost.
         size: scans that may wait.
 
     Attributes:
