@@ -141,7 +141,7 @@ class _Run:
         """Note the scans before the next one that could be read."""
         while self._coming and self._coming[0].scan is None:
             one = self._coming.popleft()
-            self.troubles.append(one.trouble)
+            self.troubles.append(str(one.trouble))
             self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.trouble))
             yield
 

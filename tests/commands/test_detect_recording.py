@@ -98,7 +98,7 @@ def test_foxglove_file_is_read_back(drive: Path, tmp_path: Path) -> None:
 
 def _conforms(value: Any, schema: dict[str, Any]) -> None:
     """The value has the schema's types and required fields."""
-    kinds = {"object": dict, "array": list, "string": str, "number": (int, float), "integer": int, "boolean": bool}
+    kinds: dict[str, Any] = {"object": dict, "array": list, "string": str, "number": (int, float), "integer": int, "boolean": bool}
     assert isinstance(value, kinds[schema["type"]])
     for name in schema.get("required", ()):
         assert name in value
@@ -144,7 +144,8 @@ def test_a_killed_run_goes_on_and_ends_the_same(
 ) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     run(drive, whole, track=True, foxglove=whole / "boxes.mcap")
-    add, done = Journal.add, []
+    add = Journal.add
+    done: list[None] = []
 
     def dies(self: Journal, result: Any) -> None:
         if len(done) == after:

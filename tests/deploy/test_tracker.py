@@ -92,7 +92,7 @@ def test_what_stands_still_has_no_velocity_over_ground_however_the_car_moves(
         ego = np.array([1e5 + speed * t, -3e5])
         cos, sin = np.cos(heading), np.sin(heading)
         x, y = np.array([[cos, sin], [-sin, cos]]) @ (place - ego)
-        tracks = tracker(found((x, y, 0.9, 0)), t, pose(*ego, heading))
+        tracks = tracker(found((x, y, 0.9, 0)), t, pose(ego[0], ego[1], heading))
     assert tracks.track_ids.tolist() == [0]
     assert tracks.velocities_mps[0] == pytest.approx([0, 0], abs=0.05)
 

@@ -36,12 +36,13 @@ def test_offsets_padding_and_byte_order(big_endian: bool, rows: int, row_padding
     )
     cloud = read(message)
     assert np.array_equal(cloud.points.xyz, POINTS[:, :3])
-    assert np.array_equal(cloud.points.reflectance, POINTS[:, 3])
+    assert cloud.points.reflectance is not None and np.array_equal(cloud.points.reflectance, POINTS[:, 3])
 
 
 def test_whole_numbers_as_drivers_write_them() -> None:
     columns = np.column_stack([POINTS[:, :3], np.arange(24) * 100, np.arange(24), np.arange(24)])
     cloud = read(laid_out(columns.astype(np.float32), layout=OUSTER, step=32))
+    assert cloud.points.reflectance is not None and cloud.points.dtype is not None
     assert cloud.points.reflectance.tolist() == [100 * i for i in range(24)]
     assert cloud.points.dtype.kind == "u" and np.array_equal(cloud.points.xyz, POINTS[:, :3])
 
