@@ -10,10 +10,19 @@ from typing import Any, TypeVar
 
 from rich.progress import track
 
-from asca_pillars.errors import DatasetError
+from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path
 
 Item = TypeVar("Item")
+
+
+def check_wishes(counts: dict[str, int], val_share: float) -> None:
+    """Refuse counts below 1 and a share outside 0..1, with a ConfigError."""
+    for name, count in counts.items():
+        if count < 1:
+            raise ConfigError(f"{name} is {count}; it must be at least 1")
+    if not 0.0 <= val_share <= 1.0:
+        raise ConfigError(f"val_share is {val_share}; it must lie between 0 and 1")
 
 
 def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool) -> None:

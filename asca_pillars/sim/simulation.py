@@ -18,11 +18,10 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
-from asca_pillars.errors import ConfigError
 from asca_pillars.files import atomic_path
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
-from asca_pillars.sim.parallel import claim_simulation, for_each
+from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import Returns, measure
@@ -115,10 +114,7 @@ def simulate(
         ConfigError: a number of frames or workers below 1, or a share outside 0..1.
         DatasetError: `out` holds frames of another seed or configuration.
     """
-    if frames < 1 or workers < 1:
-        raise ConfigError(f"frames is {frames} and workers is {workers}; both must be at least 1")
-    if not 0.0 <= val_share <= 1.0:
-        raise ConfigError(f"val_share is {val_share}; it must lie between 0 and 1")
+    check_wishes({"frames": frames, "workers": workers}, val_share)
     root = Path(out)
     config = config or SimulationConfig()
     split = KittiSplit(root)

@@ -1,6 +1,10 @@
 """`asca detect` of recordings: what is written, that a kill changes nothing, and how it refuses."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -98,7 +102,8 @@ def test_foxglove_file_is_read_back(drive: Path, tmp_path: Path) -> None:
 
 def _conforms(value: Any, schema: dict[str, Any]) -> None:
     """The value has the schema's types and required fields."""
-    kinds: dict[str, Any] = {"object": dict, "array": list, "string": str, "number": (int, float), "integer": int, "boolean": bool}
+    kinds: dict[str, Any] = {"object": dict, "array": list, "string": str, "number": (int, float)}
+    kinds |= {"integer": int, "boolean": bool}
     assert isinstance(value, kinds[schema["type"]])
     for name in schema.get("required", ()):
         assert name in value
@@ -133,17 +138,22 @@ def test_kitti_tracking_text(drive: Path, tmp_path: Path) -> None:
     assert len(rows) > SCANS and {(int(row[0]), int(row[1]), row[2]) for row in rows} <= known
 
 
+@pytest.fixture(scope="module")
+def undisturbed(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    run(drive, out, track=True, foxglove=out / "boxes.mcap")
+    return out
+
+
 def outputs(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.iterdir() if path.suffix in (".jsonl", ".mcap")}
 
 
-@pytest.mark.parametrize("after", [0, 1, 4])
-@pytest.mark.parametrize("torn_line", [b"", b'{"number": ', b"\x00\xff"])
+@pytest.mark.parametrize(("after", "torn_line"), [(0, b""), (1, b'{"number": '), (4, b"\x00\xff")])
 def test_a_killed_run_goes_on_and_ends_the_same(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int, torn_line: bytes
+    drive: Path, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int, torn_line: bytes
 ) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    run(drive, whole, track=True, foxglove=whole / "boxes.mcap")
+    killed = tmp_path / "killed"
     add = Journal.add
     done: list[None] = []
 
@@ -162,7 +172,24 @@ def test_a_killed_run_goes_on_and_ends_the_same(
     monkeypatch.setattr(Journal, "add", lambda self, result: detected.append(result.number) or add(self, result))
     run(drive, killed, track=True, foxglove=killed / "boxes.mcap")
     assert detected == list(range(after, SCANS)), "what was done is not done again"
-    assert outputs(killed) == outputs(whole)
+    assert outputs(killed) == outputs(undisturbed)
+
+
+def test_after_sigkill(drive: Path, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "killed"
+    command = [sys.executable, "-m", "asca_pillars.cli", "detect", str(drive), "--track", "-o", str(out)]
+    command += ["--foxglove", str(out / "boxes.mcap"), "--threads", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while process.poll() is None:
+        if (out / JOURNAL_FILE).exists() and (out / JOURNAL_FILE).read_bytes().count(b"\n") > 2:
+            process.kill()
+            break
+        time.sleep(0.001)
+    assert process.wait() == -signal.SIGKILL, "it was killed in time"
+    assert not (out / "detections.jsonl").exists()
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "going on after the" in said
+    assert outputs(out) == outputs(undisturbed)
 
 
 def test_a_journal_of_other_settings_is_not_gone_on_with(

@@ -22,10 +22,9 @@ from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.boxes.box_split import DATASET_FILE
 from asca_pillars.data.kitti import in_image, write_image_set
 from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import ConfigError
 from asca_pillars.files import atomic_path, write_json
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
-from asca_pillars.sim.parallel import claim_simulation, for_each
+from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
 from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
 from asca_pillars.sim.simulation import SimulationConfig, take_scan
@@ -122,10 +121,7 @@ def simulate_sequences(
         ConfigError: a number below 1, or a share outside 0..1.
         DatasetError: `out` holds sequences of another seed, length or configuration.
     """
-    if min(sequences, length, workers) < 1:
-        raise ConfigError(f"sequences {sequences}, length {length} and workers {workers} must be at least 1")
-    if not 0.0 <= val_share <= 1.0:
-        raise ConfigError(f"val_share is {val_share}; it must lie between 0 and 1")
+    check_wishes({"sequences": sequences, "length": length, "workers": workers}, val_share)
     root = Path(out)
     config = config or SimulationConfig()
     if config.field_of_view == "full":  # as much is cast, and there is no camera to label for

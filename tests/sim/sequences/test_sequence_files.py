@@ -83,7 +83,7 @@ def test_the_camera_keeps_a_part_of_the_same_points() -> None:
 
 
 def test_impossible_wishes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="length 0"):
+    with pytest.raises(ConfigError, match="length is 0"):
         simulate_sequences(tmp_path / "x", 1, 0)
     with pytest.raises(ConfigError, match=r"val_share is 2"):
         simulate_sequences(tmp_path / "x", 1, 1, val_share=2.0)
