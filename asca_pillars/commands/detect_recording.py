@@ -19,7 +19,7 @@ from asca_deploy.tracker import Tracker
 from asca_pillars.commands import detect_tables as show
 from asca_pillars.commands.detect_files import RUN_FILE
 from asca_pillars.commands.extras import require
-from asca_pillars.commands.foxglove_file import FoxgloveFile
+from asca_pillars.commands.foxglove_file import FoxgloveFile, require_own_file
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions, ScanOptions
 from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
@@ -29,7 +29,7 @@ from asca_pillars.commands.scan_input import HEIGHT_SCANS, said_of_scale, stated
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.data.recordings.open_recording import open_recording
 from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.errors import ScanError
+from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.files import atomic_path, require_own
 
 KITTI_FILE = "tracks.txt"
@@ -62,6 +62,10 @@ def detect_recording(task: RecordingTask, reading: ScanOptions, options: Runtime
     require("recordings")
     if task.rerun is not None:
         require("view")
+        if task.rerun.suffix.lower() != ".rrd":
+            raise ConfigError(f"--rerun {task.rerun}: rerun opens .rrd files; choose such a name")
+    if task.foxglove is not None:
+        require_own_file(task.foxglove)
     calibration = None if task.calib is None else read_calibration(task.calib)
     require_own(task.out, "asca detect", RUN_FILE, JOURNAL_FILE)
     recording = open_recording(task.path)

@@ -6,13 +6,16 @@ Opened beside the recording, they lie in its 3D panel: frame and times are those
 """
 
 import json
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from asca_pillars.commands.recording_results import Found
+from asca_pillars.errors import ConfigError, OutputError
 
 TOPIC = "/asca/boxes"
+LIBRARY = "asca-pillars boxes"
 _COLORS = ((0.2, 0.7, 1.0), (1.0, 0.6, 0.1), (0.4, 0.9, 0.3), (0.9, 0.4, 0.9), (0.9, 0.9, 0.3))
 _ARROW_S = 1.0  # an arrow is as long as the way of so many seconds
 _MOVES_MPS = 0.5
@@ -68,6 +71,17 @@ SCHEMA = _object(
 )
 
 
+def require_own_file(path: Path) -> None:
+    """Make sure that no recording is replaced by boxes: OutputError unless `path` is free or an earlier output."""
+    if path.suffix.lower() != ".mcap":
+        raise ConfigError(f"--foxglove {path}: Foxglove opens .mcap files; choose such a name")
+    if path.is_file():
+        with path.open("rb") as file:
+            start = file.read(100)  # magic, then a header with the name of what wrote the file
+        if LIBRARY.encode() not in start:
+            raise OutputError(f"{path}: `asca detect` did not write it and would replace it; choose another name")
+
+
 class FoxgloveFile:
     """Writes an MCAP; `finish` completes it."""
 
@@ -75,7 +89,7 @@ class FoxgloveFile:
         from mcap.writer import Writer
 
         self._writer = Writer(file)
-        self._writer.start(profile="", library="asca-pillars")
+        self._writer.start(profile="", library=LIBRARY)
         schema = self._writer.register_schema("foxglove.SceneUpdate", "jsonschema", json.dumps(SCHEMA).encode())
         self._channel = self._writer.register_channel(TOPIC, "json", schema)
 

@@ -21,6 +21,7 @@ class Found(NamedTuple):
     frame_id: str
     detections: Detections
     tracks: Tracks | None
+    dropped_points: int = 0
 
 
 class ResultFile(Protocol):
@@ -37,10 +38,10 @@ def tracked(journal: Journal, tracker: Tracker | None) -> Iterator[Found]:
             continue
         place = result.number, result.time_ns, result.frame_id
         if tracker is None:
-            yield Found(*place, result.detections, None)
+            yield Found(*place, result.detections, None, result.dropped_points)
         else:
             tracks = tracker(result.detections, result.time_ns * 1e-9)
-            yield Found(*place, tracks.detections, tracks)
+            yield Found(*place, tracks.detections, tracks, result.dropped_points)
 
 
 class JsonLines:
@@ -58,6 +59,7 @@ class JsonLines:
             "time_ns": found.time_ns,
             "frame_id": found.frame_id,
             "boxes": boxes,
+            "points_not_finite": found.dropped_points,
         }
         self._file.write(json.dumps(line) + "\n")
 

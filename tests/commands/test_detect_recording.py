@@ -238,6 +238,12 @@ def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
         detect([sample_scan_path()], out=tmp_path, track=True)
     with pytest.raises(ConfigError, match="give one alone"):
         detect([drive, sample_scan_path()], out=tmp_path)
+    before = drive.read_bytes()
+    with pytest.raises(OutputError, match=r"drive\.mcap: `asca detect` did not write it"):
+        run(drive, tmp_path, foxglove=drive)
+    assert drive.read_bytes() == before
+    with pytest.raises(ConfigError, match=r"choose such a name"):
+        run(drive, tmp_path, foxglove=tmp_path / "boxes.json")
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(OutputError, match=r"mine\.txt"):
         run(drive, tmp_path)

@@ -19,7 +19,7 @@ class PointCloud(NamedTuple):
 
     points: StoredPoints
     time_ns: int
-    """Of the header; where that says 0, when the message was recorded."""
+    """Of the header; where that says 0 or less, when the message was recorded."""
     frame_id: str
 
 
@@ -40,7 +40,9 @@ def read_point_cloud(message: Message, source: str) -> PointCloud:
         raise ScanError(f"{source}: no readable PointCloud2 ({reason}); record it again") from None
     stamp = cloud.header.stamp
     time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-    return PointCloud(_points(cloud, source), time_ns or message.recorded_ns, str(cloud.header.frame_id))
+    return PointCloud(
+        _points(cloud, source), time_ns if time_ns > 0 else message.recorded_ns, str(cloud.header.frame_id)
+    )
 
 
 def _points(cloud: Any, source: str) -> StoredPoints:
