@@ -52,6 +52,10 @@ def detect(
     track: Annotated[
         bool, typer.Option("--track", help="In a recording: give boxes identities and velocities over time.")
     ] = False,
+    odometry: Annotated[
+        str | None,
+        typer.Option("--odometry", help="With --track: the topic of the car's poses (nav_msgs/Odometry)."),
+    ] = None,
     foxglove: Annotated[
         Path | None, typer.Option("--foxglove", help="Of a recording: also write the boxes as an MCAP for Foxglove.")
     ] = None,
@@ -116,14 +120,16 @@ def detect(
             around=around,
             topic=topic,
             track=track,
+            odometry=odometry,
             calib=calib,
             foxglove=foxglove,
             rerun=rerun,
         )
         detect_recording(task, reading, options, console)
         return
-    if topic or track or foxglove or rerun or calib:
-        raise ConfigError("--topic, --track, --foxglove, --rerun and --calib need a recording (.mcap, .db3, .bag)")
+    if topic or track or odometry or foxglove or rerun or calib:
+        options_of_recordings = "--topic, --track, --odometry, --foxglove, --rerun and --calib"
+        raise ConfigError(f"{options_of_recordings} need a recording (.mcap, .db3, .bag)")
     named = name_scans(scans or [sample_scan_path()])
     scan_input = ScanInput(reading, [path for path, _ in named])
     detector = open_detector(options, score, scan_input.mounting, around=around)

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -23,10 +24,12 @@ from asca_pillars.commands.foxglove_file import FoxgloveFile, require_own_file
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions, ScanOptions
 from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
-from asca_pillars.commands.recording_results import JsonLines, KittiTracks, ResultFile, open_text, tracked
+from asca_pillars.commands.recording_results import Found, JsonLines, KittiTracks, ResultFile, open_text, tracked
 from asca_pillars.commands.rerun_file import RerunFile
 from asca_pillars.commands.scan_input import HEIGHT_SCANS, said_of_scale, stated_mounting, stated_scale
 from asca_pillars.data.kitti import read_calibration
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.recordings.odometry import Poses, read_poses
 from asca_pillars.data.recordings.open_recording import open_recording
 from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.errors import ConfigError, ScanError
@@ -48,6 +51,7 @@ class RecordingTask:
     around: bool
     topic: str | None
     track: bool
+    odometry: str | None
     calib: Path | None
     foxglove: Path | None
     rerun: Path | None
@@ -70,6 +74,9 @@ def detect_recording(task: RecordingTask, reading: ScanOptions, options: Runtime
     require_own(task.out, "asca detect", RUN_FILE, JOURNAL_FILE)
     recording = open_recording(task.path)
     topic = recording.point_cloud_topic(task.topic)
+    if task.odometry is not None and not task.track:
+        raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
+    poses = None if task.odometry is None else read_poses(recording, task.odometry)
     scans = RecordedScans(recording, topic, stated_scale(reading))
     said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
     mounting, told = stated_mounting(reading, lambda: (scan.points for scan in scans.first(HEIGHT_SCANS)))
@@ -91,7 +98,8 @@ def detect_recording(task: RecordingTask, reading: ScanOptions, options: Runtime
         damage = recording.damage
         if all(one.detections is None for one in journal.results()):
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{run.first()}")
-        _write(task, journal, tracker, scans, calibration, about)
+        results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
+        _write(task, results, scans, calibration, about)
         journal.remove()
     _tell(task, run, detector, seconds, console)
     if damage or run.troubles:
@@ -175,10 +183,16 @@ def _about(
     }
 
 
+def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.float64]:
+    """From the scan to the frame that stands still: the scan is turned to x forward, where the odometry's axes lie."""
+    level = np.eye(4)
+    level[:3, :3], level[:3, 3] = mounting.level.axes, mounting.level.shift_m
+    return np.asarray(poses.at(time_ns) @ level)
+
+
 def _write(
     task: RecordingTask,
-    journal: Journal,
-    tracker: Tracker | None,
+    results: Iterator[Found],
     scans: RecordedScans,
     calibration: Any,
     about: dict[str, Any],
@@ -201,7 +215,7 @@ def _write(
             files.append(rerun)
         with atomic_path(task.out / ABOUT_FILE) as temporary:
             temporary.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")
-        for found in tracked(journal, tracker):
+        for found in results:
             for file in files:
                 file.write(found)
         handles.close()  # before the names are changed

@@ -1,10 +1,13 @@
 """The files that `asca detect` makes of a recording: JSON lines, KITTI's tracking text, Foxglove, rerun."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from asca_deploy import Detections
 from asca_deploy.tracker import Tracker
@@ -31,8 +34,16 @@ class ResultFile(Protocol):
         """The next scan."""
 
 
-def tracked(journal: Journal, tracker: Tracker | None) -> Iterator[Found]:
-    """The results of a journal, with identities if there is a tracker; scans that could not be read are left out."""
+def tracked(
+    journal: Journal, tracker: Tracker | None, pose_at: Callable[[int], NDArray[np.float64]] | None = None
+) -> Iterator[Found]:
+    """The results of a journal, with identities if there is a tracker; scans that could not be read are left out.
+
+    Args:
+        journal: of all scans.
+        tracker: a new one.
+        pose_at: from a time, nanoseconds, to the (4, 4) pose of the scan, metres; None: unknown.
+    """
     for result in journal.results():
         if result.detections is None:
             continue
@@ -40,7 +51,8 @@ def tracked(journal: Journal, tracker: Tracker | None) -> Iterator[Found]:
         if tracker is None:
             yield Found(*place, result.detections, None, result.dropped_points)
         else:
-            tracks = tracker(result.detections, result.time_ns * 1e-9)
+            pose = None if pose_at is None else pose_at(result.time_ns)
+            tracks = tracker(result.detections, result.time_ns * 1e-9, pose)
             yield Found(*place, tracks.detections, tracks, result.dropped_points)
 
 

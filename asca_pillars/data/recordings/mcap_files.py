@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from asca_pillars.data.recordings.messages import reason
 from asca_pillars.data.recordings.recording import Encoding, Message, Recording, Topic
 from asca_pillars.errors import ScanError
 
@@ -46,7 +47,7 @@ class McapRecording(Recording):
                 except (ScanError, GeneratorExit):
                     raise
                 except Exception as error:  # decompressors and struct have errors of their own
-                    self.damage = f"{file}: ends early, after {count} messages of {topic} ({_said(error)})"
+                    self.damage = f"{file}: ends early, after {count} messages of {topic} ({reason(error)})"
 
     def _stored(self, file: Path, stream: IO[bytes], topic: str) -> Iterator[tuple[Any, Any]]:
         from mcap.reader import SeekingReader
@@ -104,14 +105,10 @@ def _counted(file: Path, stream: IO[bytes]) -> list[Topic]:
                 counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
     except Exception as error:
         if not channels:
-            raise ScanError(f"{file}: no readable MCAP ({_said(error)}); copy or record it again") from None
+            raise ScanError(f"{file}: no readable MCAP ({reason(error)}); copy or record it again") from None
     return [Topic(one.topic, _type(schemas, one), counts.get(one.id, 0)) for one in channels.values()]
 
 
 def _type(schemas: dict[int, Any], channel: Any) -> str:
     schema = schemas.get(channel.schema_id)
     return str(schema.name) if schema is not None else "unknown"
-
-
-def _said(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__} {error}".split())[:100]

@@ -1,11 +1,11 @@
 """ROS' sensor_msgs/PointCloud2: points of any field layout, byte order and padding."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from asca_pillars.data.recordings.recording import Encoding, Message
+from asca_pillars.data.recordings.messages import decoded, reason
+from asca_pillars.data.recordings.recording import Message
 from asca_pillars.data.scans.raw_floats import MAX_POINTS
 from asca_pillars.data.scans.records import Field, StoredPoints, assemble_points, wanted_fields
 from asca_pillars.errors import ScanError
@@ -34,10 +34,9 @@ def read_point_cloud(message: Message, source: str) -> PointCloud:
         ScanError: the message is damaged or contradicts itself, or has no x, y and z.
     """
     try:
-        cloud = _decoded(message.data, message.encoding)
+        cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
     except Exception as error:  # the library lets struct's and NumPy's errors pass
-        reason = " ".join(f"{type(error).__name__} {error}".split())[:100]
-        raise ScanError(f"{source}: no readable PointCloud2 ({reason}); record it again") from None
+        raise ScanError(f"{source}: no readable PointCloud2 ({reason(error)}); record it again") from None
     stamp = cloud.header.stamp
     time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
     return PointCloud(
@@ -81,17 +80,3 @@ def _points(cloud: Any, source: str) -> StoredPoints:
         view = np.ndarray((height, width), fields[index].dtype, data, offsets[index], (row_step, step))
         columns.append(view.reshape(-1))
     return assemble_points(count, columns, chosen)
-
-
-def _decoded(data: bytes, encoding: Encoding) -> Any:
-    store = _typestore(encoding)
-    deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
-    return deserialize(data, "sensor_msgs/msg/PointCloud2")
-
-
-@cache
-def _typestore(encoding: Encoding) -> Any:
-    """The standard definitions: PointCloud2 has not changed since ROS 1."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from asca_pillars.data.recordings.messages import reason
 from asca_pillars.data.recordings.recording import Message, Recording, Topic
 from asca_pillars.errors import ScanError
 
@@ -35,7 +36,7 @@ class RosBag(Recording):
             except (ScanError, GeneratorExit):
                 raise
             except Exception as error:  # of SQLite, the decompressors, the library
-                self.damage = f"{self.path}: ends early, after {count} messages of {topic} ({_said(error)})"
+                self.damage = f"{self.path}: ends early, after {count} messages of {topic} ({reason(error)})"
 
 
 def _opened(path: Path) -> Any:
@@ -46,8 +47,10 @@ def _opened(path: Path) -> Any:
     try:
         reader.open()
     except Exception as error:
-        what = "ROS 1 bag" if path.suffix == ".bag" else "rosbag2"
-        raise ScanError(f"{path}: no readable {what} ({_said(error)}); copy or record it again") from None
+        what, remedy = "rosbag2", "copy or record it again"
+        if path.suffix == ".bag":
+            what, remedy = "ROS 1 bag", "copy it again, or mend its index (rosbag reindex)"
+        raise ScanError(f"{path}: no readable {what} ({reason(error)}); {remedy}") from None
     return _Closing(reader)
 
 
@@ -62,7 +65,3 @@ class _Closing:
 
     def __exit__(self, *_: object) -> None:
         self._reader.close()
-
-
-def _said(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__} {error}".split())[:100]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from benchmarks.made_recordings import point_cloud2
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
+ODOMETRY = "nav_msgs/msg/Odometry"
 START_NS = 1_700_000_000_000_000_000
 
 
@@ -71,6 +72,7 @@ def write_mcap(
     topics: dict[str, list[tuple[int, Any]]],
     *,
     others: dict[str, str] | None = None,
+    odometry: list[tuple[int, Any]] | None = None,
     chunk_size: int = 2000,
 ) -> Path:
     """An MCAP with topics of (time, PointCloud2 message or raw bytes); `others` are topics of other types."""
@@ -91,8 +93,32 @@ def write_mcap(
         for topic, kind in (others or {}).items():
             other = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b"string data"))
             writer.add_message(other, START_NS, b"\x00\x01\x00\x00\x01\x00\x00\x00\x00", START_NS)
+        if odometry:
+            data, _ = one.generate_msgdef(ODOMETRY, ros_version=2)
+            channel = writer.register_channel(
+                "/odom", "cdr", writer.register_schema(ODOMETRY, "ros2msg", data.encode())
+            )
+            for time_ns, message in odometry:
+                writer.add_message(channel, time_ns, bytes(one.serialize_cdr(message, ODOMETRY)), time_ns)
         writer.finish()
     return path
+
+
+def odometry_message(time_ns: int, x_m: float, yaw_rad: float = 0.0) -> Any:
+    types = store().types
+    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    vector, covariance = types["geometry_msgs/msg/Vector3"], np.zeros(36)
+    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(yaw_rad / 2), w=np.cos(yaw_rad / 2))
+    pose = types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0), orientation=turn
+    )
+    twist = types["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+    return types[ODOMETRY](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom"),
+        child_frame_id="base_link",
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=covariance),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=covariance),
+    )
 
 
 def clouds(count: int, points: int = 50) -> list[tuple[int, Any]]:
