@@ -12,7 +12,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from asca_deploy import Bundle, Detector, load_bundle
+    from asca_deploy import Bundle, Detector, ScanQueue, Tracker, Tracks, load_bundle
     from asca_pillars.data.mounting import Mounting
     from asca_pillars.data.scans.scan_reader import Scan, read_scan
     from asca_pillars.errors import AscaError
@@ -30,6 +30,9 @@ __all__ = [
     "FrameReport",
     "Mounting",
     "Scan",
+    "ScanQueue",
+    "Tracker",
+    "Tracks",
     "__version__",
     "load_bundle",
     "read_scan",
@@ -44,6 +47,9 @@ _HOMES = {
     "FrameReport": "asca_pillars.geometry.frame_report",
     "Mounting": "asca_pillars.data.mounting",
     "Scan": "asca_pillars.data.scans.scan_reader",
+    "ScanQueue": "asca_deploy",
+    "Tracker": "asca_deploy",
+    "Tracks": "asca_deploy",
     "load_bundle": "asca_deploy",
     "read_scan": "asca_pillars.data.scans.scan_reader",
 }

@@ -162,6 +162,17 @@ def recover(folder: str | Path) -> None:
                 shutil.rmtree(path)
 
 
+def try_lock(handle: int) -> bool:
+    """Lock an open file for this process until it closes it; False if another process holds it."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)  # others: no locks there
+    return True
+
+
 def _prepare(path: str | Path) -> Path:
     """The place that `path` leads to, in a folder that exists and holds nothing of killed writers."""
     target = Path(os.path.realpath(path))

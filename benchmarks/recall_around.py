@@ -26,10 +26,10 @@ from rich.progress import track
 
 from asca_deploy import Detector
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
-from asca_pillars.evaluation.assignment import greedy_matches
 from asca_pillars.evaluation.kitti.operating_point import wilson_interval
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
 from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.geometry.assignment import greedy_matches
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.overlap import bev_iou

@@ -30,7 +30,7 @@ class BaseInstall(PathFinder):
     @classmethod
     def find_spec(cls, name, *rest):
         heavy = {"torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy"}
-        heavy |= {"matplotlib", "openvino"}
+        heavy |= {"matplotlib", "openvino", "rosbags", "mcap", "rerun"}
         if name.split(".")[0] in heavy:
             return None
         return super().find_spec(name, *rest)

@@ -1,4 +1,4 @@
-"""`asca detect`: scans in, tables, pictures and KITTI text out."""
+"""`asca detect`: scans or a recording in, tables, pictures, KITTI text and tracks out."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,7 @@ from asca_pillars.commands.options import (
     SensorHeightOption,
     ThreadsOption,
 )
-from asca_pillars.errors import ScanError
+from asca_pillars.errors import ConfigError, ScanError
 
 TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
 
@@ -45,6 +45,27 @@ def detect(
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Of a recording: the topic of its scans. Default: the only one.")
+    ] = None,
+    track: Annotated[
+        bool, typer.Option("--track", help="In a recording: give boxes identities and velocities over time.")
+    ] = False,
+    odometry: Annotated[
+        str | None,
+        typer.Option("--odometry", help="With --track: the topic of the car's poses (nav_msgs/Odometry)."),
+    ] = None,
+    foxglove: Annotated[
+        Path | None, typer.Option("--foxglove", help="Of a recording: also write the boxes as an MCAP for Foxglove.")
+    ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option("--rerun", help="Of a recording: also write scans and boxes as an .rrd for the rerun viewer."),
+    ] = None,
+    calib: Annotated[
+        Path | None,
+        typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
+    ] = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
 
@@ -54,17 +75,22 @@ def detect(
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
 
+    A recording (.mcap, .db3, .bag, a rosbag2 folder) is detected scan by scan; OUT/detections.jsonl has a line for
+    each, with its time. After a kill the same command goes on where it was.
+
     Examples:
 
     asca detect drive1/ drive2/ --out results --no-pictures
 
     asca detect sweeps/ --around --axes y-forward --sensor-height auto
+
+    asca detect drive.mcap --track --foxglove boxes.mcap
     """
     import logging
     import sys
 
     from rich.console import Console
-    from rich.progress import track
+    from rich.progress import track as progress
 
     from asca_deploy import sample_scan_path
     from asca_deploy.auto import summary
@@ -72,23 +98,47 @@ def detect(
     from asca_pillars.commands.detect_files import ResultWriter
     from asca_pillars.commands.models import open_detector
     from asca_pillars.commands.scan_input import ScanInput, scan_settings
+    from asca_pillars.data.recordings.open_recording import is_recording
     from asca_pillars.data.scans.find_scans import name_scans
 
     console = Console(markup=False)
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
-    named = name_scans(scans or [sample_scan_path()])
-    settings = scan_settings(
+    reading = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
-    scan_input = ScanInput(settings, [path for path, _ in named])
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    recordings = [path for path in scans or () if is_recording(path)]
+    if recordings:
+        if scans is None or len(scans) > 1:
+            raise ConfigError(f"{recordings[0]}: is a recording; give one alone")
+        from asca_pillars.commands.detect_recording import RecordingTask, detect_recording
+
+        task = RecordingTask(
+            path=recordings[0],
+            out=out,
+            score=score,
+            around=around,
+            topic=topic,
+            track=track,
+            odometry=odometry,
+            calib=calib,
+            foxglove=foxglove,
+            rerun=rerun,
+        )
+        detect_recording(task, reading, options, console)
+        return
+    if topic or track or odometry or foxglove or rerun or calib:
+        options_of_recordings = "--topic, --track, --odometry, --foxglove, --rerun and --calib"
+        raise ConfigError(f"{options_of_recordings} need a recording (.mcap, .db3, .bag)")
+    named = name_scans(scans or [sample_scan_path()])
+    scan_input = ScanInput(reading, [path for path, _ in named])
     detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     results: list[show.Result] = []
     unreadable = 0
     with ResultWriter(out, pictures=pictures) as write:
-        for path, name in track(named, "Detecting", console=console, disable=len(named) == 1):
+        for path, name in progress(named, "Detecting", console=console, disable=len(named) == 1):
             try:
                 scan = scan_input.read(path)
                 detections = detector(scan.points)

@@ -1,4 +1,4 @@
-"""`asca eval`: a model or finished predictions against labels, by one of four protocols."""
+"""`asca eval`: a model or finished predictions against labels, by one of five protocols."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -64,11 +64,12 @@ def evaluate(
         ),
     ] = 0.05,
     protocol: Annotated[
-        Literal["kitti", "waymo", "iou", "distance"] | None,
+        Literal["kitti", "waymo", "iou", "distance", "tracking"] | None,
         typer.Option(
             "--protocol",
             help="kitti: AP and AOS of Car, Pedestrian and Cyclist. waymo: AP and APH of any class by level and range. "
             "iou: AP of any class, 3D and BEV. distance: nuScenes' and Argoverse 2's metrics. "
+            "tracking: HOTA, MOTA, identity switches of the tracks that asca detect --track wrote. "
             "Default: kitti; iou for a dataset without a camera.",
         ),
     ] = None,
@@ -96,6 +97,11 @@ def evaluate(
     console = Console(markup=False)
     if protocol is None:
         protocol = steps.default_protocol(data)
+    if protocol == "tracking":
+        from asca_pillars.commands.eval_tracks import evaluate_tracks
+
+        evaluate_tracks(data, split, predictions, out, json, console)
+        return
     if protocol in ("iou", "distance"):
         from asca_pillars.commands import eval_boxes
 

@@ -62,7 +62,7 @@ def claim(out: Path) -> None:
     Raises:
         OutputError: there is; names it.
     """
-    reports = "report.json", "waymo.json", "iou.json", "distance.json"
+    reports = "report.json", "waymo.json", "iou.json", "distance.json", "tracking.json"
     require_own(out, COMMAND, *reports, f"predictions/{MADE_BY}", text='"')
     for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
         require_replaceable(out / folder, COMMAND, marker)

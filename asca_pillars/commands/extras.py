@@ -10,6 +10,8 @@ EXTRAS = {
     "openvino": ("openvino",),
     "eval": ("matplotlib",),
     "import": ("pyarrow",),
+    "recordings": ("rosbags", "mcap"),
+    "view": ("rerun", "rosbags", "mcap"),
 }
 
 

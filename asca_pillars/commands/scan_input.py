@@ -5,7 +5,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
-from asca_pillars.data.scan_settings import ScanSettings
+from asca_pillars.data.scan_settings import ScanSettings, sample_points
 from asca_pillars.data.scans.scan_reader import FolderScale, Scan, folder_reflectance_scale, read_scan
 from asca_pillars.errors import ConfigError
 
@@ -45,7 +45,7 @@ class ScanInput:
         stated = settings.reflectance_scale
         for key, group in groupby(sorted(paths, key=_folder_and_suffix), _folder_and_suffix):
             self._scales[key] = self._decide(key[0], list(group)) if stated == "auto" else FolderScale(stated, None)
-        self.mounting, estimate = settings.mounting(paths, lambda path: self.read(path).points)
+        self.mounting, estimate = settings.mounting(sample_points(paths, lambda path: self.read(path).points))
         if estimate is not None:
             self.said.append(f"sensor height: {estimate}")
 
@@ -60,10 +60,15 @@ class ScanInput:
     def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
         where = folder if len(paths) > 1 else paths[0]
         decided = folder_reflectance_scale(paths, columns=self._columns)
-        if decided.scale not in (1.0, "auto"):
-            what = f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"
-            self.said.append(f"{where}: {decided.doubt or what}")
+        self.said += [f"{where}: {line}" for line in said_of_scale(decided)]
         return decided
+
+
+def said_of_scale(decided: FolderScale) -> list[str]:
+    """What a user is to know of a scale that the values decided: a sentence, or none."""
+    if decided.scale in (1.0, "auto"):
+        return []
+    return [decided.doubt or f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"]
 
 
 def _folder_and_suffix(path: Path) -> tuple[Path, str]:

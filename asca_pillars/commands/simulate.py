@@ -1,4 +1,4 @@
-"""`asca simulate`: a folder of labelled street scans, for tools that read KITTI, and how like real ones they are."""
+"""`asca simulate`: a folder of labelled street scans or of short drives, and how like real ones the scans are."""
 
 from pathlib import Path
 from typing import Annotated
@@ -22,6 +22,16 @@ def simulate(
             help="Frames to write. Default: 100; with --report none where there are scans already.",
         ),
     ] = None,
+    sequences: Annotated[
+        int | None,
+        typer.Option(
+            "--sequences",
+            min=1,
+            help="Short drives at 10 Hz instead of single scans: the car and the road users move, boxes carry "
+            "identities and velocities. Written as a dataset of boxes without a camera (docs/RECORDINGS.md).",
+        ),
+    ] = None,
+    length: Annotated[int, typer.Option("--length", min=1, help="Scans of each sequence; 10 make a second.")] = 100,
     seed: Annotated[
         int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number of workers.")
     ] = 0,
@@ -80,6 +90,8 @@ def simulate(
 
     asca simulate data/all -n 10000 --view around
 
+    asca simulate data/drives --sequences 3 --length 200
+
     asca simulate data/sim --report --like data/kitti --bundle my_bundle
     """
     require("sim")
@@ -99,6 +111,15 @@ def simulate(
         KittiSplit(like).frame_ids  # noqa: B018 - a wrong folder is named before the work
     console = Console(markup=False)
     settings = load_simulation_config(config, view)
+    if sequences is not None:
+        if frames is not None or report or like is not None:
+            raise ConfigError("--sequences: leave --frames, --report and --like out; they are for single scans")
+        require_own(out, "asca simulate", "simulation.json", text='"length"')
+        from asca_pillars.sim.sequences.sequence_files import simulate_sequences
+
+        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share)
+        console.print(f"{sequences} sequences of {length} scans below {out}; look at one: asca detect {out}/scans/0000")
+        return
     there = any((out / "training" / "velodyne").glob("*.bin"))
     if frames is not None or not (there and (report or like is not None)):
         frames = frames or FRAMES

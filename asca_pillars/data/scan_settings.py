@@ -1,6 +1,6 @@
 """How scan files are read and where their sensor sat: the options of commands and the keys of a dataset.yaml, alike."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -16,7 +16,7 @@ from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.schema import Strict
 
 FEWEST_COLUMNS = 3
-_HEIGHT_SCANS = 8  # that a height of "auto" looks at
+SAMPLE_SCANS = 8  # that a height of "auto" looks at
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,12 @@ class ScanSettings(Strict):
         return Mounting(self._stated_height_m, self.axes, pose)
 
     def mounting(
-        self, paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]], folder: Path | None = None
+        self, samples: Iterable[NDArray[np.float32]], folder: Path | None = None
     ) -> tuple[Mounting, HeightEstimate | None]:
         """The mounting, and how a height of "auto" was estimated; None if it was stated.
 
         Args:
-            paths: of the scans; up to eight of them, evenly spaced, are read where the height is "auto".
-            read: gives the points (N, >=3) of one of them; those that raise a ScanError are left out.
+            samples: points (N, >=3) in metres of some scans; only looked at where the height is "auto".
             folder: as for `stated_mounting`.
 
         Raises:
@@ -79,15 +78,16 @@ class ScanSettings(Strict):
         stated = self.stated_mounting(folder)
         if self.sensor_height != "auto":
             return stated, None
-        return measured_mounting(_readable(paths[:: -(-len(paths) // _HEIGHT_SCANS)], read), stated)
+        return measured_mounting(samples, stated)
 
     @property
     def _stated_height_m(self) -> float | None:
         return None if self.sensor_height == "auto" else self.sensor_height
 
 
-def _readable(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
-    for path in paths:
+def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
+    """Points (N, >=3) of up to SAMPLE_SCANS of the scans, evenly spaced; those that cannot be read are left out."""
+    for path in paths[:: max(-(-len(paths) // SAMPLE_SCANS), 1)]:
         try:
             yield read(path)
         except ScanError:

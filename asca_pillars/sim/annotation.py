@@ -47,10 +47,11 @@ def label_camera_view(
         calib: the camera.
         config: from how many points and what visible share on an object is labelled.
     """
-    points, visible, truncated = _evidence(targets, hits, owner, calib)
+    points, visible = evidence(hits, owner)
+    _, truncated = image_boxes(_boxes(targets), calib)
     labels, areas = [], []
     objects = _objects(targets, calib)
-    for index in _nearest_first(targets):
+    for index in nearest_first(targets):
         if truncated[index] >= MAX_TRUNCATION or hits.visible[index] == 0:
             continue
         item = objects[index]
@@ -71,19 +72,25 @@ def label_all_around(
     Arguments are as for `label_camera_view`, but `owner` (N,) is of all points. See the top of the file for what the
     fields mean where there is no camera.
     """
-    points, visible, truncated = _evidence(targets, hits, owner, calib)
+    points, visible = evidence(hits, owner)
+    _, truncated = image_boxes(_boxes(targets), calib)
     labels = []
     objects = _objects(targets, calib)
-    for index in _nearest_first(targets):
+    for index in nearest_first(targets):
         if points[index] == 0:
             continue
         item = objects[index]
-        hardly = points[index] < config.min_points or visible[index] < config.min_visible_share
-        occluded = UNKNOWN if hardly else occlusion_state(visible[index])
+        occluded = occlusion_around(points[index], visible[index], config)
         in_image = item.bbox[2] > item.bbox[0]
         cut = round(float(truncated[index]), 2) if in_image else -1.0
         labels.append(replace(item, truncated=cut, occluded=occluded))
     return labels
+
+
+def occlusion_around(points: int, visible_share: float, config: SceneConfig) -> int:
+    """Occlusion state 0..3 of an object of which that many points are there and that share is visible."""
+    hardly = points < config.min_points or visible_share < config.min_visible_share
+    return UNKNOWN if hardly else occlusion_state(visible_share)
 
 
 def occlusion_state(visible_share: float) -> int:
@@ -104,14 +111,12 @@ def _objects(targets: tuple[Target, ...], calib: Calibration) -> list[KittiObjec
     return objects_from_boxes(_boxes(targets), [target.type for target in targets], calib)
 
 
-def _nearest_first(targets: tuple[Target, ...]) -> npt.NDArray[np.int64]:
+def nearest_first(targets: tuple[Target, ...]) -> npt.NDArray[np.int64]:
+    """Indices (M,) of the objects by their distance in metres from the sensor."""
     return np.argsort(np.hypot(*_boxes(targets)[:, :2].T), kind="stable")
 
 
-def _evidence(
-    targets: tuple[Target, ...], hits: Hits, owner: Owners, calib: Calibration
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Of each object (M,): its points, the visible share of its firings, and what the image's border cuts."""
-    points = np.bincount(owner[owner >= 0], minlength=len(targets))
-    _, truncated = image_boxes(_boxes(targets), calib)
-    return points, hits.visible / np.maximum(hits.alone, 1), truncated
+def evidence(hits: Hits, owner: Owners) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Of each object (M,): how many points are its own, by the `owner` (N,) of each, and its visible share."""
+    points = np.bincount(owner[owner >= 0], minlength=len(hits.alone))
+    return points, hits.visible / np.maximum(hits.alone, 1)

@@ -1,10 +1,6 @@
 """Writing simulated frames in KITTI's layout."""
 
-import contextlib
-import json
-import multiprocessing
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from rich.progress import track
 
 from asca_pillars.data.kitti import (
     Calibration,
@@ -23,14 +18,14 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
-from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
-from asca_pillars.sim.casting.raycast import cast
+from asca_pillars.sim.casting.raycast import Hits, cast
+from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
-from asca_pillars.sim.sensor.returns import measure
-from asca_pillars.sim.world.scene import build, draw_scene
+from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
+from asca_pillars.sim.sensor.returns import Returns, measure
+from asca_pillars.sim.world.scene import Scene, build, draw_scene
 
 
 @dataclass(frozen=True)
@@ -65,17 +60,38 @@ def simulate_frame(seed: int, index: int, config: SimulationConfig | None = None
     camera_only, around = config.field_of_view == "camera", config.field_of_view == "around"
     scene = draw_scene(config.scene, np.random.default_rng([seed, index, 0]))
     firings = draw_firings(config.lidar, np.random.default_rng([seed, index, 2]), camera_only, around)
-    half_angle = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0)
-    bodies = build(scene, config.scene, (seed, index), half_angle if camera_only else np.pi)
-    noise = np.random.default_rng([seed, index, 3])
-    key = int(noise.integers(1 << 62))
-    hits = cast(bodies, len(scene.targets), scene.ground, firings, key)
-    returns = measure(hits, firings, noise)
+    hits, returns = take_scan(scene, config, firings, (seed, index), np.random.default_rng([seed, index, 3]))
     seen = np.ones(len(returns.points), bool) if around else in_image(returns.points, scene.calibration)
     label = label_all_around if around else label_camera_view
     objects = label(scene.targets, hits, returns.owner[seen], scene.calibration, config.scene)
     points = returns.points[seen] if camera_only else returns.points
     return Frame(np.ascontiguousarray(points), objects, scene.calibration)
+
+
+def take_scan(
+    scene: Scene,
+    config: SimulationConfig,
+    firings: Firings,
+    seed: tuple[int, ...],
+    noise: np.random.Generator,
+    numbers: Sequence[int] | None = None,
+) -> tuple[Hits, Returns]:
+    """Scan a scene: what each firing meets, and the points (N, 4) that the sensor makes of it.
+
+    Args:
+        scene: in the LiDAR frame.
+        config: of the scene and the sensor.
+        firings: of this scan.
+        seed: of the bodies, and `numbers` of each, as for `world.scene.build`.
+        noise: of this scan.
+        numbers: of the bodies.
+    """
+    camera_only = config.field_of_view == "camera"
+    half_angle = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0)
+    bodies = build(scene, config.scene, seed, half_angle if camera_only else np.pi, numbers)
+    key = int(noise.integers(1 << 62))
+    hits = cast(bodies, len(scene.targets), scene.ground, firings, key)
+    return hits, measure(hits, firings, noise)
 
 
 def simulate(
@@ -98,25 +114,13 @@ def simulate(
         ConfigError: a number of frames or workers below 1, or a share outside 0..1.
         DatasetError: `out` holds frames of another seed or configuration.
     """
-    if frames < 1 or workers < 1:
-        raise ConfigError(f"frames is {frames} and workers is {workers}; both must be at least 1")
-    if not 0.0 <= val_share <= 1.0:
-        raise ConfigError(f"val_share is {val_share}; it must lie between 0 and 1")
+    check_wishes({"frames": frames, "workers": workers}, val_share)
     root = Path(out)
     config = config or SimulationConfig()
-    _claim_folder(root, seed, config)
     split = KittiSplit(root)
+    claim_simulation(root, {"seed": seed, **asdict(config)}, split.folder / "velodyne")
     todo = [index for index in range(frames) if not _is_complete(split, index)]
-    job = partial(_write_frame, root, seed, config)
-    if workers > 1 and len(todo) > 1:
-        # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
-        with (
-            _one_thread_per_process(),
-            multiprocessing.get_context("spawn").Pool(min(workers, len(todo))) as pool,
-        ):
-            _watch(pool.imap_unordered(job, todo, chunksize=4), len(todo), progress)
-    else:
-        _watch(map(job, todo), len(todo), progress)
+    for_each(partial(_write_frame, root, seed, config), todo, workers, progress=progress)
     names = [frame_id(index) for index in range(frames)]
     first_val = frames - round(frames * val_share)
     write_image_set(root, "train", names[:first_val])
@@ -127,39 +131,6 @@ def simulate(
 def frame_id(index: int) -> str:
     """KITTI's name of a frame: six digits."""
     return f"{index:06d}"
-
-
-def _claim_folder(root: Path, seed: int, config: SimulationConfig) -> None:
-    """Note in simulation.json what the frames of a folder depend on; refuse a folder of other frames."""
-    path = root / "simulation.json"
-    text = json.dumps({"seed": seed, **asdict(config)}, indent=2) + "\n"
-    if not path.exists():
-        scans = KittiSplit(root).folder / "velodyne"
-        if any(scans.glob("*.bin")):
-            raise DatasetError(f"{scans}: holds scans that were not simulated; choose another folder")
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    elif path.read_text(encoding="utf-8") != text:
-        raise DatasetError(f"{path}: the frames there have another seed or configuration; choose another folder")
-
-
-@contextlib.contextmanager
-def _one_thread_per_process() -> Iterator[None]:
-    """Linear algebra of the processes started inside uses one thread each: the processes are the parallelism."""
-    before = os.environ.get("OPENBLAS_NUM_THREADS")
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["OPENBLAS_NUM_THREADS"]
-        else:
-            os.environ["OPENBLAS_NUM_THREADS"] = before
-
-
-def _watch(results: Iterable[None], total: int, progress: bool) -> None:
-    for _ in track(results, "Simulating", total=total, disable=not progress):
-        pass
 
 
 def _is_complete(split: KittiSplit, index: int) -> bool:

@@ -9,6 +9,9 @@ from asca_deploy.bundle import (
 )
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
+from asca_deploy.scan_queue import ScanQueue
+from asca_deploy.tracker import Tracker
+from asca_deploy.tracks import Tracks
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_report import FrameReport
 
@@ -17,6 +20,9 @@ __all__ = [
     "Detections",
     "Detector",
     "FrameReport",
+    "ScanQueue",
+    "Tracker",
+    "Tracks",
     "default_bundle_path",
     "find_bundle",
     "load_bundle",

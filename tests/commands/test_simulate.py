@@ -7,7 +7,7 @@ import pytest
 
 from asca_pillars.commands import extras
 from asca_pillars.commands import simulate as command
-from asca_pillars.errors import AscaError, DatasetError
+from asca_pillars.errors import AscaError, ConfigError, DatasetError
 from tests.sim.report.made_up import write_set
 
 
@@ -68,3 +68,18 @@ def test_a_wrong_real_folder_and_a_bundle_without_one_are_told_before_the_work(t
     with pytest.raises(AscaError, match="give --like"):
         command.simulate(tmp_path / "sim", frames=2, workers=1, view="camera", bundle=Path("asca_small_sim"))
     assert not (tmp_path / "sim").exists()
+
+
+def test_sequences_are_written_and_go_with_nothing_of_single_scans(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command.simulate(tmp_path / "a", sequences=1, length=2, workers=1, config="vlp_16")
+    assert "1 sequences of 2 scans below" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "a" / "scans" / "0000").iterdir()} == {"000000.bin", "000001.bin"}
+    with pytest.raises(ConfigError, match="leave --frames"):
+        command.simulate(tmp_path / "b", sequences=1, frames=3)
+    with pytest.raises(AscaError, match="another folder"):
+        command.simulate(tmp_path / "a", frames=1, workers=1)
+    simulate(tmp_path / "c", 1, report=False)
+    with pytest.raises(AscaError, match="another folder"):
+        command.simulate(tmp_path / "c", sequences=1, length=2)

@@ -27,7 +27,7 @@ from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, rea
 from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scan_settings import ScanSettings
+from asca_pillars.data.scan_settings import ScanSettings, sample_points
 from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, find_scans
 from asca_pillars.data.scans.reflectance import ReflectanceScale
 from asca_pillars.data.scans.scan_reader import folder_reflectance_scale, read_scan, stored_points
@@ -101,7 +101,7 @@ class BoxSplit:
             ScanError: the height cannot be estimated.
         """
         paths = [frame.scan for _, frame in sorted(self._frames.items())]
-        return self.settings.mounting(paths, self._read, Path(self.root))[0]
+        return self.settings.mounting(sample_points(paths, self._read), Path(self.root))[0]
 
     @property
     def scans_folder(self) -> Path:

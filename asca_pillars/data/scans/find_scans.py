@@ -34,7 +34,7 @@ def find_scans(path: str | Path) -> list[Path]:
     scans = [entry for entry in path.rglob("*") if _is_scan(entry.relative_to(path)) and entry.is_file()]
     if not scans:
         raise ScanError(f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}")
-    return sorted(scans, key=_natural_order)
+    return sorted(scans, key=natural_order)
 
 
 def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
@@ -75,7 +75,8 @@ def _is_scan(relative: Path) -> bool:
     return relative.suffix.lower() in SCAN_SUFFIXES and not any(part.startswith(".") for part in relative.parts)
 
 
-def _natural_order(path: Path) -> list[list[tuple[int, str]]]:
+def natural_order(path: Path) -> list[list[tuple[int, str]]]:
+    """A key by which 2.bin comes before 10.bin."""
     return [
         [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", part)]
         for part in path.parts

@@ -53,7 +53,7 @@ def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field
     Raises:
         ScanError: lines are missing, not as long as the fields, or not of numbers; or there is no x, y and z.
     """
-    wanted, width = _wanted(source, fields), sum(field.count for field in fields)
+    wanted, width = wanted_fields(source, fields), sum(field.count for field in fields)
     if len(lines) < count:
         raise ScanError(f"{source}: {len(lines)} lines where {count} points need {count}; {AGAIN}")
     rows = [line.split() for line in lines[:count]]
@@ -66,7 +66,7 @@ def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field
     except ValueError as error:
         raise ScanError(f"{source}: {error}; {AGAIN}") from error
     starts = np.cumsum([0] + [field.count for field in fields])
-    return _assemble(count, [table[:, starts[index]] for index in wanted], [fields[index] for index in wanted])
+    return assemble_points(count, [table[:, starts[index]] for index in wanted], [fields[index] for index in wanted])
 
 
 def points_from_bytes(
@@ -77,7 +77,7 @@ def points_from_bytes(
     Raises:
         ScanError: the body is shorter than `count` points, or the fields hold no x, y and z.
     """
-    wanted, size = _wanted(source, fields), sum(field.size_bytes for field in fields)
+    wanted, size = wanted_fields(source, fields), sum(field.size_bytes for field in fields)
     if len(data) < count * size:
         raise ScanError(f"{source}: {len(data)} bytes where {count} points need {count * size}; {AGAIN}")
     raw = np.frombuffer(data, dtype=np.uint8, count=count * size)
@@ -89,11 +89,15 @@ def points_from_bytes(
         else:
             column = np.ascontiguousarray(raw.reshape(count, size)[:, start : start + field.size_bytes])
         columns.append(column.reshape(-1).view(field.dtype))
-    return _assemble(count, columns, [fields[index] for index in wanted])
+    return assemble_points(count, columns, [fields[index] for index in wanted])
 
 
-def _wanted(source: str, fields: Sequence[Field]) -> list[int]:
-    """Indices of x, y, z and, where there is one, the reflectance. CloudCompare writes scalar_Intensity."""
+def wanted_fields(source: str, fields: Sequence[Field]) -> list[int]:
+    """Indices of x, y, z and, where there is one, the reflectance. CloudCompare writes scalar_Intensity.
+
+    Raises:
+        ScanError: a coordinate is missing, or one of them is there twice or has several values per point.
+    """
     names = [field.name.lower().removeprefix("scalar_") for field in fields]
     if missing := [name for name in "xyz" if name not in names]:
         raise ScanError(
@@ -109,7 +113,8 @@ def _wanted(source: str, fields: Sequence[Field]) -> list[int]:
     return wanted
 
 
-def _assemble(count: int, columns: Sequence[NDArray[np.generic]], fields: Sequence[Field]) -> StoredPoints:
+def assemble_points(count: int, columns: Sequence[NDArray[np.generic]], fields: Sequence[Field]) -> StoredPoints:
+    """Points of columns (N,) x, y, z in metres and perhaps reflectances, with the field of each."""
     xyz = np.zeros((count, 3), dtype=np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         for axis, column in enumerate(columns[:3]):

@@ -77,7 +77,7 @@ def read_scan(path: str | Path, *, columns: int | None = None, reflectance_scale
     """
     reflectance_scale = checked_scale(reflectance_scale)
     stored = _read_stored(Path(path), columns)
-    return _finite_scan(stored, reflectance_scale)
+    return finite_scan(stored, reflectance_scale)
 
 
 class FolderScale(NamedTuple):
@@ -98,13 +98,18 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
     for path in chosen:
         with suppress(ScanError):
             one = _read_stored(path, columns)
-            if one.reflectance is not None:
-                stored.append((one.reflectance, one.dtype))
-    if not stored:
+            stored.append(one)
+    return common_reflectance_scale(stored)
+
+
+def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
+    """One reflectance scale for scans that belong together; auto where none of them has reflectances."""
+    samples = [(one.reflectance, one.dtype) for one in stored if one.reflectance is not None]
+    if not samples:
         return FolderScale("auto", None)
-    scale = common_scale(stored)
-    by_values = any(decide_scale(*one)[1] == "values" for one in stored)
-    doubts = [ambiguity(values, scale) for values, _ in stored] if by_values else [None]
+    scale = common_scale(samples)
+    by_values = any(decide_scale(*one)[1] == "values" for one in samples)
+    doubts = [ambiguity(values, scale) for values, _ in samples] if by_values else [None]
     return FolderScale(scale, doubts[0] if all(doubts) else None)
 
 
@@ -157,7 +162,8 @@ def _read_stored(path: Path, columns: int | None) -> StoredPoints:
         raise ScanError(f"{path}: {size} bytes do not fit into memory; cut the recording into scans") from None
 
 
-def _finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
+def finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
+    """The finite points of what is stored, reflectances divided by `scale`, or by what the values suggest."""
     points = np.zeros((len(stored.xyz), 4), dtype=np.float32)
     points[:, :3] = stored.xyz
     notes = ScanNotes(remarks=stored.remarks)

@@ -94,7 +94,7 @@ def _by_frame(path: Path, frame_ids: set[str]) -> tuple[dict[str, BoxRecords], S
         if np.isnan(records.scores).any():
             number = int(np.isnan(records.scores).argmax()) + 1
             raise DatasetError(f"{place}, box {number}: no `score`; every prediction needs one")
-        frame_id = _frame_id(scan, frame_ids)
+        frame_id = frame_of_scan(scan, frame_ids)
         if frame_id in places:
             raise DatasetError(f"{place}: {scan} has predictions in {places[frame_id]} already; join them")
         if frame_id is not None:
@@ -107,7 +107,8 @@ def _by_frame(path: Path, frame_ids: set[str]) -> tuple[dict[str, BoxRecords], S
     return predictions, sorted(predictions)
 
 
-def _frame_id(scan: str, frame_ids: set[str]) -> str | None:
+def frame_of_scan(scan: str, frame_ids: set[str]) -> str | None:
+    """The frame whose id is the longest end of a scan's path; None if there is none."""
     parts = PurePosixPath(scan.replace("\\", "/")).with_suffix("").parts
     ends = ("/".join(parts[first:]) for first in range(len(parts)))
     return next((end for end in ends if end in frame_ids), None)

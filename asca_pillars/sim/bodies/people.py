@@ -7,8 +7,13 @@ from asca_pillars.sim.bodies.figures import Floats, Limb, draw_cloth, draw_skin,
 from asca_pillars.sim.bodies.primitives import Primitives, Surface, ellipsoids, quads
 
 
-def pedestrian_body(rng: np.random.Generator, height: float, width: float, length: float) -> Primitives:
-    """A standing or walking person. `width` bounds the shoulders and arms, `length` the step and the swing."""
+def pedestrian_body(
+    rng: np.random.Generator, height: float, width: float, length: float, walked_m: float = 0.0
+) -> Primitives:
+    """A standing or walking person. `width` bounds the shoulders and arms, `length` the step and the swing.
+
+    The step goes on with `walked_m`, and nothing else of the body does: the same `rng` gives the same person.
+    """
     h = height
     shoulder = float(np.clip(0.40 * width + 0.04, 0.19, 0.30)) * min(h / 1.6, 1.0)
     lean = float(rng.normal(0.02, 0.03)) * h
@@ -19,6 +24,7 @@ def pedestrian_body(rng: np.random.Generator, height: float, width: float, lengt
     stride = float(np.clip(length / 2 - 0.07, 0.06, 0.58)) * (1.0 if rng.random() < 0.88 else 0.2)
     # Feet rest on the ground where the step is widest: half of the walkers are near there.
     phase = float(rng.uniform(0.0, 2 * np.pi) if rng.random() < 0.5 else rng.normal(np.pi / 2, 0.5))
+    phase += np.pi * walked_m / (2 * stride)  # a foot on the ground stays there while the body passes over it
     rows: list[Limb] = [
         ((0, 0, 0.52 * h), (lean, 0, 0.80 * h), shoulder * 0.9, 0.128 * thick, upper),
         ((lean * 0.8, 0, 0.70 * h), (lean, 0, 0.84 * h), shoulder, 0.115 * thick, upper),

@@ -47,6 +47,7 @@ class Street(NamedTuple):
     second_v_m: float
     second_half_m: float
     ditch_m: float
+    along_m: float  # how far along x the car has driven since the scene was drawn; hills and markings stay behind
     # Derived, because heights are asked for by the million.
     cos_yaw: float
     sin_yaw: float
@@ -106,7 +107,7 @@ def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float
     All in metres, LiDAR frame; relief (R, R) holds heights above z_m, as in `Ground`.
     """
     cells = relief.shape[0] - 1
-    row = min(max((x + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
+    row = min(max((x + street.along_m + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
     col = min(max((y + RELIEF_HALF_M) / RELIEF_STEP_M, 0.0), cells - 1e-6)
     i, j = int(row), int(col)
     a, b = row - i, col - j
@@ -152,7 +153,8 @@ def ground_material(x: float, y: float, street: Street) -> int:
     lane = street.lane_m
     if lane > 0.0 and main < 0.0 and cross > 0.0:
         to_line = abs(v / lane - np.round(v / lane)) * lane
-        if to_line < 0.07 and u - 9.0 * np.floor(u / 9.0) < 4.0:
+        dashed = u + street.along_m
+        if to_line < 0.07 and dashed - 9.0 * np.floor(dashed / 9.0) < 4.0:
             return MARKING
         if main > -0.32 and main < -0.18:
             return MARKING
@@ -160,17 +162,18 @@ def ground_material(x: float, y: float, street: Street) -> int:
 
 
 @numba.njit(cache=True)
-def highest_within(relief: Floats) -> Floats:
+def highest_within(relief: Floats, along_m: float) -> Floats:
     """Highest (R - 1,) of relief (R, R), metres, within each multiple of RELIEF_STEP_M of the car.
 
     Rays may start below it.
     """
     half = relief.shape[0] // 2
-    highest = np.full(2 * half, relief[half, half])
+    driven = along_m / RELIEF_STEP_M
+    highest = np.full(2 * half, relief.min())
     for i in range(relief.shape[0]):
         for j in range(relief.shape[1]):
             # A lattice point shapes the cells around it, up to 1.5 steps nearer than itself.
-            ring = max(int(np.hypot(i - half, j - half) - 1.5), 0)
+            ring = min(max(int(np.hypot(i - half - driven, j - half) - 1.5), 0), 2 * half - 1)
             highest[ring] = max(highest[ring], relief[i, j])
     for ring in range(1, len(highest)):
         highest[ring] = max(highest[ring], highest[ring - 1])

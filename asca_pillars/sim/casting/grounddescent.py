@@ -161,7 +161,7 @@ def cast_ground(
     slopes, origins, cos_phase, sin_phase = rays.slope, rays.origin_z_m, rays.cos_phase, rays.sin_phase
     cos_azimuth, sin_azimuth, is_cast = rays.cos_azimuth, rays.sin_azimuth, rays.cast
     rho, cosine, reflectance, owner = nearest.rho_m, nearest.cosine, nearest.reflectance, nearest.owner
-    highest = highest_within(relief)
+    highest = highest_within(relief, street.along_m)
     rough = street.rough_m
     columns = len(is_cast)
     group = max(int(GROUP_DEG / 360.0 * columns), 1)

@@ -1,6 +1,6 @@
 """Where road users of each class stand, drive and walk on a street; u along it, v to its left."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,10 @@ from asca_pillars.sim.world.ground import Ground
 Floats = npt.NDArray[np.float64]
 QUARTER_TURNS = (0.0, np.pi, np.pi / 2, -np.pi / 2)
 NOSE_IN_M, ALONG_M = (0.5, 1.1), (0.4, 1.8)  # gaps between parked cars side by side and one behind the other
+
+
+Going: TypeAlias = Literal["still", "lane", "crossing", "riding", "walking"]
+"""What something does where it stands: in a scan nothing shows it, in a sequence it moves by it."""
 
 
 class Neighbor(NamedTuple):
@@ -29,6 +33,7 @@ class Candidate(NamedTuple):
     company: list[Neighbor] | None = None  # of what stands there, once it does, it becomes one
     neighbor: Neighbor | None = None
     half_hidden: bool = False  # something shall stand before it
+    going: Going = "still"
 
 
 class Habits:
@@ -74,7 +79,9 @@ class Habits:
         """A tram of size (3,) in metres on its track, or beside the road."""
         rails = self.ground.rails_v_m
         v = self.ground.half_width_m + 3.0 if rails is None else rails
-        return Candidate(self.ground.to_lidar(way * self.rng.uniform(8.0, 74.0), v, self.rng.choice([0.0, np.pi])))
+        return Candidate(
+            self.ground.to_lidar(way * self.rng.uniform(8.0, 74.0), v, self.rng.choice([0.0, np.pi])), going="lane"
+        )
 
     def pedestrian(self, size: Floats, way: float) -> Candidate:
         """A person of size (3,), metres, alone or in company; along the street, across the line of sight, or anyhow."""
@@ -97,7 +104,7 @@ class Habits:
                 beyond = pavement + rng.uniform(0.0, 8.0) if rng.random() < config.beyond_pavement else 0.0
                 v = rng.choice([-1.0, 1.0]) * (half + beyond + rng.uniform(0.1, max(pavement, 1.0) + 1.5))
             heading = self._turned(heading, u, v)
-        return self._at(self.people, u, v, heading)
+        return self._at(self.people, u, v, heading, going="walking")
 
     def _turned(self, heading: float, u: float, v: float) -> float:
         """A walker's heading against the street: as given, anyhow, or across the line of sight."""
@@ -153,7 +160,7 @@ class Habits:
             v = side * (half + (rng.uniform(-1.3, -0.3) if rng.random() < 0.5 else rng.uniform(0.4, 7.0)))
             against = rng.random() < config.riding_against_traffic
             heading = (np.pi if (side > 0) != against else 0.0) + rng.normal(0, 0.12)
-        return self._at(self.riders, u, v, heading)
+        return self._at(self.riders, u, v, heading, going="riding")
 
     def _at(
         self,
@@ -163,11 +170,13 @@ class Habits:
         heading: float,
         length: float = 0.0,
         sway: tuple[float, float] = (0.0, 0.0),
+        *,
+        going: Going = "still",
     ) -> Candidate:
         """A candidate beside which others of `company` may stand; `sway` is the spread of its place and heading."""
         across, turn = (float(self.rng.normal(0.0, spread)) if spread else 0.0 for spread in sway)
         place = self.ground.to_lidar(u, v + across, heading + turn)
-        return Candidate(place, company, Neighbor(float(u), float(v), float(heading), float(length)))
+        return Candidate(place, company, Neighbor(float(u), float(v), float(heading), float(length)), going=going)
 
     def _distance(self, shape: float, scale: float) -> float:
         """Along the street, metres: by KITTI's labels where its camera looks, and as many beside the car."""
@@ -182,7 +191,7 @@ class Habits:
         lane = -1.0 if rng.random() < 0.5 else 1.0
         across = lane * ground.cross_half_m * rng.uniform(0.4, 0.65)
         heading = (0.0 if lane > 0 else np.pi) + rng.normal(0, 0.06)
-        return Candidate(ground.cross_to_lidar(rng.uniform(-45.0, 45.0), across, heading))
+        return Candidate(ground.cross_to_lidar(rng.uniform(-45.0, 45.0), across, heading), going="crossing")
 
     def _parked(self, size: Floats, way: float) -> Candidate:
         """At the kerb, half on the pavement or nose in; mostly next to one that is parked already."""
@@ -237,4 +246,4 @@ class Habits:
             lane = (int(rng.integers(lanes)) + 0.5) * min(half / lanes, 3.6)
             oncoming = rng.random() < config.oncoming
             v, heading = (lane if oncoming else -lane), (np.pi if oncoming else 0.0)
-        return self._at(self.traffic, u, v, heading, size[0], sway=(0.2, 0.035))
+        return self._at(self.traffic, u, v, heading, size[0], sway=(0.2, 0.035), going="lane")

@@ -34,6 +34,13 @@ class Occupied:
         self.count += 1
         return True
 
+    def hold(self, x: float, y: float, length: float, width: float, yaw: float) -> None:
+        """Take a footprint, free or not, for what will move there; nothing that comes later stands in it."""
+        if self.count == len(self.rows):
+            self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)])
+        self.rows[self.count] = x, y, length, width, yaw, 0.0
+        self.count += 1
+
 
 @numba.njit(cache=True)
 def _is_free(row: Floats, rows: Floats, count: int) -> bool:

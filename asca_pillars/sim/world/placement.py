@@ -7,7 +7,7 @@ import numpy as np
 
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.habits import Candidate, Floats, Habits
+from asca_pillars.sim.world.habits import Candidate, Floats, Going, Habits
 from asca_pillars.sim.world.occupied import Occupied
 from asca_pillars.sim.world.sizes import draw_size
 
@@ -22,12 +22,15 @@ PEDESTRIANS_OVERLAP_M = 0.15  # boxes of people who walk side by side share that
 class Target:
     """A labelled object: KITTI type and label box (x, y, z, length, width, height, yaw).
 
-    The body stands on the ground, `lift_m` below the bottom of the box.
+    The body stands on the ground, `lift_m` below the bottom of the box. `going` is what it does, `walked_m` how far it
+    has walked since it was placed.
     """
 
     type: str
     box: Floats
     lift_m: float = 0.0
+    going: Going = "still"
+    walked_m: float = 0.0
 
 
 @dataclass
@@ -84,5 +87,6 @@ class Placer:
         mean, deviation = self.config.box_lift_m[0 if name in (*ON_FOOT, "Cyclist") else 1]
         lift = float(np.clip(self.rng.normal(mean, deviation), -0.12, 0.15))
         yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
-        self.targets.append(Target(name, np.array([x, y, level + lift + size[2] / 2, *size, yaw]), lift))
+        box = np.array([x, y, level + lift + size[2] / 2, *size, yaw])
+        self.targets.append(Target(name, box, lift, candidate.going))
         return True

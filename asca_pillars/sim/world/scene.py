@@ -1,5 +1,6 @@
 """One random street: its ground, its objects, its background, its camera."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,8 +43,14 @@ class Scene:
     calibration: Calibration
 
 
-def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
-    """A random street with everything on it."""
+def draw_scene(config: SceneConfig, rng: np.random.Generator, arrange: Callable[[Placer], None] | None = None) -> Scene:
+    """A random street with everything on it.
+
+    Args:
+        config: what is drawn between which bounds.
+        rng: of the scene.
+        arrange: changes what has been placed, before anything unlabelled is put around it.
+    """
     kind = draw_kind(config, rng)
     habits = HABITS_OF.get(kind, kind)
     ground = draw_ground(config, rng, kind)
@@ -51,6 +58,8 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator) -> Scene:
     occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
     placer = Placer(rng, config, ground, occupied, habits)
     place_objects(placer)
+    if arrange is not None:
+        arrange(placer)
     builder = Builder(rng, config, ground, occupied, kind)
     hide_partly(builder, placer.half_hidden)
     fill_gaps(builder, placer.targets)
@@ -134,7 +143,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     elif name == "Misc":
         body = heavy.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
     elif name == "Pedestrian":
-        body = people.pedestrian_body(rng, height - 0.05, width, length)
+        body = people.pedestrian_body(rng, height - 0.05, width, length, target.walked_m)
     elif name == "Person_sitting":
         body = people.sitting_body(rng, height - 0.05)
     else:
@@ -143,11 +152,17 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 
 
-def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: float) -> Bodies:
+def build(
+    scene: Scene,
+    config: SceneConfig,
+    seed: tuple[int, ...],
+    within_rad: float,
+    numbers: Sequence[int] | None = None,
+) -> Bodies:
     """Primitives of a scene.
 
     Objects whose azimuth is beyond `within_rad` of straight ahead are left out; the chance of the others does not
-    change by that.
+    change by that. An object's body depends on `seed` and on its number; `numbers` are 0, 1, 2 ... if not given.
     """
     parts, owners, salts, blob_owners, blob_salts = [scene.background], [], [], [], []
     background = scene.background
@@ -160,8 +175,9 @@ def build(scene: Scene, config: SceneConfig, seed: tuple[int, int], within_rad: 
         reach = np.pi if distance < target.box[3] else np.arctan(0.6 * target.box[3] / distance)
         if abs(np.arctan2(target.box[1], target.box[0])) > within_rad + reach:
             continue
-        body = body_of(target, config, np.random.default_rng([*seed, 1, index]))
-        first = 10_000_000 + index * 10_000
+        number = index if numbers is None else numbers[index]
+        body = body_of(target, config, np.random.default_rng([*seed, 1, number]))
+        first = 10_000_000 + number * 10_000
         parts.append(body)
         owners.append(np.full(len(body.triangles), index))
         salts.append(first + np.arange(len(body.triangles)))

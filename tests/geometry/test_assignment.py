@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.evaluation.assignment import UNMATCHED, best_assignments, greedy_matches
+from asca_pillars.geometry.assignment import UNMATCHED, best_assignments, greedy_matches
 
 
 def greatest_sum(overlap: NDArray[np.float64]) -> float:

@@ -1,0 +1,238 @@
+"""`asca detect` of a recording: scans of one topic in, boxes with time stamps and identities out."""
+
+import json
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from asca_deploy import Detector, find_bundle, load_bundle
+from asca_deploy.tracker import Tracker
+from asca_pillars.commands import detect_tables as show
+from asca_pillars.commands.detect_files import RUN_FILE
+from asca_pillars.commands.extras import require
+from asca_pillars.commands.foxglove_file import FoxgloveFile, require_own_file
+from asca_pillars.commands.models import open_detector
+from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
+from asca_pillars.commands.recording_results import Found, JsonLines, KittiTracks, ResultFile, open_text, tracked
+from asca_pillars.commands.rerun_file import RerunFile
+from asca_pillars.commands.scan_input import said_of_scale
+from asca_pillars.data.kitti import read_calibration
+from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.recordings.odometry import Poses, read_poses
+from asca_pillars.data.recordings.open_recording import open_recording
+from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.data.scan_settings import SAMPLE_SCANS, ScanSettings
+from asca_pillars.errors import ConfigError, ScanError
+from asca_pillars.files import atomic_path, require_own
+
+KITTI_FILE = "tracks.txt"
+ABOUT_FILE = "recording.json"
+WEAK_SHARE = 0.7
+"""Detections from this share of the lowest threshold on carry tracks on that better ones began."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingTask:
+    """What is made of a recording; the options of `asca detect` by the same names."""
+
+    path: Path
+    out: Path
+    score: float | None
+    around: bool
+    topic: str | None
+    track: bool
+    odometry: str | None
+    calib: Path | None
+    foxglove: Path | None
+    rerun: Path | None
+
+
+def detect_recording(task: RecordingTask, reading: ScanSettings, options: RuntimeOptions, console: Console) -> None:
+    """Detect in every scan of a topic and write the results; what a killed run had done is not done again.
+
+    Raises:
+        AscaError: something cannot be read or written; scans that cannot be read are skipped, and told at the end.
+    """
+    require("recordings")
+    if task.rerun is not None:
+        require("view")
+        if task.rerun.suffix.lower() != ".rrd":
+            raise ConfigError(f"--rerun {task.rerun}: rerun opens .rrd files; choose such a name")
+    if task.foxglove is not None:
+        require_own_file(task.foxglove)
+    calibration = None if task.calib is None else read_calibration(task.calib)
+    require_own(task.out, "asca detect", RUN_FILE, JOURNAL_FILE)
+    recording = open_recording(task.path)
+    topic = recording.point_cloud_topic(task.topic)
+    if task.odometry is not None and not task.track:
+        raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
+    poses = None if task.odometry is None else read_poses(recording, task.odometry)
+    scans = RecordedScans(recording, topic, reading.reflectance_scale)
+    said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
+    mounting, estimate = reading.mounting(scan.points for scan in scans.first(SAMPLE_SCANS))
+    if estimate is not None:
+        said.append(f"sensor height: {estimate}")
+    for line in said:
+        console.print(line, style="yellow", soft_wrap=True)
+    births = _thresholds(options.bundle, task.score)
+    least = WEAK_SHARE * min(births.values()) if task.track else task.score
+    detector = open_detector(options, least, mounting, around=task.around)
+    about = _about(task, reading, detector, topic.name, least)
+    with Journal(task.out, about, detector.spec.class_names) as journal:
+        if journal.done:
+            console.print(f"going on after the {journal.done} scans that {journal.path} holds", soft_wrap=True)
+        start = process_time()
+        run = _Run(detector, scans, journal)
+        for _ in track(run.results(), "Detecting", topic.messages - journal.done, console=console):
+            pass
+        seconds = process_time() - start
+        tracker = Tracker(birth_score=births) if task.track else None
+        damage = recording.damage
+        if all(one.detections is None for one in journal.results()):
+            raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{run.first()}")
+        results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
+        _write(task, results, scans, calibration, about)
+        journal.remove()
+    _tell(task, run, detector, seconds, console)
+    if damage or run.troubles:
+        raise ScanError("; ".join([*([damage] if damage else []), *run.skipped()]))
+
+
+class _Run:
+    """Detection of the scans that the journal does not hold yet."""
+
+    def __init__(self, detector: Detector, scans: RecordedScans, journal: Journal) -> None:
+        self._detector, self._scans, self._journal = detector, scans, journal
+        self._coming: deque[RecordedScan] = deque()
+        self.troubles = [one.trouble for one in journal.results() if one.trouble] if journal.done else []
+        self.kept: list[show.Result] = []
+
+    def results(self) -> Iterator[None]:
+        """One item for each scan that is in the journal now."""
+        for found in self._detector.stream(self._points()):
+            yield from self._skip()
+            scan = self._coming.popleft()
+            assert scan.scan is not None, "only scans that could be read are streamed"
+            self._journal.add(
+                ScanResult(
+                    scan.number,
+                    scan.time_ns,
+                    scan.frame_id,
+                    found,
+                    dropped_points=scan.scan.dropped_points + found.report.non_finite_points,
+                )
+            )
+            where = self._scans.recording.path / str(scan.number)
+            self.kept.append(show.Result(where, scan.scan.notes, found.labels, found.report))
+            yield
+        yield from self._skip()
+
+    def first(self) -> str:
+        """The first reason why a scan was skipped, to end a sentence with."""
+        return f": {self.troubles[0]}" if self.troubles else ""
+
+    def skipped(self) -> list[str]:
+        """A sentence, if scans were skipped."""
+        return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
+
+    def _points(self) -> Iterator[NDArray[np.float32]]:
+        for one in self._scans.read(self._journal.done):
+            self._coming.append(one)
+            if one.scan is not None:
+                yield one.scan.points
+
+    def _skip(self) -> Iterator[None]:
+        """Note the scans before the next one that could be read."""
+        while self._coming and self._coming[0].scan is None:
+            one = self._coming.popleft()
+            self.troubles.append(str(one.trouble))
+            self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.trouble))
+            yield
+
+
+def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
+    """The score of each class from which on a detection begins a track."""
+    spec = load_bundle(find_bundle(bundle)).spec
+    return {one.name: one.score_threshold if score is None else score for one in spec.classes}
+
+
+def _about(
+    task: RecordingTask, reading: ScanSettings, detector: Detector, topic: str, least: float | None
+) -> dict[str, Any]:
+    """All that detections depend on: a journal of anything else is not gone on with."""
+    files = sorted(task.path.iterdir()) if task.path.is_dir() else [task.path]
+    ranges = detector.spec.ranges
+    return {
+        "recording": str(task.path),
+        "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files],
+        "topic": topic,
+        "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
+        "runs_on": detector.runs_on,
+        "score": least,
+        "around": task.around,
+        "ranges_m": None if task.around else [list(ranges.x_m), list(ranges.y_m)],
+        "reading": {name: None if value is None else str(value) for name, value in asdict(reading).items()},
+    }
+
+
+def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.float64]:
+    """From the scan to the frame that stands still: the scan is turned to x forward, where the odometry's axes lie."""
+    level = np.eye(4)
+    level[:3, :3], level[:3, 3] = mounting.level.axes, mounting.level.shift_m
+    return np.asarray(poses.at(time_ns) @ level)
+
+
+def _write(
+    task: RecordingTask,
+    results: Iterator[Found],
+    scans: RecordedScans,
+    calibration: Any,
+    about: dict[str, Any],
+) -> None:
+    """All files, none of which appears before all are complete."""
+    with ExitStack() as places, ExitStack() as handles:
+        text = places.enter_context(atomic_path(task.out / RUN_FILE))
+        files: list[ResultFile] = [JsonLines(open_text(handles, text), task.path.name)]
+        if calibration is not None:
+            kitti = places.enter_context(atomic_path(task.out / KITTI_FILE))
+            files.append(KittiTracks(open_text(handles, kitti), calibration))
+        if task.foxglove is not None:
+            place = places.enter_context(atomic_path(task.foxglove))
+            foxglove = FoxgloveFile(handles.enter_context(place.open("wb")))
+            handles.callback(foxglove.finish)
+            files.append(foxglove)
+        if task.rerun is not None:
+            rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
+            handles.callback(rerun.finish)
+            files.append(rerun)
+        with atomic_path(task.out / ABOUT_FILE) as temporary:
+            temporary.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")
+        for found in results:
+            for file in files:
+                file.write(found)
+        handles.close()  # before the names are changed
+
+
+def _tell(task: RecordingTask, run: _Run, detector: Detector, seconds: float, console: Console) -> None:
+    if run.kept:
+        labels = np.concatenate([one.labels for one in run.kept])
+        counts = np.bincount(labels, minlength=len(detector.spec.class_names))
+        found = ", ".join(f"{count} {name}" for count, name in zip(counts, detector.spec.class_names, strict=True))
+        console.print(f"{len(run.kept)} scans, in all {found}; {1e3 * seconds / len(run.kept):.1f} ms of CPU per scan")
+        for line in show.notes(run.kept):
+            console.print(line, style="yellow", soft_wrap=True)
+    written = [task.out / RUN_FILE, *(path for path in (task.foxglove, task.rerun) if path is not None)]
+    if task.calib is not None:
+        written.insert(1, task.out / KITTI_FILE)
+    console.print(f"Results: {', '.join(map(str, written))}", soft_wrap=True)

@@ -1,0 +1,47 @@
+"""The steps of `asca eval --protocol tracking`: identities over time, from what `asca detect --track` wrote."""
+
+import json
+from pathlib import Path
+
+from rich.console import Console
+
+from asca_pillars.commands.eval_steps import claim
+from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.open_split import open_split
+from asca_pillars.errors import ConfigError
+from asca_pillars.evaluation.report import markdown_page, print_tables
+from asca_pillars.evaluation.tracking.tracking_report import (
+    tracking_json,
+    tracking_notes,
+    tracking_report,
+    tracking_table,
+)
+from asca_pillars.files import atomic_path, write_json
+from asca_pillars.system import describe_environment
+
+
+def evaluate_tracks(
+    data: Path | None, split: str, predictions: Path | None, out: Path, json_path: Path | None, console: Console
+) -> None:
+    """Score tracks; print and write the table and the JSON.
+
+    Raises:
+        AscaError: an option is missing, or a file cannot be read.
+    """
+    if data is None or predictions is None:
+        raise ConfigError("--protocol tracking: give --data ROOT and --predictions, the output of asca detect --track")
+    labels = open_split(data, split)
+    if not isinstance(labels, BoxSplit):
+        raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")
+    claim(out)
+    about = {"data": str(data), "split": split, "predictions": str(predictions)}
+    about |= {"environment": json.loads(describe_environment())}
+    report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
+    tables, notes = [tracking_table(report)], tracking_notes(report)
+    print_tables(report.subject, tables, notes, console)
+    for path in (json_path, out / "tracking.json"):
+        if path is not None:
+            write_json(path, tracking_json(report))
+    with atomic_path(out / "tracking.md") as temporary:
+        temporary.write_text(markdown_page(report.subject, tables, notes), encoding="utf-8")
+    console.print(f"Written to {out}/", highlight=False)

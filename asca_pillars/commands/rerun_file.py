@@ -1,0 +1,63 @@
+"""Scans and boxes as a file that the rerun viewer opens: `rerun out.rrd`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.commands.recording_results import Found
+from asca_pillars.data.recordings.recorded_scans import RecordedScan
+
+MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
+TIMELINE = "time"
+
+
+class RerunFile:
+    """Writes an .rrd: `scan` the points, gray by reflectance, `boxes` what was found.
+
+    Args:
+        path: to write to.
+        scans: those of the results, in the same order; others are passed over.
+    """
+
+    def __init__(self, path: Path, scans: Iterator[RecordedScan]) -> None:
+        import rerun as rr
+
+        self._rr, self._scans = rr, scans
+        self._stream = rr.RecordingStream("asca-pillars")
+        self._stream.save(path)
+
+    def write(self, found: Found) -> None:
+        """One scan with its boxes."""
+        rr, stream = self._rr, self._stream
+        stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
+        points = next(one.scan.points for one in self._scans if one.number == found.number and one.scan is not None)
+        shown = points[:: -(-len(points) // MAX_POINTS) or 1]
+        gray = (np.clip(0.2 + shown[:, 3], 0, 1) * 255).astype(np.uint8)
+        stream.log("scan", rr.Points3D(shown[:, :3], colors=np.repeat(gray[:, None], 3, axis=1), radii=0.03))
+        stream.log("boxes", self._boxes(found))
+
+    def finish(self) -> None:
+        """Write what is still in memory."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _boxes(self, found: Found) -> Any:
+        rr, boxes = self._rr, found.detections.boxes
+        half: NDArray[np.float64] = boxes[:, 6].astype(np.float64) / 2
+        quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+        if found.tracks is None:
+            labels = [f"{box.class_name} {box.score:.2f}" for box in found.detections]
+            ids = found.detections.labels
+        else:
+            labels = [f"{track.detection.class_name} {track.track_id}" for track in found.tracks]
+            ids = found.tracks.track_ids
+        return rr.Boxes3D(
+            centers=boxes[:, :3],
+            sizes=boxes[:, 3:6],
+            quaternions=quaternions,
+            labels=labels,
+            class_ids=(ids % 65_535).astype(np.uint16),
+        )

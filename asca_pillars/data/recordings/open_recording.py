@@ -1,0 +1,46 @@
+"""Which paths are recordings, and opening them."""
+
+from pathlib import Path
+
+from asca_pillars.data.recordings.mcap_files import McapRecording
+from asca_pillars.data.recordings.recording import Recording
+from asca_pillars.data.recordings.ros_bags import RosBag
+from asca_pillars.data.scans.find_scans import natural_order
+from asca_pillars.errors import ScanError
+
+RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
+METADATA_FILE = "metadata.yaml"
+
+
+def is_recording(path: Path) -> bool:
+    """Whether it is a recording by its name: a file, or a folder with the metadata.yaml or the files of rosbag2."""
+    if path.is_dir():
+        return (path / METADATA_FILE).is_file() or bool(_files(path))
+    return path.suffix.lower() in RECORDING_SUFFIXES
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a recording.
+
+    Raises:
+        ScanError: nothing is there, or it cannot be read.
+    """
+    if not path.exists():
+        raise ScanError(f"{path}: no such file or folder; check the path")
+    if path.is_dir():
+        files = _files(path)
+        if files and all(file.suffix == ".mcap" for file in files):
+            return McapRecording(path, files)
+        if not (path / METADATA_FILE).is_file() and len(files) == 1:
+            return RosBag(files[0])
+        if not (path / METADATA_FILE).is_file():
+            raise ScanError(f"{path}: {len(files)} files without {METADATA_FILE}; copy it too, or give them one by one")
+        return RosBag(path)
+    if path.stat().st_size == 0:
+        raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
+    return McapRecording(path, [path]) if path.suffix.lower() == ".mcap" else RosBag(path)
+
+
+def _files(folder: Path) -> list[Path]:
+    found = [file for suffix in (".mcap", ".db3") for file in folder.glob(f"*{suffix}")]
+    return sorted(found, key=lambda file: natural_order(Path(file.name)))

@@ -1,0 +1,82 @@
+"""ROS' sensor_msgs/PointCloud2: points of any field layout, byte order and padding."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from asca_pillars.data.recordings.messages import decoded, reason
+from asca_pillars.data.recordings.recording import Message
+from asca_pillars.data.scans.raw_floats import MAX_POINTS
+from asca_pillars.data.scans.records import Field, StoredPoints, assemble_points, wanted_fields
+from asca_pillars.errors import ScanError
+
+# sensor_msgs/PointField: datatype 1 to 8.
+_DATATYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+
+
+class PointCloud(NamedTuple):
+    """The points of a message, when they were measured, and in which frame."""
+
+    points: StoredPoints
+    time_ns: int
+    """Of the header; where that says 0 or less, when the message was recorded."""
+    frame_id: str
+
+
+def read_point_cloud(message: Message, source: str) -> PointCloud:
+    """The points of a stored message.
+
+    Args:
+        message: of a topic of this type.
+        source: names it in errors.
+
+    Raises:
+        ScanError: the message is damaged or contradicts itself, or has no x, y and z.
+    """
+    try:
+        cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
+    except Exception as error:  # the library lets struct's and NumPy's errors pass
+        raise ScanError(f"{source}: no readable PointCloud2 ({reason(error)}); record it again") from None
+    stamp = cloud.header.stamp
+    time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return PointCloud(
+        _points(cloud, source), time_ns if time_ns > 0 else message.recorded_ns, str(cloud.header.frame_id)
+    )
+
+
+def _points(cloud: Any, source: str) -> StoredPoints:
+    height, width, step, row_step = int(cloud.height), int(cloud.width), int(cloud.point_step), int(cloud.row_step)
+    count, data = height * width, np.asarray(cloud.data, np.uint8)
+    if count > MAX_POINTS:
+        raise ScanError(f"{source}: {count} points are more than {MAX_POINTS}; record single scans")
+    fields, offsets = [], []
+    for field in cloud.fields:
+        if not 1 <= field.datatype <= len(_DATATYPES):
+            raise ScanError(f"{source}: field {field.name[:40]} has datatype {field.datatype}; there are 1 to 8")
+        order = ">" if cloud.is_bigendian else "<"
+        # Some drivers write a count of 0 for single values.
+        fields.append(
+            Field(str(field.name), np.dtype(order + _DATATYPES[field.datatype - 1]), max(int(field.count), 1))
+        )
+        offsets.append(int(field.offset))
+    wanted = wanted_fields(source, fields)
+    for index in wanted:
+        if offsets[index] + fields[index].size_bytes > step:
+            raise ScanError(
+                f"{source}: field {fields[index].name} at byte {offsets[index]} lies beyond the points' {step} bytes"
+            )
+    chosen = [fields[index] for index in wanted]
+    if not count:
+        return assemble_points(0, [np.zeros(0, field.dtype) for field in chosen], chosen)
+    row_step = row_step if height > 1 else max(row_step, width * step)  # single rows need none, and some have 0
+    # The last row may come without its padding.
+    if row_step < width * step or len(data) < (height - 1) * row_step + width * step:
+        raise ScanError(
+            f"{source}: {len(data)} bytes where {height} x {width} points of {step} bytes in rows of {row_step} "
+            "need more; record it again"
+        )
+    columns = []
+    for index in wanted:
+        view = np.ndarray((height, width), fields[index].dtype, data, offsets[index], (row_step, step))
+        columns.append(view.reshape(-1))
+    return assemble_points(count, columns, chosen)

@@ -1,0 +1,70 @@
+"""The scans of a recording's topic, one after the other, with time stamps; those that cannot be read are counted."""
+
+from collections.abc import Iterator
+from itertools import islice
+from typing import NamedTuple
+
+from asca_pillars.data.recordings.point_cloud2 import PointCloud, read_point_cloud
+from asca_pillars.data.recordings.recording import Recording, Topic
+from asca_pillars.data.scans.reflectance import ReflectanceScale
+from asca_pillars.data.scans.scan_reader import FolderScale, Scan, common_reflectance_scale, finite_scan
+from asca_pillars.errors import ScanError
+
+
+class RecordedScan(NamedTuple):
+    """One message of the topic: its number, its time, and its scan or why there is none."""
+
+    number: int
+    time_ns: int
+    frame_id: str
+    scan: Scan | None
+    trouble: str | None = None
+
+
+class RecordedScans:
+    """The scans of one topic.
+
+    Args:
+        recording: to read from.
+        topic: of point clouds.
+        reflectance_scale: the stored value that is a reflectance of 1; auto: decided once, by the first scans.
+
+    Attributes:
+        scale: what was decided.
+    """
+
+    def __init__(self, recording: Recording, topic: Topic, reflectance_scale: ReflectanceScale) -> None:
+        self.recording, self.topic = recording, topic
+        if reflectance_scale == "auto":
+            self.scale = common_reflectance_scale([cloud.points for cloud in self._first(16)])
+        else:
+            self.scale = FolderScale(reflectance_scale, None)
+
+    def first(self, count: int) -> Iterator[Scan]:
+        """The first scans that can be read, at most `count`."""
+        return (finite_scan(cloud.points, self.scale.scale) for cloud in self._first(count))
+
+    def read(self, start: int = 0) -> Iterator[RecordedScan]:
+        """All scans from message `start` on; what damage ends the recording early, `recording.damage` tells."""
+        for number, message in enumerate(self.recording.messages(self.topic.name)):
+            if number < start:
+                continue
+            try:
+                cloud = read_point_cloud(message, self._place(number))
+            except ScanError as error:
+                yield RecordedScan(number, message.recorded_ns, "", None, str(error))
+                continue
+            yield RecordedScan(number, cloud.time_ns, cloud.frame_id, finite_scan(cloud.points, self.scale.scale))
+
+    def _first(self, count: int) -> Iterator[PointCloud]:
+        return islice(self._clouds(), count)
+
+    def _clouds(self) -> Iterator[PointCloud]:
+        for number, message in enumerate(self.recording.messages(self.topic.name)):
+            try:
+                yield read_point_cloud(message, self._place(number))
+            except ScanError:
+                continue  # named when its turn comes
+
+    def _place(self, number: int) -> str:
+        return f"{self.recording.path}, {self.topic.name}, message {number}"

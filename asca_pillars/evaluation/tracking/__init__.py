@@ -1,0 +1,1 @@
+"""Identities over time: HOTA and the CLEAR metrics."""

@@ -1,0 +1,79 @@
+"""Simulating frame after frame in several processes, into a folder that says what it holds."""
+
+import contextlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.progress import track
+
+from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.files import atomic_path
+
+Item = TypeVar("Item")
+
+
+def check_wishes(counts: dict[str, int], val_share: float) -> None:
+    """Refuse counts below 1 and a share outside 0..1, with a ConfigError."""
+    for name, count in counts.items():
+        if count < 1:
+            raise ConfigError(f"{name} is {count}; it must be at least 1")
+    if not 0.0 <= val_share <= 1.0:
+        raise ConfigError(f"val_share is {val_share}; it must lie between 0 and 1")
+
+
+def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool) -> None:
+    """Do a job for each item, in `workers` processes; the job has to be one that can be sent to a process."""
+    if workers > 1 and len(todo) > 1:
+        # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
+        with (
+            _one_thread_per_process(),
+            multiprocessing.get_context("spawn").Pool(min(workers, len(todo))) as pool,
+        ):
+            _watch(pool.imap_unordered(job, todo, chunksize=4), len(todo), progress)
+    else:
+        _watch(map(job, todo), len(todo), progress)
+
+
+def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
+    """Note in simulation.json what the frames of a folder depend on; refuse a folder of other frames.
+
+    Args:
+        root: the folder.
+        about: plain values.
+        scans: folder below it that holds the scans.
+
+    Raises:
+        DatasetError: the scans there are of something else.
+    """
+    path = root / "simulation.json"
+    text = json.dumps(about, indent=2) + "\n"
+    if not path.exists():
+        if any(scans.rglob("*.bin")):
+            raise DatasetError(f"{scans}: holds scans that were not simulated; choose another folder")
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    elif path.read_text(encoding="utf-8") != text:
+        raise DatasetError(f"{path}: the frames there have another seed or configuration; choose another folder")
+
+
+@contextlib.contextmanager
+def _one_thread_per_process() -> Iterator[None]:
+    """Linear algebra of the processes started inside uses one thread each: the processes are the parallelism."""
+    before = os.environ.get("OPENBLAS_NUM_THREADS")
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["OPENBLAS_NUM_THREADS"]
+        else:
+            os.environ["OPENBLAS_NUM_THREADS"] = before
+
+
+def _watch(results: Iterable[None], total: int, progress: bool) -> None:
+    for _ in track(results, "Simulating", total=total, disable=not progress):
+        pass

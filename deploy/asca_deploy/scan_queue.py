@@ -1,0 +1,95 @@
+"""Scans that come when they like, for a detector that takes them when it can.
+
+queue = ScanQueue(when_full="drop")
+lidar.on_scan = queue.put            # in the sensor's thread
+for detections in detector.stream(queue):
+    ...
+print(queue.dropped)
+"""
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, Literal, TypeAlias, get_args
+
+from numpy.typing import NDArray
+
+from asca_pillars.errors import ConfigError
+
+WhenFull: TypeAlias = Literal["drop", "wait"]
+
+
+class ScanQueue:
+    """Between a sensor's thread, which calls `put`, and `Detector.stream`, which iterates. For one of each.
+
+    A stream takes up to two scans ahead of the one that it hands out; those are no longer in the queue.
+
+    Args:
+        when_full: what a scan does that finds the queue full. "drop": the oldest waiting scan is dropped and counted,
+            so that boxes are of the latest scans. "wait": `put` waits until there is room, so that none is lost.
+        size: scans that may wait.
+
+    Attributes:
+        dropped: how many scans were dropped.
+        taken: how many were handed to the iterator.
+
+    Raises:
+        ConfigError: another word than these two, or a size below 1.
+    """
+
+    def __init__(self, when_full: WhenFull, size: int = 1) -> None:
+        if when_full not in get_args(WhenFull):
+            raise ConfigError(f"when_full {when_full}: give {' or '.join(get_args(WhenFull))}")
+        if size < 1:
+            raise ConfigError(f"size {size}: at least one scan has to wait somewhere")
+        self._drops, self._size = when_full == "drop", size
+        self._waiting: deque[tuple[NDArray[Any], Any]] = deque()
+        self._tags: deque[Any] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+        self.dropped = self.taken = 0
+
+    def put(self, points: NDArray[Any], tag: Any = None) -> bool:
+        """Hand in a scan; whether it was taken into the queue, which it is unless the queue was closed.
+
+        Args:
+            points: (N, 4) as for `Detector`, x, y, z in metres and reflectance; not to be written to afterwards.
+            tag: what shall come back with the detections, such as the time stamp: see `next_tag`.
+        """
+        with self._changed:
+            if not self._drops:
+                self._changed.wait_for(lambda: self._closed or len(self._waiting) < self._size)
+            if self._closed:
+                return False
+            if len(self._waiting) == self._size:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append((points, tag))
+            self._changed.notify_all()
+            return True
+
+    def close(self) -> None:
+        """No more scans: those that wait are handed out, then the iterator ends. `put` returns False from here on."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def next_tag(self) -> Any:
+        """The tag of the oldest scan that was handed out: call it once for each result of the stream.
+
+        Raises:
+            IndexError: it was called more often than scans were handed out.
+        """
+        return self._tags.popleft()
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._waiting)
+                if not self._waiting:
+                    return
+                points, tag = self._waiting.popleft()
+                self._tags.append(tag)
+                self.taken += 1
+                self._changed.notify_all()
+            yield points

@@ -1,0 +1,275 @@
+"""`asca detect` of recordings: what is written, that a kill changes nothing, and how it refuses."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+
+from asca_deploy import sample_scan_path
+from asca_pillars.commands import detect_recording as steps
+from asca_pillars.commands import extras
+from asca_pillars.commands.detect import detect
+from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal
+from asca_pillars.data.boxes.box_records import read_frames
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import AscaError, ConfigError, OutputError, ScanError
+from tests.data.recordings.cloud_recordings import laid_out, odometry_message, stamps, write_mcap
+from tests.scenes import write_dataset
+
+POINTS = read_scan(sample_scan_path()).points[::4].copy()
+SCANS = 5
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample scan, shifted by half a metre from scan to scan, and one message that is torn."""
+    messages: list[tuple[int, Any]] = []
+    for index, time_ns in enumerate(stamps(SCANS)):
+        points = POINTS - np.array([0.5 * index, 0, 0, 0], np.float32)
+        messages.append((time_ns, laid_out(points, time_ns=time_ns)))
+    return write_mcap(tmp_path_factory.mktemp("drive") / "drive.mcap", {"/lidar": messages})
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    times = stamps(3)
+    messages = [(times[0], laid_out(POINTS)), (times[1], b"torn"), (times[2], laid_out(POINTS))]
+    return write_mcap(tmp_path_factory.mktemp("torn") / "torn.mcap", {"/lidar": messages})
+
+
+def run(path: Path, out: Path, **options: Any) -> list[dict[str, Any]]:
+    detect([path], out=out, threads=1, **options)
+    return [json.loads(line) for line in (out / "detections.jsonl").read_text().splitlines()]
+
+
+def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = run(drive, tmp_path)
+    assert [line["time_ns"] for line in lines] == stamps(SCANS)
+    assert lines[0]["frame_id"] == "lidar" and "track_id" not in lines[0]["boxes"][0]
+    assert {path.name for path in tmp_path.iterdir()} == {"detections.jsonl", "recording.json"}
+    said = capsys.readouterr().out
+    assert "/lidar: 5 scans" in said and "ms of CPU per scan" in said
+    # The same boxes as of the scan alone.
+    np.save(tmp_path / "scan.npy", POINTS)
+    detect([tmp_path / "scan.npy"], out=tmp_path / "alone", threads=1, pictures=False)
+    assert json.loads((tmp_path / "alone" / "scan.json").read_text())["boxes"] == lines[0]["boxes"]
+
+
+def test_tracks_last_and_move(drive: Path, tmp_path: Path) -> None:
+    lines = run(drive, tmp_path, track=True)
+    first, last = ({box["track_id"]: box for box in line["boxes"]} for line in (lines[0], lines[-1]))
+    both = [(first[number], last[number]) for number in first.keys() & last.keys()]
+    assert len(both) >= 3
+    for before, after in both:
+        assert after["class"] == before["class"]
+        assert after["x_m"] - before["x_m"] == pytest.approx(-0.5 * (SCANS - 1), abs=0.4)
+    assert np.median([after["vx_mps"] for _, after in both]) == pytest.approx(-5, abs=1)
+    assert len(list(read_frames(tmp_path / "detections.jsonl"))) == SCANS, "other tools read the lines"
+
+
+def test_with_odometry_what_stands_still_has_no_speed(drive: Path, tmp_path: Path) -> None:
+    """The scans of `drive` are those of a car that drives 5 m/s past things that stand still."""
+    messages = [
+        (time_ns, laid_out(POINTS - np.array([0.5 * i, 0, 0, 0], np.float32), time_ns=time_ns))
+        for i, time_ns in enumerate(stamps(SCANS))
+    ]
+    poses = [
+        (time_ns - 10**7, odometry_message(time_ns - 10**7, 100 + 0.5 * i - 0.05))
+        for i, time_ns in enumerate(stamps(SCANS + 1))
+    ]
+    path = write_mcap(tmp_path / "drive.mcap", {"/lidar": messages}, odometry=poses)
+    lines = run(path, tmp_path / "out", track=True, odometry="/odom")
+    speeds = [np.hypot(box["vx_mps"], box["vy_mps"]) for box in lines[-1]["boxes"] if box["class"] == "Car"]
+    assert len(speeds) >= 3 and np.median(speeds) < 1
+    with pytest.raises(ConfigError, match="give --track"):
+        run(path, tmp_path / "out", odometry="/odom")
+    with pytest.raises(ScanError, match="/lidar holds no nav_msgs/msg/Odometry; there is /odom"):
+        run(path, tmp_path / "out", track=True, odometry="/lidar")
+
+
+def test_foxglove_file_is_read_back(drive: Path, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    lines = run(drive, tmp_path / "out", track=True, foxglove=tmp_path / "boxes.mcap")
+    with (tmp_path / "boxes.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        messages = list(reader.iter_messages())
+        summary = reader.get_summary()
+    assert summary is not None and summary.statistics is not None and summary.statistics.message_count == SCANS
+    for line, (schema, channel, message) in zip(lines, messages, strict=True):
+        assert schema is not None and (schema.name, schema.encoding) == ("foxglove.SceneUpdate", "jsonschema")
+        assert channel.message_encoding == "json" and message.log_time == line["time_ns"]
+        update = json.loads(message.data)
+        _conforms(update, json.loads(schema.data))
+        assert update["deletions"][0]["type"] == 1
+        assert [entity["id"] for entity in update["entities"]] == [f"track-{box['track_id']}" for box in line["boxes"]]
+        cube, box = update["entities"][0]["cubes"][0], line["boxes"][0]
+        assert cube["pose"]["position"]["x"] == pytest.approx(box["x_m"], abs=1e-4)
+        assert cube["size"]["x"] == pytest.approx(box["length_m"], abs=1e-4)
+        turn = 2 * np.arctan2(cube["pose"]["orientation"]["z"], cube["pose"]["orientation"]["w"])
+        assert np.cos(turn - box["yaw_rad"]) == pytest.approx(1, abs=1e-6)
+
+
+def _conforms(value: Any, schema: dict[str, Any]) -> None:
+    """The value has the schema's types and required fields."""
+    kinds: dict[str, Any] = {"object": dict, "array": list, "string": str, "number": (int, float)}
+    kinds |= {"integer": int, "boolean": bool}
+    assert isinstance(value, kinds[schema["type"]])
+    for name in schema.get("required", ()):
+        assert name in value
+    for name, part in schema.get("properties", {}).items():
+        _conforms(value[name], part)
+    for item in value if schema["type"] == "array" else ():
+        _conforms(item, schema["items"])
+
+
+def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
+    rerun = pytest.importorskip("rerun", reason="needs pip install 'asca-pillars[view]'")
+    lines = run(drive, tmp_path / "out", track=True, rerun=tmp_path / "out.rrd")
+    boxes: dict[int, list[str]] = {}
+    points = 0
+    for chunk in rerun.chunk.RrdReader(tmp_path / "out.rrd").stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/boxes":
+            times, labels = batch["time"].cast("int64").to_pylist(), batch["Boxes3D:labels"].to_pylist()
+            boxes |= dict(zip(times, labels, strict=True))
+        if chunk.entity_path == "/scan":
+            points += sum(map(len, batch["Points3D:positions"].to_pylist()))
+    assert boxes == {line["time_ns"]: [f"{box['class']} {box['track_id']}" for box in line["boxes"]] for line in lines}
+    assert 1000 * SCANS < points <= 20_000 * SCANS
+
+
+def test_kitti_tracking_text(drive: Path, tmp_path: Path) -> None:
+    calib = KittiSplit(write_dataset(tmp_path / "kitti", 1)).calib_path("000000")
+    lines = run(drive, tmp_path / "out", track=True, calib=calib)
+    rows = [row.split() for row in (tmp_path / "out" / "tracks.txt").read_text().splitlines()]
+    assert {len(row) for row in rows} == {18}, "frame, identity, 15 fields of a label, score"
+    known = {(index, box["track_id"], box["class"]) for index, line in enumerate(lines) for box in line["boxes"]}
+    assert len(rows) > SCANS and {(int(row[0]), int(row[1]), row[2]) for row in rows} <= known
+
+
+@pytest.fixture(scope="module")
+def undisturbed(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    run(drive, out, track=True, foxglove=out / "boxes.mcap")
+    return out
+
+
+def outputs(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.iterdir() if path.suffix in (".jsonl", ".mcap")}
+
+
+@pytest.mark.parametrize(("after", "torn_line"), [(0, b""), (1, b'{"number": '), (4, b"\x00\xff")])
+def test_a_killed_run_goes_on_and_ends_the_same(
+    drive: Path, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int, torn_line: bytes
+) -> None:
+    killed = tmp_path / "killed"
+    add = Journal.add
+    done: list[None] = []
+
+    def dies(self: Journal, result: Any) -> None:
+        if len(done) == after:
+            raise KeyboardInterrupt
+        done.append(add(self, result))
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Journal, "add", dies)
+        run(drive, killed, track=True, foxglove=killed / "boxes.mcap")
+    assert [path.name for path in killed.iterdir()] == [JOURNAL_FILE], "nothing that looks like a result"
+    with (killed / JOURNAL_FILE).open("ab") as file:
+        file.write(torn_line)
+    detected: list[int] = []
+    monkeypatch.setattr(Journal, "add", lambda self, result: detected.append(result.number) or add(self, result))
+    run(drive, killed, track=True, foxglove=killed / "boxes.mcap")
+    assert detected == list(range(after, SCANS)), "what was done is not done again"
+    assert outputs(killed) == outputs(undisturbed)
+
+
+def test_after_sigkill(drive: Path, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "killed"
+    command = [sys.executable, "-m", "asca_pillars.cli", "detect", str(drive), "--track", "-o", str(out)]
+    command += ["--foxglove", str(out / "boxes.mcap"), "--threads", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while process.poll() is None:
+        if (out / JOURNAL_FILE).exists() and (out / JOURNAL_FILE).read_bytes().count(b"\n") > 2:
+            process.kill()
+            break
+        time.sleep(0.001)
+    assert process.wait() == -signal.SIGKILL, "it was killed in time"
+    assert not (out / "detections.jsonl").exists()
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "going on after the" in said
+    assert outputs(out) == outputs(undisturbed)
+
+
+def test_a_journal_of_other_settings_is_not_gone_on_with(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dies(*_: object) -> Iterator[None]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(steps, "tracked", dies)
+        run(drive, tmp_path, score=0.9)
+    assert (tmp_path / JOURNAL_FILE).exists()
+    assert min(box["score"] for line in run(drive, tmp_path, score=0.5) for box in line["boxes"]) < 0.9
+
+
+def test_two_runs_at_once_do_not_share_a_folder(drive: Path, tmp_path: Path) -> None:
+    with Journal(tmp_path, {}, ("Car",)), pytest.raises(OutputError, match="another run writes it"):
+        run(drive, tmp_path)
+
+
+def test_damaged_messages_are_skipped_and_counted(torn: Path, tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match=r"^1 scans were skipped: .*torn.mcap, /lidar, message 1: no readable"):
+        run(torn, tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / "detections.jsonl").read_text().splitlines()]
+    assert [line["scan"] for line in lines] == ["torn.mcap/000000", "torn.mcap/000002"]
+    assert not (tmp_path / JOURNAL_FILE).exists()
+
+
+def test_a_recording_without_its_end_gives_what_it_has(drive: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(drive.read_bytes()[: int(drive.stat().st_size * 0.7)])
+    with pytest.raises(ScanError, match="ends early, after"):
+        run(cut, tmp_path / "out")
+    assert 1 <= len((tmp_path / "out" / "detections.jsonl").read_text().splitlines()) < SCANS
+
+
+def test_nothing_readable_is_an_error_and_writes_nothing(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": [(stamps(1)[0], b"torn")]})
+    with pytest.raises(ScanError, match=r"none of the 1 scans of /lidar can be read: .*message 0"):
+        run(path, tmp_path / "out")
+    assert not (tmp_path / "out" / "detections.jsonl").exists()
+
+
+def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="need a recording"):
+        detect([sample_scan_path()], out=tmp_path, track=True)
+    with pytest.raises(ConfigError, match="give one alone"):
+        detect([drive, sample_scan_path()], out=tmp_path)
+    before = drive.read_bytes()
+    with pytest.raises(OutputError, match=r"drive\.mcap: `asca detect` did not write it"):
+        run(drive, tmp_path, foxglove=drive)
+    assert drive.read_bytes() == before
+    with pytest.raises(ConfigError, match=r"choose such a name"):
+        run(drive, tmp_path, foxglove=tmp_path / "boxes.json")
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"mine\.txt"):
+        run(drive, tmp_path)
+
+
+def test_missing_libraries_are_named(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(extras.EXTRAS, "recordings", ("no_such_library",))
+    with pytest.raises(AscaError, match=r"pip install 'asca-pillars\[recordings\]'"):
+        run(drive, tmp_path)

@@ -1,0 +1,129 @@
+"""Small recordings made here: PointCloud2 of any layout in MCAP, rosbag2 and ROS 1 bags."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.made_recordings import point_cloud2
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+ODOMETRY = "nav_msgs/msg/Odometry"
+START_NS = 1_700_000_000_000_000_000
+
+
+def cloud_points(seed: int, count: int = 50) -> NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform([2, -5, -1.7, 0], [30, 5, 1, 1], (count, 4)).astype(np.float32)
+
+
+def stamps(count: int) -> list[int]:
+    return [START_NS + index * 100_000_000 for index in range(count)]
+
+
+def store(ros1: bool = False) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+
+
+def laid_out(
+    points: NDArray[np.float32],
+    *,
+    layout: list[tuple[str, str, int]] | None = None,
+    step: int = 16,
+    rows: int = 1,
+    row_padding: int = 0,
+    big_endian: bool = False,
+    time_ns: int = START_NS,
+) -> Any:
+    """A PointCloud2 whose fields (name, NumPy type without byte order, offset) hold the columns in order."""
+    layout = layout or [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "f4", 12)]
+    order = ">" if big_endian else "<"
+    types = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+    structure = np.dtype(
+        {
+            "names": [name for name, _, _ in layout],
+            "formats": [order + kind for _, kind, _ in layout],
+            "offsets": [offset for _, _, offset in layout],
+            "itemsize": step,
+        }
+    )
+    packed = np.zeros(len(points), structure)
+    for index, (name, _, _) in enumerate(layout):
+        packed[name] = points[:, index]
+    width = len(points) // rows
+    table = np.full((rows, width * step + row_padding), 0xAB, np.uint8)
+    table[:, : width * step] = packed.view(np.uint8).reshape(rows, width * step)
+    one = store()
+    message = point_cloud2(one, time_ns, points)
+    field = one.types["sensor_msgs/msg/PointField"]
+    message.fields = [
+        field(name=name, offset=offset, datatype=types.index(kind) + 1, count=1) for name, kind, offset in layout
+    ]
+    message.height, message.width, message.point_step = rows, width, step
+    message.row_step, message.is_bigendian, message.data = table.shape[1], big_endian, table.reshape(-1)
+    return message
+
+
+def write_mcap(
+    path: Path,
+    topics: dict[str, list[tuple[int, Any]]],
+    *,
+    others: dict[str, str] | None = None,
+    odometry: list[tuple[int, Any]] | None = None,
+    chunk_size: int = 2000,
+) -> Path:
+    """An MCAP with topics of (time, PointCloud2 message or raw bytes); `others` are topics of other types."""
+    from mcap.writer import Writer
+
+    one = store()
+    definition, _ = one.generate_msgdef(CLOUD, ros_version=2)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_size)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(CLOUD, "ros2msg", definition.encode())
+        for topic, messages in topics.items():
+            channel = writer.register_channel(topic, "cdr", schema)
+            for time_ns, message in messages:
+                data = message if isinstance(message, bytes) else bytes(one.serialize_cdr(message, CLOUD))
+                writer.add_message(channel, time_ns, data, time_ns)
+        for topic, kind in (others or {}).items():
+            other = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b"string data"))
+            writer.add_message(other, START_NS, b"\x00\x01\x00\x00\x01\x00\x00\x00\x00", START_NS)
+        if odometry:
+            data, _ = one.generate_msgdef(ODOMETRY, ros_version=2)
+            channel = writer.register_channel(
+                "/odom", "cdr", writer.register_schema(ODOMETRY, "ros2msg", data.encode())
+            )
+            for time_ns, message in odometry:
+                writer.add_message(channel, time_ns, bytes(one.serialize_cdr(message, ODOMETRY)), time_ns)
+        writer.finish()
+    return path
+
+
+def odometry_message(time_ns: int, x_m: float, yaw_rad: float = 0.0) -> Any:
+    types = store().types
+    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    vector, covariance = types["geometry_msgs/msg/Vector3"], np.zeros(36)
+    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(yaw_rad / 2), w=np.cos(yaw_rad / 2))
+    pose = types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0), orientation=turn
+    )
+    twist = types["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+    return types[ODOMETRY](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom"),
+        child_frame_id="base_link",
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=covariance),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=covariance),
+    )
+
+
+def clouds(count: int, points: int = 50) -> list[tuple[int, Any]]:
+    """(time, message) of as many scans."""
+    one = store()
+    return [
+        (time_ns, point_cloud2(one, time_ns, cloud_points(seed, points))) for seed, time_ns in enumerate(stamps(count))
+    ]

@@ -1,0 +1,135 @@
+"""Recordings of every kind: topics, order, damage."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+
+from asca_pillars.data.recordings.open_recording import is_recording, open_recording
+from asca_pillars.data.recordings.recorded_scans import RecordedScans
+from asca_pillars.errors import ScanError
+from benchmarks.made_recordings import TOPIC, write_recording
+from tests.data.recordings.cloud_recordings import cloud_points, clouds, laid_out, stamps, write_mcap
+
+
+@pytest.mark.parametrize("name", ["drive.mcap", "drive_bag", "drive.bag"])
+def test_scans_and_times_come_back(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    times = stamps(5)
+    assert write_recording(path, iter([(time_ns, cloud_points(i)) for i, time_ns in enumerate(times)])) == 5
+    assert is_recording(path)
+    recording = open_recording(path)
+    topic = recording.point_cloud_topic()
+    assert (topic.name, topic.messages) == (TOPIC, 5)
+    scans = list(RecordedScans(recording, topic, "auto").read())
+    assert [one.time_ns for one in scans] == times and recording.damage is None
+    for index, one in enumerate(scans):
+        assert one.scan is not None and np.array_equal(one.scan.points, cloud_points(index))
+    assert [one.number for one in RecordedScans(recording, topic, 1.0).read(3)] == [3, 4]
+
+
+def test_a_database_alone_and_one_with_its_metadata(tmp_path: Path) -> None:
+    write_recording(tmp_path / "bag", iter([(stamps(1)[0], cloud_points(0))]))
+    (database,) = (tmp_path / "bag").glob("*.db3")
+    assert open_recording(database).point_cloud_topic().messages == 1
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    assert open_recording(tmp_path / "bag").point_cloud_topic().messages == 1
+
+
+def test_a_folder_of_mcap_files_is_one_recording(tmp_path: Path) -> None:
+    everything = clouds(12)
+    for part in range(12):
+        write_mcap(tmp_path / "bag" / f"bag_{part}.mcap", {"/lidar": everything[part : part + 1]})
+    recording = open_recording(tmp_path / "bag")
+    assert [one.recorded_ns for one in recording.messages("/lidar")] == stamps(12), "10 comes after 9"
+    assert recording.point_cloud_topic().messages == 12
+
+
+def test_several_topics_have_to_be_named(tmp_path: Path) -> None:
+    path = write_mcap(
+        tmp_path / "a.mcap", {"/front": clouds(2), "/rear": clouds(3)}, others={"/note": "std_msgs/msg/String"}
+    )
+    recording = open_recording(path)
+    with pytest.raises(ScanError, match=r"give --topic: /front \(sensor_msgs/msg/PointCloud2, 2\), /rear \(.*, 3\)$"):
+        recording.point_cloud_topic()
+    assert recording.point_cloud_topic("/rear").messages == 3
+    with pytest.raises(ScanError, match=r"no topic /left; there are /front .*, /note \(std_msgs/msg/String, 1\)"):
+        recording.point_cloud_topic("/left")
+    with pytest.raises(ScanError, match="/note holds std_msgs/msg/String, not scans"):
+        recording.point_cloud_topic("/note")
+
+
+def test_no_scans_at_all(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", {}, others={"/note": "std_msgs/msg/String"})
+    with pytest.raises(ScanError, match=r"no topic of type sensor_msgs/msg/PointCloud2; there are /note"):
+        open_recording(path).point_cloud_topic()
+
+
+def test_an_mcap_without_its_end_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    whole = write_mcap(tmp_path / "whole.mcap", {"/lidar": clouds(8)})
+    data = whole.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: int(len(data) * 0.6)])
+    recording = open_recording(cut)
+    topic = recording.point_cloud_topic()
+    scans = list(RecordedScans(recording, topic, 1.0).read())
+    assert 2 <= len(scans) < 8 and topic.messages == len(scans)
+    assert recording.damage is not None and f"ends early, after {len(scans)} messages of /lidar" in recording.damage
+    assert [one.time_ns for one in scans] == stamps(8)[: len(scans)]
+
+
+def test_a_damaged_chunk_ends_an_indexed_file_early(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8)})
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    recording = open_recording(path)
+    read = list(recording.messages("/lidar"))
+    assert len(read) < 8 and recording.damage is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.mcap", b"", "empty"),
+        ("a.mcap", b"no recording at all" * 9, "no readable MCAP"),
+        ("a.db3", b"SQLite or not" * 99, "no readable rosbag2"),
+        ("a.bag", b"#ROSBAG V9.9\n" * 99, "no readable ROS 1 bag"),
+    ],
+)
+def test_what_is_no_recording_is_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ScanError, match=said) as refusal:
+        list(open_recording(path).messages("/lidar"))
+    assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_missing_paths_and_folders_of_scans(tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match="no such file"):
+        open_recording(tmp_path / "drive.mcap")
+    assert not is_recording(tmp_path)
+
+
+def test_scans_that_cannot_be_read_are_told_one_by_one(tmp_path: Path) -> None:
+    good = clouds(3)
+    flat = laid_out(cloud_points(0), layout=[("x", "f4", 0), ("y", "f4", 4)], step=8)
+    messages = [good[0], (good[1][0], b"torn"), (good[2][0], flat)]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
+    scans = list(RecordedScans(recording, recording.point_cloud_topic(), "auto").read())
+    assert [one.scan is None for one in scans] == [False, True, True]
+    assert "a.mcap, /lidar, message 1: no readable PointCloud2" in str(scans[1].trouble)
+    assert "message 2: no field z" in str(scans[2].trouble)
+
+
+def test_the_reflectance_scale_is_decided_once_for_the_recording(tmp_path: Path) -> None:
+    dark, bright = cloud_points(0), cloud_points(1)
+    dark[:, 3], bright[:, 3] = 1.5, np.linspace(0, 255, len(bright))
+    messages = [(time, laid_out(points, time_ns=time)) for time, points in zip(stamps(2), (dark, bright), strict=True)]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
+    scans = RecordedScans(recording, recording.point_cloud_topic(), "auto")
+    assert scans.scale.scale == 255.0
+    first = next(scans.read()).scan
+    assert first is not None and first.points[0, 3] == pytest.approx(1.5 / 255)

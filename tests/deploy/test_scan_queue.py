@@ -1,0 +1,105 @@
+"""Scans that come too fast are dropped and counted, or waited for."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asca_deploy import Detector
+from asca_deploy.scan_queue import ScanQueue
+from asca_pillars.errors import ConfigError
+from tests.deploy.conftest import make_scan
+
+PATIENCE_S = 20
+
+
+def scan(number: int) -> np.ndarray:
+    return np.full((1, 4), number, np.float32)
+
+
+def numbers(queue: ScanQueue) -> list[int]:
+    return [int(points[0, 0]) for points in queue]
+
+
+@pytest.fixture
+def started() -> Iterator[list[threading.Thread]]:
+    threads: list[threading.Thread] = []
+    yield threads
+    for thread in threads:
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+
+
+def test_the_oldest_waiting_scan_is_dropped_and_counted() -> None:
+    queue = ScanQueue("drop", size=2)
+    for number in range(5):
+        assert queue.put(scan(number), tag=number * 10)
+    queue.close()
+    assert numbers(queue) == [3, 4]
+    assert (queue.dropped, queue.taken) == (3, 2)
+    assert [queue.next_tag(), queue.next_tag()] == [30, 40]
+
+
+def test_waiting_loses_nothing_and_holds_the_sensor_back(started: list[threading.Thread]) -> None:
+    queue = ScanQueue("wait")
+    in_queue: list[int] = []
+
+    def sensor() -> None:
+        for number in range(20):
+            queue.put(scan(number))
+            in_queue.append(number)
+        queue.close()
+
+    started.append(threading.Thread(target=sensor))
+    started[0].start()
+    for position, points in enumerate(queue):
+        assert int(points[0, 0]) == position
+        assert len(in_queue) <= position + 2
+    assert (queue.dropped, queue.taken) == (0, 20)
+
+
+def test_closing_lets_a_waiting_sensor_go(started: list[threading.Thread]) -> None:
+    queue = ScanQueue("wait")
+    queue.put(scan(0))
+    answers: list[bool] = []
+    started.append(threading.Thread(target=lambda: answers.append(queue.put(scan(1)))))
+    started[0].start()
+    queue.close()
+    started[0].join(PATIENCE_S)
+    assert answers == [False] and not queue.put(scan(2))
+    assert numbers(queue) == [0]
+
+
+def test_a_stream_that_is_slower_than_the_sensor(tiny_bundle: Path, started: list[threading.Thread]) -> None:
+    queue, detector = ScanQueue("drop"), Detector(tiny_bundle)
+    first = threading.Event()
+
+    def sensor() -> None:
+        for number in range(4):
+            queue.put(make_scan(number), tag=number)
+        assert first.wait(PATIENCE_S)  # the detector has begun; what came too fast is gone
+        for number in range(4, 40):
+            queue.put(make_scan(number), tag=number)
+        queue.close()
+
+    started.append(threading.Thread(target=sensor))
+    started[0].start()
+    tags = []
+    for detections in detector.stream(queue):
+        first.set()
+        tags.append(queue.next_tag())
+        alone = detector(make_scan(tags[-1]))
+        assert np.array_equal(detections.boxes, alone.boxes), "the tag is that of the scan"
+    assert tags == sorted(tags) and tags[-1] == 39, "the latest scan is never the one that is dropped"
+    assert len(tags) == queue.taken and queue.taken + queue.dropped == 40
+
+
+def test_impossible_wishes() -> None:
+    with pytest.raises(ConfigError, match="when_full block: give drop or wait"):
+        ScanQueue("block")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="size 0"):
+        ScanQueue("drop", size=0)
+    with pytest.raises(IndexError):
+        ScanQueue("drop").next_tag()

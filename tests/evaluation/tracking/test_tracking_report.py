@@ -1,0 +1,108 @@
+"""Tracks of simulated sequences, scored: what counts, and how lines find their frames."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from asca_pillars.cli import app
+from asca_pillars.commands.eval_tracks import evaluate_tracks
+from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.evaluation.tracking.tracking_report import TrackingReport, tracking_json, tracking_report
+from asca_pillars.sim.sequences.sequence_files import simulate_sequences
+from asca_pillars.sim.simulation_configs import load_simulation_config
+
+CLASSES = ("Car", "Pedestrian", "Cyclist")
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = load_simulation_config("vlp_16", "around")
+    return simulate_sequences(tmp_path_factory.mktemp("drives"), 2, 6, 2, 1, config, progress=False)
+
+
+def labels(drives: Path) -> list[dict[str, Any]]:
+    """The labels of every frame as predictions are written."""
+    lines = []
+    for frame_id in BoxSplit(drives).frame_ids:
+        content = json.loads((drives / "labels" / f"{frame_id}.json").read_text())
+        boxes = [box | {"score": 0.9} for box in content["boxes"] if box["class"] in CLASSES]
+        lines.append({"scan": f"{frame_id}.bin", "time_s": content["time_s"], "boxes": boxes})
+    return lines
+
+
+def score(drives: Path, folder: Path, lines: list[dict[str, Any]]) -> TrackingReport:
+    folder.mkdir(exist_ok=True)
+    (folder / "detections.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return tracking_report(BoxSplit(drives), folder, "labels", {})
+
+
+def test_labels_as_tracks_are_perfect_by_name_and_by_time(drives: Path, tmp_path: Path) -> None:
+    by_name = labels(drives)
+    by_time = [line | {"scan": f"drive.mcap/{index:06d}"} for index, line in enumerate(by_name)]
+    for lines in (by_name, by_time):
+        report = score(drives, tmp_path / "out", lines)
+        assert report.frames == report.frames_found == 12
+        assert [one.name for one in report.scores if one.clear.labels]
+        for one in report.scores:
+            if one.clear.labels:
+                assert one.hota == pytest.approx((1, 1, 1, 1)) and one.clear.mota == 1.0
+                assert one.clear.identity_switches == one.clear.fragmentations == 0
+
+
+def test_new_identities_in_every_frame_are_switches(drives: Path, tmp_path: Path) -> None:
+    lines = labels(drives)
+    for index, line in enumerate(lines):
+        line["boxes"] = [box | {"track_id": box["track_id"] + 10_000 * index} for box in line["boxes"]]
+    report = score(drives, tmp_path, lines)
+    car = next(one for one in report.scores if one.name == "Car")
+    assert car.hota.det_a == pytest.approx(1) and car.hota.ass_a < 0.5
+    assert car.clear.identity_switches > car.clear.labels / 2
+
+
+def test_frames_without_a_line_are_misses(drives: Path, tmp_path: Path) -> None:
+    report = score(drives, tmp_path, labels(drives)[:6])
+    assert (report.frames, report.frames_found) == (12, 6)
+    assert any(one.clear.misses for one in report.scores)
+
+
+def test_what_the_detector_cannot_see_is_not_counted(drives: Path, tmp_path: Path) -> None:
+    everything = sum(one.clear.labels for one in score(drives, tmp_path, labels(drives)).scores)
+    (tmp_path / "recording.json").write_text(json.dumps({"ranges_m": [[0, 69], [-30, 30]]}))
+    ahead = score(drives, tmp_path, labels(drives))
+    assert 0 < sum(one.clear.labels for one in ahead.scores) < everything
+    assert all(one.clear.false_boxes == 0 for one in ahead.scores), "boxes of labels that do not count go with them"
+
+
+def test_the_command_prints_and_writes(drives: Path, tmp_path: Path) -> None:
+    score(drives, tmp_path / "found", labels(drives))
+    options = ["--protocol", "tracking", "--split", "training", "--data", drives, "--predictions", tmp_path / "found"]
+    result = CliRunner().invoke(app, ["eval", *map(str, options), "-o", str(tmp_path / "out")], catch_exceptions=False)
+    assert result.exit_code == 0 and "HOTA" in result.output and "switches" in result.output
+    written = json.loads((tmp_path / "out" / "tracking.json").read_text())
+    assert written["classes"]["Car"]["hota"] == pytest.approx(1) and written["frames"] == 12
+    assert "| Car |" in (tmp_path / "out" / "tracking.md").read_text()
+    assert "environment" in written
+
+
+def test_plain_values(drives: Path, tmp_path: Path) -> None:
+    json.dumps(tracking_json(score(drives, tmp_path, labels(drives))), allow_nan=False)
+
+
+def test_what_cannot_be_scored_is_refused(drives: Path, tmp_path: Path) -> None:
+    without = labels(drives)
+    for line in without:
+        line["boxes"] = [{key: value for key, value in box.items() if key != "track_id"} for box in line["boxes"]]
+    with pytest.raises(DatasetError, match="without `track_id`"):
+        score(drives, tmp_path, without)
+    twice = labels(drives)
+    twice[0]["boxes"] = twice[0]["boxes"][:1] * 2
+    with pytest.raises(DatasetError, match="the same `track_id`"):
+        score(drives, tmp_path, twice)
+    with pytest.raises(DatasetError, match="no line belongs to a frame"):
+        score(drives, tmp_path, [{"scan": "elsewhere.bin", "time_s": 1e9, "boxes": []}])
+    with pytest.raises(ConfigError, match="give --data"):
+        evaluate_tracks(None, "val", None, tmp_path, None, None)  # type: ignore[arg-type]
