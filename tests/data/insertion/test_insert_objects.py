@@ -210,7 +210,7 @@ def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -
 
 
 def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("asca_pillars.training.dataset.prepare_inserter", lambda *_: pytest.fail("built"))
+    monkeypatch.setattr("asca_pillars.data.training_frames.prepare_inserter", lambda *_: pytest.fail("built"))
     sample = open_dataset(root, config("rs_aug"), training=False).sample(0, 0)
     assert np.array_equal(sample.frame.points, frame_of(root, 0).points)
 
