@@ -29,13 +29,13 @@ def open_recording(path: Path) -> Recording:
         raise ScanError(f"{path}: no such file or folder; check the path")
     if path.is_dir():
         files = _files(path)
-        if files and all(file.suffix == ".mcap" for file in files):
-            return McapRecording(path, files)
-        if not (path / METADATA_FILE).is_file() and len(files) == 1:
-            return RosBag(files[0])
         if not (path / METADATA_FILE).is_file():
-            raise ScanError(f"{path}: {len(files)} files without {METADATA_FILE}; copy it too, or give them one by one")
-        return RosBag(path)
+            if len(files) == 1:
+                return open_recording(files[0])
+            raise ScanError(
+                f"{path}: {len(files)} recordings, and no {METADATA_FILE} that would make one of them; give one of them"
+            )
+        return McapRecording(path, files) if {file.suffix for file in files} == {".mcap"} else RosBag(path)
     if path.stat().st_size == 0:
         raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
     return McapRecording(path, [path]) if path.suffix.lower() == ".mcap" else RosBag(path)

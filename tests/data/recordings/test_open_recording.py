@@ -42,6 +42,9 @@ def test_a_folder_of_mcap_files_is_one_recording(tmp_path: Path) -> None:
     everything = clouds(12)
     for part in range(12):
         write_mcap(tmp_path / "bag" / f"bag_{part}.mcap", {"/lidar": everything[part : part + 1]})
+    with pytest.raises(ScanError, match="12 recordings, and no metadata"):
+        open_recording(tmp_path / "bag")
+    (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: {storage_identifier: mcap}")
     recording = open_recording(tmp_path / "bag")
     assert [one.recorded_ns for one in recording.messages("/lidar")] == stamps(12), "10 comes after 9"
     assert recording.point_cloud_topic().messages == 12
