@@ -1,5 +1,6 @@
 """Which paths are recordings, and opening them."""
 
+import re
 from pathlib import Path
 
 from asca_pillars.data.recordings.mcap_files import McapRecording
@@ -29,16 +30,24 @@ def open_recording(path: Path) -> Recording:
         raise ScanError(f"{path}: no such file or folder; check the path")
     if path.is_dir():
         files = _files(path)
-        if files and all(file.suffix == ".mcap" for file in files):
-            return McapRecording(path, files)
-        if not (path / METADATA_FILE).is_file() and len(files) == 1:
-            return RosBag(files[0])
         if not (path / METADATA_FILE).is_file():
-            raise ScanError(f"{path}: {len(files)} files without {METADATA_FILE}; copy it too, or give them one by one")
-        return RosBag(path)
+            if len(files) == 1:
+                return open_recording(files[0])
+            raise ScanError(
+                f"{path}: {len(files)} recordings, and no {METADATA_FILE} that would make one of them; give one of them"
+            )
+        # The format's own library reads on where a file is damaged, and knows nothing of rosbag2's compression.
+        plain_mcap = {file.suffix for file in files} == {".mcap"} and not _is_compressed(path / METADATA_FILE)
+        return McapRecording(path, files) if plain_mcap else RosBag(path)
     if path.stat().st_size == 0:
         raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
     return McapRecording(path, [path]) if path.suffix.lower() == ".mcap" else RosBag(path)
+
+
+def _is_compressed(metadata: Path) -> bool:
+    """Whether rosbag2 compressed the messages or files of a recording, which it writes nowhere else."""
+    text = metadata.read_text(encoding="utf-8", errors="replace")
+    return re.search(r"""compression_mode:\s*['"]?(message|file)""", text, re.IGNORECASE) is not None
 
 
 def _files(folder: Path) -> list[Path]:

@@ -11,7 +11,7 @@ from asca_pillars.data.recordings.open_recording import is_recording, open_recor
 from asca_pillars.data.recordings.recorded_scans import RecordedScans
 from asca_pillars.errors import ScanError
 from benchmarks.made_recordings import TOPIC, write_recording
-from tests.data.recordings.cloud_recordings import cloud_points, clouds, laid_out, stamps, write_mcap
+from tests.data.recordings.cloud_recordings import CLOUD, cloud_points, clouds, laid_out, stamps, store, write_mcap
 
 
 @pytest.mark.parametrize("name", ["drive.mcap", "drive_bag", "drive.bag"])
@@ -30,6 +30,25 @@ def test_scans_and_times_come_back(tmp_path: Path, name: str) -> None:
     assert [one.number for one in RecordedScans(recording, topic, 1.0).read(3)] == [3, 4]
 
 
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+@pytest.mark.parametrize("mode", ["MESSAGE", "FILE"])
+def test_compressed_rosbag2(tmp_path: Path, storage: str, mode: str) -> None:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    one, times = store(), stamps(3)
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin[storage])
+    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/lidar", CLOUD, typestore=one)
+        for index, (time_ns, message) in enumerate(clouds(3)):
+            assert time_ns == times[index]
+            writer.write(connection, time_ns, one.serialize_cdr(message, CLOUD))
+    assert is_recording(tmp_path / "bag")
+    recording = open_recording(tmp_path / "bag")
+    scans = list(RecordedScans(recording, recording.point_cloud_topic(), 1.0).read())
+    assert [one.time_ns for one in scans] == times and all(one.scan is not None for one in scans)
+
+
 def test_a_database_alone_and_one_with_its_metadata(tmp_path: Path) -> None:
     write_recording(tmp_path / "bag", iter([(stamps(1)[0], cloud_points(0))]))
     (database,) = (tmp_path / "bag").glob("*.db3")
@@ -42,6 +61,9 @@ def test_a_folder_of_mcap_files_is_one_recording(tmp_path: Path) -> None:
     everything = clouds(12)
     for part in range(12):
         write_mcap(tmp_path / "bag" / f"bag_{part}.mcap", {"/lidar": everything[part : part + 1]})
+    with pytest.raises(ScanError, match="12 recordings, and no metadata"):
+        open_recording(tmp_path / "bag")
+    (tmp_path / "bag" / "metadata.yaml").write_text("rosbag2_bagfile_information: {storage_identifier: mcap}")
     recording = open_recording(tmp_path / "bag")
     assert [one.recorded_ns for one in recording.messages("/lidar")] == stamps(12), "10 comes after 9"
     assert recording.point_cloud_topic().messages == 12
