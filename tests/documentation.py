@@ -19,7 +19,9 @@ from asca_pillars.data.boxes.box_records import json_line, read_frames
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.models.build import build_model
 from asca_pillars.schema import to_dict
+from benchmarks.made_recordings import point_cloud2
 from tests.data.boxes.box_scenes import write_box_dataset
+from tests.data.recordings.cloud_recordings import stamps, store, write_mcap
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -75,6 +77,8 @@ def write_files(root: Path) -> None:
     for name in ("scan.bin", "my_scans/1.bin", "sweeps/1.bin"):
         write_scan(root / name, points)
     write_scan(root / "my_scans" / "2.bin", points[::2])
+    made = store()
+    write_mcap(root / "drive.mcap", {"/points": [(time, point_cloud2(made, time, points[::4])) for time in stamps(2)]})
     rings = np.arange(len(points)) % 64
     np.column_stack([points[:, :3], np.round(points[:, 3:] * 255), rings]).astype("<f4").tofile(root / "sweep.bin")
     (root / "lidar_to_vehicle.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 1.4\n0 0 0 1\n")
