@@ -1,0 +1,71 @@
+"""What a training sample costs: in the processes that load it, and in the network; what a machine can therefore train.
+
+    asca simulate data/sim --frames 400 --view camera
+    asca prepare asca_sim --data data/sim
+    python -m benchmarks.training_cost asca_sim --data data/sim
+
+Samples are drawn as `asca train` draws them, augmentation and insertion included, in one process; a step is forward,
+loss and backward on `--device`. Medians over the batches, with quartiles, in processor
+time (all threads together); of a step on another device than a CPU the time that passes.
+"""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+from rich.progress import track
+
+from asca_pillars.config import load_config
+from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.models.build import build_model
+from asca_pillars.system import cpu_model
+from asca_pillars.training.dataset import open_dataset
+
+WARM_UP = 3
+
+
+def main(
+    config: Annotated[str, typer.Argument(help="YAML of the model, or the name of one that ships.")],
+    data: Annotated[Path, typer.Option(help="Dataset, prepared.")],
+    batches: Annotated[int, typer.Option(help="Batches to time.")] = 60,
+    device: Annotated[str, typer.Option(help="Of the network: cpu or cuda.")] = "cpu",
+    override: Annotated[list[str] | None, typer.Option("--set", "-s", help="As of `asca train`.")] = None,
+) -> None:
+    """Print milliseconds per sample of loading and of a step."""
+    settings = load_config(config, override or ())
+    frames = open_dataset(data, settings, training=True)
+    model = build_model(settings.model).to(device)
+    model.train()
+    optimizer = torch.optim.Adam(model.parameters(), lr=settings.train.learning_rate)
+    size = settings.train.batch_size
+    clock = time.process_time if device == "cpu" else time.perf_counter  # other jobs on a CPU do not count
+    loading, stepping = [], []
+    for number in track(range(batches + WARM_UP), "Measuring"):
+        start = time.process_time()
+        samples = [frames.sample(0, (number * size + index) % len(frames)) for index in range(size)]
+        inputs = frames.preparation.collate([sample.prepared for sample in samples])
+        loaded = time.process_time()
+        begin = clock()
+        inputs = inputs.to(device)
+        with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=settings.train.precision == "bf16"):
+            loss = torch.stack(list(model.loss(model.predict(inputs), inputs).values())).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if device != "cpu":
+            torch.cuda.synchronize()
+        stepping.append(clock() - begin)
+        loading.append(loaded - start)
+    rows = []
+    for title, seconds in (("loading", loading), ("step", stepping)):
+        low, median, high = np.percentile(1e3 * np.array(seconds[WARM_UP:]) / size, (25, 50, 75))
+        rows.append((title, f"{median:.1f}", f"{low:.1f} to {high:.1f}", f"{1e3 / median:.0f}"))
+    print(f"{cpu_model()}; {torch.get_num_threads()} threads; network on {device}\n")
+    print(markdown_table(("", "ms per sample", "quartiles", "samples per second and process"), rows, left=1))
+
+
+if __name__ == "__main__":
+    typer.run(main)
