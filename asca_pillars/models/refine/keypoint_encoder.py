@@ -1,6 +1,7 @@
 """Features of keypoints: voxel set abstraction's raw points and map, and keypoint weighting (PV-RCNN, 3.2, 3.3)."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -8,41 +9,65 @@ from torch import Tensor, nn
 from asca_pillars.models.refine.set_abstraction import NORM_EPS, NORM_MOMENTUM, SetAbstraction
 
 
+class BallSource(NamedTuple):
+    """What keypoints aggregate within balls: raw points, or the voxels of a level."""
+
+    channels: int
+    """Of a point besides its position."""
+    radii: int
+    """How many balls around each keypoint."""
+    widths: Sequence[int]
+    """Of the MLP of each ball."""
+
+
+class SourceRows(NamedTuple):
+    """The points of one source."""
+
+    positions: Tensor
+    """(N, 3), metres, in the frame of the keypoints."""
+    features: Tensor
+    """(N, channels)."""
+
+
 class KeypointEncoder(nn.Module):
-    """Raw points around a keypoint at several radii, and the first stage's map under it, fused and weighted.
+    """What lies around a keypoint at several radii, and the first stage's map under it, fused and weighted.
 
     Args:
-        point_channels: of a raw point besides its position: 1, reflectance.
+        sources: what is aggregated within balls.
         bev_channels: of the first stage's map.
-        radii: how many balls around each keypoint.
-        widths: of the MLP of each ball.
         out_channels: of the fused feature.
+        weighting_channels: of the hidden layers of the weighting.
     """
 
     def __init__(
-        self, point_channels: int, bev_channels: int, radii: int, widths: Sequence[int], out_channels: int
+        self, sources: Sequence[BallSource], bev_channels: int, out_channels: int, weighting_channels: int
     ) -> None:
         super().__init__()
-        self.balls = nn.ModuleList(SetAbstraction(point_channels, widths) for _ in range(radii))
-        joined = radii * widths[-1] + bev_channels
+        self.sources = tuple(sources)
+        self.balls = nn.ModuleList(
+            SetAbstraction(source.channels, source.widths) for source in sources for _ in range(source.radii)
+        )
+        joined = sum(source.radii * source.widths[-1] for source in sources) + bev_channels
+        hidden = [weighting_channels, weighting_channels]
         self.fuse = nn.Sequential(*mlp(joined, [out_channels]))
-        self.weigh = nn.Sequential(*mlp(joined, [out_channels, out_channels]), nn.Linear(out_channels, 1))
+        self.weigh = nn.Sequential(*mlp(joined, hidden), nn.Linear(weighting_channels, 1))
         self.out_channels = out_channels
 
     def forward(
-        self, points: Tensor, keypoints: Tensor, bev: Tensor, indices: Sequence[Tensor]
+        self, rows: Sequence[SourceRows], keypoints: Tensor, bev: Tensor, indices: Sequence[Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Weighted features (K, out_channels), and logits (K,) of a keypoint's being part of an object.
 
         Args:
-            points: (N, 3 + point_channels).
+            rows: of each source.
             keypoints: (K, 3).
             bev: (K, bev_channels) the map at the keypoints.
-            indices: of each radius (K, T) points.
+            indices: (K, T) rows of the source, source by source and radius by radius.
         """
+        owners = [own for own, source in zip(rows, self.sources, strict=True) for _ in range(source.radii)]
         found = [
-            ball(points[:, :3], points[:, 3:], keypoints, index)
-            for ball, index in zip(self.balls, indices, strict=True)
+            ball(own.positions, own.features, keypoints, index)
+            for ball, own, index in zip(self.balls, owners, indices, strict=True)
         ]
         joined = torch.cat([*found, bev], dim=1)
         logits = self.weigh(joined)

@@ -1,0 +1,81 @@
+"""Scans of PV-RCNN as tensors: rows of one frame after those of the other, indices counted through the batch."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils._pytree import tree_map_only
+
+from asca_pillars.models.pillar.loss import TargetBatch
+from asca_pillars.points.voxel_scan import VoxelScan
+from asca_pillars.tables.batching import stack_cells, stack_rows
+from asca_pillars.tables.voxel_spec import VoxelSpec
+from asca_pillars.tables.voxel_tables import VoxelLevel, stack_voxel_levels
+
+
+class VoxelBatch(NamedTuple):
+    """B scans, see `points.voxel_scan.VoxelScan`."""
+
+    features: Tensor
+    """(N, 4) of the voxels."""
+    levels: tuple[VoxelLevel[Tensor], ...]
+    """conv1 to conv4 and conv_out."""
+    points: Tensor
+    """(P, 4)."""
+    keypoints: Tensor
+    """(K, 3)."""
+    positions: tuple[Tensor, ...]
+    """Of each source (N, 3)."""
+    ball_indices: tuple[Tensor, ...]
+    """(K, samples), source by source and radius by radius."""
+    bev_cells: Tensor
+    """(K, 4) flat indices into the maps of all frames."""
+    bev_weights: Tensor
+    """(K, 4)."""
+    frame_keypoints: tuple[int, ...]
+    """Keypoints of each frame."""
+
+
+class LabeledVoxels(NamedTuple):
+    """B scans, what their anchors and keypoints should say, and the boxes that the other targets follow from."""
+
+    scans: VoxelBatch
+    anchors: TargetBatch
+    keypoint_states: Tensor
+    """(K,) int8: 1 in an object, 0 outside, -1 takes no part."""
+    boxes: tuple[NDArray[np.float32], ...]
+    """Of each frame (M, 7), metres and radians, LiDAR frame."""
+    labels: tuple[NDArray[np.int64], ...]
+    """Of each frame (M,), or IGNORED."""
+
+    def to(self, device: Any) -> "LabeledVoxels":
+        """The same with its tensors on `device`."""
+        moved: LabeledVoxels = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
+        return moved
+
+
+def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch:
+    """Several scans, at least one, as one batch."""
+    levels = stack_voxel_levels([scan.levels for scan in scans], spec.level_shapes)
+    sources = range(len(scans[0].positions))
+    rows, columns = spec.map_shape
+    batch = VoxelBatch(
+        features=np.concatenate([scan.features for scan in scans]),
+        levels=tuple(levels),
+        points=np.concatenate([scan.points for scan in scans]),
+        keypoints=np.concatenate([scan.keypoints for scan in scans]),
+        positions=tuple(np.concatenate([scan.positions[source] for scan in scans]) for source in sources),
+        ball_indices=tuple(
+            stack_rows([scan.ball_indices[source][ball] for scan in scans], [len(s.positions[source]) for s in scans])
+            for source in sources
+            for ball in range(len(scans[0].ball_indices[source]))
+        ),
+        bev_cells=stack_cells([scan.bev_cells for scan in scans], rows * columns),
+        bev_weights=np.concatenate([scan.bev_weights for scan in scans]),
+        frame_keypoints=tuple(len(scan.keypoints) for scan in scans),
+    )
+    tensors: VoxelBatch = tree_map_only(np.ndarray, torch.from_numpy, batch)
+    return tensors
