@@ -93,20 +93,15 @@ class VoxelSpec(DetectorSpec):
         A strided convolution with padding 1 centers its output on the first of its voxels, so a cell stands at its
         lower end.
         """
-        steps = (self.grid.size_m[axis] * self.map_stride for axis in range(2))
-        lows = (self.grid.x_range_m[0], self.grid.y_range_m[0])
-        x, y = (
-            low + step * np.arange(count)
-            for low, step, count in zip(lows, steps, reversed(self.map_shape), strict=True)
-        )
-        return x, y
+        step_x, step_y = (self.grid.size_m[axis] * self.map_stride for axis in range(2))
+        rows, columns = (np.arange(count, dtype=np.float64) for count in self.map_shape)
+        return self.grid.x_range_m[0] + step_x * columns, self.grid.y_range_m[0] + step_y * rows
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where anchors stand: x of the head map's columns (W,), y of its rows (H,), metres, LiDAR frame."""
         rows, columns = self.map_shape
         if self.anchor_places == "ends":
-            x_range_m, y_range_m = self.grid.x_range_m, self.grid.y_range_m
-            return np.linspace(*x_range_m, columns, dtype=np.float64), np.linspace(*y_range_m, rows, dtype=np.float64)
+            return np.linspace(*self.grid.x_range_m, columns), np.linspace(*self.grid.y_range_m, rows)
         x, y = self.map_places_m()
         half = [self.grid.size_m[axis] * self.map_stride / 2 for axis in range(2)]
         return x + half[0], y + half[1]

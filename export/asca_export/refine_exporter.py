@@ -18,6 +18,7 @@ from asca_export.exporter import LICENSE, MIN_SCANS, export_bundle, provenance
 from asca_export.neck_output import add_neck_output
 from asca_export.refine_graph import export_refine
 from asca_export.refine_parity import prove_refine_parity
+from asca_pillars.config import pillar_spec
 from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
@@ -49,7 +50,7 @@ def export_refine_bundle(
     config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
     if not isinstance(detector, RefineDetector):
         raise ExportError(f"model.kind {config.model.kind}: not a second stage")
-    model = with_first_stage(dataclasses.replace(detector.model, spec=config.model.spec))
+    model = with_first_stage(dataclasses.replace(detector.model, spec=pillar_spec(config)))
     stage = open_first_stage(model.first_stage)
     with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, "asca export", MANIFEST) as folder:
         first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, progress)

@@ -9,7 +9,7 @@ import yaml
 
 from asca_pillars.ablation.variants import VARIANTS, Variant, runs, train_runs
 from asca_pillars.commands.ablate import ablate
-from asca_pillars.config import PillarModel, load_config, shipped_configs
+from asca_pillars.config import PillarModel, load_config, pillar_spec, shipped_configs
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.schema import to_dict
 from tests.scenes import write_dataset
@@ -46,7 +46,7 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, capsys: pytest.
     assert "6 frames for training, 8 for validation" in text and "2 runs" in text
     assert sum(line.startswith("| K=2 | - | - | - | - |") for line in text.splitlines()) == 2
     trained = load_config(out / "baseline" / "seed0" / "config.yaml")
-    assert (trained.train.learning_rate, trained.model.spec.grid.zones) == (2e-3, 1)
+    assert (trained.train.learning_rate, pillar_spec(trained).grid.zones) == (2e-3, 1)
     weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
 
     ablate(config, data=data, out=out, **options)  # nothing is trained twice

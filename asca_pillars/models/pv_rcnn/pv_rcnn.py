@@ -82,7 +82,7 @@ class PvRcnn(nn.Module):
         self.encode = encode
         self.refine = refine
 
-    def propose(self, batch: VoxelBatch) -> FirstStageOutputs:
+    def propose(self, batch: VoxelBatch[Tensor]) -> FirstStageOutputs:
         """Voxels -> features of every level and head maps."""
         levels = self.voxels(batch.features, batch.levels)
         canvas = self.scatter(levels[-1], batch.levels[-1].cells, len(batch.frame_keypoints))
@@ -101,7 +101,7 @@ class PvRcnn(nn.Module):
         empty = features.new_zeros(frames * rows * columns * nz, features.shape[1])
         return empty.index_put((cells,), features).view(frames, rows, columns, -1)
 
-    def describe(self, batch: VoxelBatch, levels: Sequence[Tensor], canvas: Tensor) -> tuple[Tensor, Tensor]:
+    def describe(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor], canvas: Tensor) -> tuple[Tensor, Tensor]:
         """Weighted features (K, C) of the keypoints, and logits (K,) of their being part of an object."""
         cells = canvas.flatten(0, 2)
         bev = sum(

@@ -70,7 +70,8 @@ class PvRcnnDetector(nn.Module):
         targets, learnt = _roi_targets(outputs.proposals, batch)
         counted = torch.from_numpy(learnt).to(device)
         found = outputs.found
-        wanted = RefineTargets(*(torch.from_numpy(part[learnt]).to(device) for part in targets), batch.keypoint_states)
+        confidence, positive, residuals, sizes = (torch.from_numpy(part[learnt]).to(device) for part in targets)
+        wanted = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
         second = refine_loss(
             Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits), wanted
         )
@@ -108,7 +109,9 @@ class PvRcnnDetector(nn.Module):
             return found
         return found[sample_rois(match_proposals(found, boxes, labels), self.model.rois, rng)]
 
-    def _refine(self, scans: VoxelBatch, first: FirstStageOutputs, proposals: Sequence[Detections]) -> Refinements:
+    def _refine(
+        self, scans: VoxelBatch[Tensor], first: FirstStageOutputs, proposals: Sequence[Detections]
+    ) -> Refinements:
         levels, canvas = [level.float() for level in first.levels], first.canvas.float()
         features, keypoint_logits = self.network.describe(scans, levels, canvas)
         if self.training and not sum(map(len, proposals)):
@@ -127,12 +130,10 @@ class PvRcnnDetector(nn.Module):
             torch.from_numpy(stack_rows([grid.indices[ball] for grid in grids], scans.frame_keypoints)).to(device)
             for ball in range(len(settings.grid_radii_m))
         ]
-        nothing_else = features.new_zeros(sum(map(len, proposals)), 0)
-        return Refinements(
-            *self.network.refine(scans.keypoints, features, points, indices, nothing_else), keypoint_logits
-        )
+        confidence, residuals = self.network.refine(scans.keypoints, features, points, indices)
+        return Refinements(confidence, residuals, keypoint_logits)
 
-    def _silence(self, scans: VoxelBatch) -> PvRcnnOutputs:
+    def _silence(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
         nothing, frames = zero_of_weights(self), len(scans.frame_keypoints)
         height, width, anchors, _ = self.model.spec.anchors.shape

@@ -1,7 +1,7 @@
 """Scans of PV-RCNN as tensors: rows of one frame after those of the other, indices counted through the batch."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,25 +15,27 @@ from asca_pillars.tables.batching import stack_cells, stack_rows
 from asca_pillars.tables.voxel_spec import VoxelSpec
 from asca_pillars.tables.voxel_tables import VoxelLevel, stack_voxel_levels
 
+Array = TypeVar("Array")
 
-class VoxelBatch(NamedTuple):
-    """B scans, see `points.voxel_scan.VoxelScan`."""
 
-    features: Tensor
+class VoxelBatch(NamedTuple, Generic[Array]):
+    """B scans as arrays or tensors, see `points.voxel_scan.VoxelScan`."""
+
+    features: Array
     """(N, 4) of the voxels."""
-    levels: tuple[VoxelLevel[Tensor], ...]
+    levels: tuple[VoxelLevel[Array], ...]
     """conv1 to conv4 and conv_out."""
-    points: Tensor
+    points: Array
     """(P, 4)."""
-    keypoints: Tensor
+    keypoints: Array
     """(K, 3)."""
-    positions: tuple[Tensor, ...]
+    positions: tuple[Array, ...]
     """Of each source (N, 3)."""
-    ball_indices: tuple[Tensor, ...]
+    ball_indices: tuple[Array, ...]
     """(K, samples), source by source and radius by radius."""
-    bev_cells: Tensor
+    bev_cells: Array
     """(K, 4) flat indices into the maps of all frames."""
-    bev_weights: Tensor
+    bev_weights: Array
     """(K, 4)."""
     frame_keypoints: tuple[int, ...]
     """Keypoints of each frame."""
@@ -42,7 +44,7 @@ class VoxelBatch(NamedTuple):
 class LabeledVoxels(NamedTuple):
     """B scans, what their anchors and keypoints should say, and the boxes that the other targets follow from."""
 
-    scans: VoxelBatch
+    scans: VoxelBatch[Tensor]
     anchors: TargetBatch
     keypoint_states: Tensor
     """(K,) int8: 1 in an object, 0 outside, -1 takes no part."""
@@ -57,12 +59,12 @@ class LabeledVoxels(NamedTuple):
         return moved
 
 
-def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch:
+def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch[Tensor]:
     """Several scans, at least one, as one batch."""
     levels = stack_voxel_levels([scan.levels for scan in scans], spec.level_shapes)
     sources = range(len(scans[0].positions))
     rows, columns = spec.map_shape
-    batch = VoxelBatch(
+    batch: VoxelBatch[NDArray[Any]] = VoxelBatch(
         features=np.concatenate([scan.features for scan in scans]),
         levels=tuple(levels),
         points=np.concatenate([scan.points for scan in scans]),
@@ -77,5 +79,5 @@ def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch:
         bev_weights=np.concatenate([scan.bev_weights for scan in scans]),
         frame_keypoints=tuple(len(scan.keypoints) for scan in scans),
     )
-    tensors: VoxelBatch = tree_map_only(np.ndarray, torch.from_numpy, batch)
+    tensors: VoxelBatch[Tensor] = tree_map_only(np.ndarray, torch.from_numpy, batch)
     return tensors

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.config import Config, DataConfig, InsertConfig, PillarModel
+from asca_pillars.config import Config, DataConfig, InsertConfig, PillarModel, pillar_spec
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
@@ -131,7 +131,7 @@ def test_per_frame_labels_need_their_scan(root: Path) -> None:
 
 
 def test_inspection_and_insertion_read_it(root: Path) -> None:
-    split, spec = open_split(root, "train"), CONFIG.model.spec
+    split, spec = open_split(root, "train"), pillar_spec(CONFIG)
     inspection = inspect_dataset(split, spec, CONFIG.data)
     assert inspection.types == {"Car": 3, "Forklift": 3} and [facts.boxes for facts in inspection.classes] == [3, 3]
     assert not [finding for finding in findings(inspection, spec, 1) if finding.level == "error"]

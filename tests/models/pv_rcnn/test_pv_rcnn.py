@@ -1,12 +1,14 @@
 """The network and both stages' training: published sizes, gradients, batches, and one frame learnt by heart."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
+from asca_pillars.config import load_config
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.overlap import iou_3d
@@ -38,7 +40,10 @@ def gradients(detector: PvRcnnDetector, inputs: LabeledVoxels) -> dict[str, torc
 
 
 def test_the_published_model_has_its_published_size() -> None:
-    network = build_pv_rcnn(PvRcnnModel())
+    model = load_config("pv_rcnn_kitti").model
+    assert isinstance(model, PvRcnnModel)
+    assert dataclasses.replace(model, spec=PvRcnnModel().spec) == PvRcnnModel(), "the defaults are the published sizes"
+    network = build_pv_rcnn(model)
     counts = {name: sum(weight.numel() for weight in part.parameters()) for name, part in network.named_children()}
     assert counts == {
         "voxels": 711_872,
@@ -58,9 +63,9 @@ def test_voxels_are_convolved_as_densely() -> None:
     with torch.inference_mode():
         found = backbone(features, levels)
         for number, (shape, level) in enumerate(zip(SPEC.level_shapes, levels, strict=True)):
-            layers = list(backbone.same[number]) if number < len(backbone.same) else []  # type: ignore[arg-type]
+            layers = list(backbone.same[number].children()) if number < len(backbone.same) else []
             before = SPEC.level_shapes[max(number - 1, 0)], levels[max(number - 1, 0)].cells.numpy()
-            convolutions = [(layer, 1, 1, (shape, level.cells.numpy())) for layer in layers]
+            convolutions: list[Any] = [(layer, 1, 1, (shape, level.cells.numpy())) for layer in layers]
             if number:
                 strided = SPEC.strided[number - 1]
                 convolutions.insert(0, (backbone.down[number - 1], strided.stride, strided.padding, before))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from asca_pillars.config import Config, DataConfig, TrainConfig
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector, build_pv_rcnn_detector
@@ -69,3 +70,9 @@ def frame(seed: int) -> LabeledFrame:
 
 def batch(detector: PvRcnnDetector, *frames: LabeledFrame) -> LabeledVoxels:
     return detector.preparation.collate([detector.preparation.prepare(each, None) for each in frames])
+
+
+def tiny_config(**recipe: Any) -> Config:
+    """Two epochs of two frames a step."""
+    train = {"epochs": 2, "batch_size": 2, "learning_rate": 1e-2, "checkpoint_steps": 1} | recipe
+    return Config(name="tiny_pv_rcnn", model=MODEL, data=DataConfig(workers=0), train=TrainConfig(**train))
