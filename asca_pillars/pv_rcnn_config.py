@@ -9,6 +9,9 @@ from asca_pillars.points.voxel_scan import VoxelSetSettings
 from asca_pillars.schema import Strict
 from asca_pillars.tables.voxel_spec import VoxelSpec
 
+Gate = Literal["none", "keypoint"]
+Attention = Literal["none", "dual", "rda"]
+
 
 @dataclass(frozen=True)
 class PvRcnnNetwork(Strict):
@@ -25,6 +28,9 @@ class PvRcnnNetwork(Strict):
         grid_widths: output channels of the MLP on the keypoints around a grid point.
         hidden: channels of the fully connected layers of the second stage.
         dropout: share of their values that training drops.
+        gate: `keypoint`: a gate on the raw points' features of each keypoint (Deformable PV-RCNN's context fusion).
+        attention: after each block of the map's backbone: `rda`, AFE-RCNN's residual dual attention; `dual`, the same
+            without its residual.
     """
 
     voxel_channels: tuple[int, int, int, int, int] = (16, 32, 64, 64, 128)
@@ -37,6 +43,8 @@ class PvRcnnNetwork(Strict):
     grid_widths: tuple[int, ...] = (64, 64)
     hidden: int = 256
     dropout: float = 0.3
+    gate: Gate = "none"
+    attention: Attention = "none"
 
     def __post_init__(self) -> None:
         single = {name: (getattr(self, name),) for name in _CHANNELS}
@@ -69,6 +77,8 @@ class PvRcnnModel(Strict):
         network: widths.
         training_proposals: which boxes of the first stage a training step draws from.
         rois: how many of them it draws for each frame.
+        box_loss: of the second stage's boxes; `va` adds AFE-RCNN's distance IoU seen from above to residuals and
+            corners.
     """
 
     kind: Literal["pv_rcnn"] = "pv_rcnn"
@@ -77,6 +87,7 @@ class PvRcnnModel(Strict):
     network: PvRcnnNetwork = field(default_factory=PvRcnnNetwork)
     training_proposals: AnchorProposals = field(default_factory=_many_proposals)
     rois: int = 128
+    box_loss: Literal["smooth_l1", "va"] = "smooth_l1"
 
     def __post_init__(self) -> None:
         if self.rois < 2:
@@ -85,4 +96,8 @@ class PvRcnnModel(Strict):
             raise ConfigError(
                 f"model.network.source_widths has {len(self.network.source_widths)} entries: give one for each of "
                 f"model.settings.sources {', '.join(each.source for each in self.settings.sources)}"
+            )
+        if self.network.gate != "none" and "points" not in {each.source for each in self.settings.sources}:
+            raise ConfigError(
+                f"model.network.gate = {self.network.gate}: gates raw points; add `points` to model.settings.sources"
             )

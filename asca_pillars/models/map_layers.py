@@ -1,6 +1,6 @@
 """Layers of a backbone on a map seen from above (SECOND, PointPillars): blocks, and their upsamplings."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -27,11 +27,19 @@ def upsampling(in_channels: int, channels: int, stride: int) -> nn.Sequential:
     )
 
 
-def joined_maps(features: Tensor, blocks: Iterable[nn.Module], deblocks: Iterable[nn.Module]) -> Tensor:
-    """Block after block, each upsampled, side by side: (B, C, H, W) -> (B, channels of all, H', W')."""
+def joined_maps(
+    features: Tensor,
+    blocks: Sequence[nn.Module] | nn.ModuleList,
+    deblocks: Iterable[nn.Module],
+    attention: Iterable[nn.Module] | None = None,
+) -> Tensor:
+    """Block after block, each upsampled, side by side: (B, C, H, W) -> (B, channels of all, H', W').
+
+    With `attention` a module after each block, before its upsampling and the next block.
+    """
     maps = []
-    for block, deblock in zip(blocks, deblocks, strict=True):
-        features = block(features)
+    for block, attend, deblock in zip(blocks, attention or [nn.Identity()] * len(blocks), deblocks, strict=True):
+        features = attend(block(features))
         maps.append(deblock(features))
     return torch.cat(maps, dim=1)
 

@@ -10,6 +10,7 @@
   of each channel go into that convolution's weights. Offsets are exact because nothing is padded after them.
 """
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -59,12 +60,21 @@ class FastBackbone(nn.Module):
         detector: in evaluation mode; it stays as it is.
         steps: of the pseudo-image, which then holds STEP_VALUE times the step; None for real values.
         padded: whether the pseudo-image comes with the first convolution's padding.
+        attention: a module after each block, if there is any.
     """
 
-    def __init__(self, detector: NeckAndHead, steps: CanvasSteps | None = None, *, padded: bool = True) -> None:
+    def __init__(
+        self,
+        detector: NeckAndHead,
+        steps: CanvasSteps | None = None,
+        *,
+        padded: bool = True,
+        attention: Iterable[nn.Module] | None = None,
+    ) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(_folded(block) for block in detector.neck.blocks)
         self.upsamples = nn.ModuleList(Upsample(deblock) for deblock in detector.neck.deblocks)
+        self.attention = nn.ModuleList(attention or [nn.Identity()] * len(self.blocks))
         self.head = _Head(detector.head)
         if padded:
             _take_padded(next(iter(self.stages()[0].convolutions.values())), steps)
@@ -84,8 +94,8 @@ class FastBackbone(nn.Module):
         Without padding in it the pseudo-image is (1, ny, nx, C).
         """
         features, maps = canvas.permute(0, 3, 1, 2), []
-        for block, upsample in zip(self.blocks, self.upsamples, strict=True):
-            features = block(features)
+        for block, attend, upsample in zip(self.blocks, self.attention, self.upsamples, strict=True):
+            features = attend(block(features))
             maps.append(upsample(features))
         return self.head(torch.cat(maps, dim=-1))
 

@@ -31,7 +31,7 @@ def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -
     rows = {"features": "voxels_0"} | {name: f"voxels_{name.partition('_')[2]}" for name in list(inputs)[1:]}
     _export(_Voxels(network.voxels, levels), graph_path(folder, VOXELS), inputs, rows, levels)
     inputs, _ = interfaces.backbone_interface(bundle)
-    backbone = FastBackbone(network, padded=False)
+    backbone = FastBackbone(network, padded=False, attention=network.neck.attention)
     _export(backbone, graph_path(folder, BACKBONE), inputs, {}, HeadMaps._fields)
     inputs, _ = interfaces.keypoints_interface(bundle)
     sources = bundle.pv_rcnn.settings.sources

@@ -1,5 +1,6 @@
 """PV-RCNN from training to boxes: checkpoint, bundle, runtime."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -28,7 +29,7 @@ from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.training.loop import train
 from tests.export.test_refine_exporter import DETECT
 from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.models.pv_rcnn.tiny_pv_rcnn import SPEC, tiny_config
+from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, MODEL, SPEC, tiny_config
 from tests.scenes import write_dataset
 
 Trained = tuple[Checkpoint, Path]
@@ -36,9 +37,10 @@ Trained = tuple[Checkpoint, Path]
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """A trained checkpoint, and the bundle exported from it."""
+    """A trained checkpoint with every module that the papers add, and the bundle exported from it."""
     folder = tmp_path_factory.mktemp("pv_rcnn")
-    checkpoint = load_checkpoint(train(tiny_config(epochs=1), write_dataset(folder / "data", 5), folder / "run"))
+    config = tiny_config(dataclasses.replace(MODEL, **EVERYTHING), epochs=1)
+    checkpoint = load_checkpoint(train(config, write_dataset(folder / "data", 5), folder / "run"))
     export_pv_rcnn_bundle(checkpoint, folder / "bundle", SCANS)
     return checkpoint, folder / "bundle"
 
@@ -160,7 +162,7 @@ def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) ->
     kept = weight.detach().clone()
     try:
         with torch.no_grad():
-            weight += 0.5
+            weight.add_(0.5)
         with pytest.raises(ExportError, match=f"part at stage ({stage})"):
             prove_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), SCANS[:1])
     finally:

@@ -8,12 +8,13 @@ from torch import Tensor, nn
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
 from asca_pillars.models.pillar.head import SSDHead
+from asca_pillars.models.pv_rcnn.dual_attention import DualAttention
 from asca_pillars.models.pv_rcnn.voxel_backbone import VoxelBackbone
 from asca_pillars.models.pv_rcnn.voxel_batch import VoxelBatch
 from asca_pillars.models.refine.keypoint_encoder import BallSource, KeypointEncoder, SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
 from asca_pillars.points.voxel_scan import LEVEL_SOURCES, Source, VoxelSetSettings
-from asca_pillars.pv_rcnn_config import PvRcnnModel
+from asca_pillars.pv_rcnn_config import Attention, PvRcnnModel
 from asca_pillars.tables.voxel_spec import VoxelSpec
 
 POINT_CHANNELS = 4  # x, y, z, reflectance
@@ -21,13 +22,26 @@ _BLOCK_STRIDES = (1, 2)
 
 
 class MapBackbone(nn.Module):
-    """The backbone on the map seen from above (section 3.1): two blocks, the second at half the resolution."""
+    """The backbone on the map seen from above (section 3.1): two blocks, the second at half the resolution.
+
+    With `attention` dual attention after each block, before its upsampling (AFE-RCNN, figure 3).
+    """
 
     def __init__(
-        self, in_channels: int, block_channels: Sequence[int], block_convs: Sequence[int], upsample_channels: int
+        self,
+        in_channels: int,
+        block_channels: Sequence[int],
+        block_convs: Sequence[int],
+        upsample_channels: int,
+        attention: Attention = "none",
     ) -> None:
         super().__init__()
         self.blocks, self.deblocks, stride = nn.ModuleList(), nn.ModuleList(), 1
+        self.attention: nn.ModuleList | None = None
+        if attention != "none":
+            self.attention = nn.ModuleList(
+                DualAttention(channels, residual=attention == "rda") for channels in block_channels
+            )
         for channels, convs, step in zip(block_channels, block_convs, _BLOCK_STRIDES, strict=True):
             stride *= step
             self.blocks.append(convolution_block(in_channels, channels, convs, stride=step))
@@ -37,7 +51,7 @@ class MapBackbone(nn.Module):
 
     def forward(self, canvas: Tensor) -> Tensor:
         """Unitless (B, C, H, W) -> (B, out_channels, H, W)."""
-        return joined_maps(canvas, self.blocks, self.deblocks)
+        return joined_maps(canvas, self.blocks, self.deblocks, self.attention)
 
 
 class FirstStageOutputs(NamedTuple):
@@ -138,7 +152,9 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
     network, spec, settings = model.network, model.spec, model.settings
     channels = {"points": POINT_CHANNELS - 3, **dict(zip(LEVEL_SOURCES, network.voxel_channels[:-1], strict=True))}
     map_channels = network.voxel_channels[-1] * spec.level_shapes[-1][0]
-    neck = MapBackbone(map_channels, network.block_channels, network.block_convs, network.upsample_channels)
+    neck = MapBackbone(
+        map_channels, network.block_channels, network.block_convs, network.upsample_channels, network.attention
+    )
     return PvRcnn(
         spec,
         settings,
@@ -147,7 +163,12 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
         head=SSDHead(neck.out_channels, spec.anchors.shape[2], scores_per_anchor=len(spec.classes)),
         encode=KeypointEncoder(
             [
-                BallSource(channels[each.source], len(each.radii_m), widths)
+                BallSource(
+                    channels[each.source],
+                    len(each.radii_m),
+                    widths,
+                    gated=each.source == "points" and network.gate == "keypoint",
+                )
                 for each, widths in zip(settings.sources, network.source_widths, strict=True)
             ],
             map_channels,

@@ -17,13 +17,15 @@ from asca_pillars.models.pv_rcnn.pv_rcnn import FirstStageOutputs, PvRcnn, build
 from asca_pillars.models.pv_rcnn.voxel_batch import LabeledVoxels, VoxelBatch
 from asca_pillars.models.pv_rcnn.voxel_preparation import VoxelPreparation
 from asca_pillars.models.refine.pillar_refiner import Refinements, zero_of_weights
-from asca_pillars.models.refine.refine_loss import RefineTargets, refine_loss
+from asca_pillars.models.refine.refine_loss import RefineTargets, distance_iou_loss, refine_loss
 from asca_pillars.points.anchor_proposals import AnchorProposals, propose_anchors
 from asca_pillars.points.refine_geometry import grid_neighbors
 from asca_pillars.points.refined_detections import reported_frames
 from asca_pillars.points.roi_targets import match_proposals, roi_targets, sample_rois
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.tables.batching import stack_rows
+
+_DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
 
 
 class PvRcnnOutputs(NamedTuple):
@@ -72,10 +74,13 @@ class PvRcnnDetector(nn.Module):
         found = outputs.found
         confidence, positive, residuals, sizes = (torch.from_numpy(part[learnt]).to(device) for part in targets)
         wanted = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
-        second = refine_loss(
-            Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits), wanted
-        )
-        return first._asdict() | second._asdict()
+        kept = Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits)
+        terms = first._asdict() | refine_loss(kept, wanted)._asdict()
+        if self.model.box_loss == "va":
+            boxes = (kept.residuals[positive].float(), residuals[positive], sizes[positive])
+            distance_iou = distance_iou_loss(*boxes).sum() / max(len(boxes[0]), 1)
+            terms["distance_iou"] = _DISTANCE_IOU_WEIGHT * distance_iou
+        return terms
 
     def detect(self, outputs: PvRcnnOutputs, spec: DetectorSpec) -> list[Detections]:
         """Refined boxes of each frame, with the thresholds of `spec`."""

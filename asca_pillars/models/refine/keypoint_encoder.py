@@ -1,5 +1,6 @@
 """Features of keypoints: voxel set abstraction's raw points and map, and keypoint weighting (PV-RCNN, 3.2, 3.3)."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,6 +19,8 @@ class BallSource(NamedTuple):
     """How many balls around each keypoint."""
     widths: Sequence[int]
     """Of the MLP of each ball."""
+    gated: bool = False
+    """Whether `ContextGate` chooses among its features."""
 
 
 class SourceRows(NamedTuple):
@@ -27,6 +30,20 @@ class SourceRows(NamedTuple):
     """(N, 3), metres, in the frame of the keypoints."""
     features: Tensor
     """(N, channels)."""
+
+
+class ContextGate(nn.Module):
+    """g * W_fc f with g = sigmoid(W_gate f + b_gate), channel by channel (Deformable PV-RCNN, context fusion)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.gate = nn.Linear(channels, channels)
+        self.value = nn.Linear(channels, channels, bias=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Unitless (K, C) -> (K, C)."""
+        gated: Tensor = torch.sigmoid(self.gate(features)) * self.value(features)
+        return gated
 
 
 class KeypointEncoder(nn.Module):
@@ -47,7 +64,11 @@ class KeypointEncoder(nn.Module):
         self.balls = nn.ModuleList(
             SetAbstraction(source.channels, source.widths) for source in sources for _ in range(source.radii)
         )
-        joined = sum(source.radii * source.widths[-1] for source in sources) + bev_channels
+        channels = [source.radii * source.widths[-1] for source in sources]
+        self.gates = nn.ModuleDict(
+            {str(number): ContextGate(channels[number]) for number, source in enumerate(sources) if source.gated}
+        )
+        joined = sum(channels) + bev_channels
         hidden = [weighting_channels, weighting_channels]
         self.fuse = nn.Sequential(*mlp(joined, [out_channels]))
         self.weigh = nn.Sequential(*mlp(joined, hidden), nn.Linear(weighting_channels, 1))
@@ -64,11 +85,14 @@ class KeypointEncoder(nn.Module):
             bev: (K, bev_channels) the map at the keypoints.
             indices: (K, T) rows of the source, source by source and radius by radius.
         """
-        owners = [own for own, source in zip(rows, self.sources, strict=True) for _ in range(source.radii)]
-        found = [
-            ball(own.positions, own.features, keypoints, index)
-            for ball, own, index in zip(self.balls, owners, indices, strict=True)
-        ]
+        found, balls = [], iter(zip(self.balls, indices, strict=True))
+        for number, (own, source) in enumerate(zip(rows, self.sources, strict=True)):
+            of_radii = [
+                ball(own.positions, own.features, keypoints, index)
+                for ball, index in itertools.islice(balls, source.radii)
+            ]
+            features = torch.cat(of_radii, dim=1)
+            found.append(self.gates[str(number)](features) if source.gated else features)
         joined = torch.cat([*found, bev], dim=1)
         logits = self.weigh(joined)
         return self.fuse(joined) * torch.sigmoid(logits), logits[:, 0]

@@ -18,7 +18,7 @@ from asca_pillars.models.pv_rcnn.voxel_batch import LabeledVoxels
 from asca_pillars.points.anchor_proposals import AnchorProposals
 from asca_pillars.points.voxel_scan import VoxelSetSettings
 from asca_pillars.pv_rcnn_config import PvRcnnModel, PvRcnnNetwork
-from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, batch, frame, tiny_detector
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, VARIANTS, batch, frame, tiny_detector
 from tests.tables.test_cell_map import at_cells, dense
 
 EVERY_ANCHOR = AnchorProposals(candidates=3000, nms_iou=0.95, count=3000)
@@ -106,8 +106,9 @@ def test_a_batch_of_two_is_two_batches_of_one() -> None:
     torch.testing.assert_close(together.found.confidence, confidence, atol=1e-4, rtol=1e-3)
 
 
-def test_every_weight_learns_and_the_same_each_time() -> None:
-    detector = tiny_detector(training_proposals=EVERY_ANCHOR)
+@pytest.mark.parametrize("changes", VARIANTS.values(), ids=VARIANTS)
+def test_every_weight_learns_and_the_same_each_time(changes: dict[str, Any]) -> None:
+    detector = tiny_detector(training_proposals=EVERY_ANCHOR, **changes)
     inputs = batch(detector, on_anchors(), frame(1))
     first, again = gradients(detector, inputs), gradients(detector, inputs)
     assert set(first) == {name for name, _ in detector.named_parameters()}

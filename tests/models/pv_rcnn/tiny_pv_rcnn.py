@@ -48,6 +48,18 @@ NETWORK = PvRcnnNetwork(
     hidden=32,
     dropout=0.0,
 )
+VARIANTS: dict[str, dict[str, Any]] = {
+    "published": {},
+    "gate": {"network": dataclasses.replace(NETWORK, gate="keypoint")},
+    "dual attention": {"network": dataclasses.replace(NETWORK, attention="dual")},
+    "residual dual attention": {"network": dataclasses.replace(NETWORK, attention="rda")},
+    "distance IoU": {"box_loss": "va"},
+}
+"""What differs from `MODEL`."""
+EVERYTHING: dict[str, Any] = {
+    "network": dataclasses.replace(NETWORK, gate="keypoint", attention="rda"),
+    "box_loss": "va",
+}
 MODEL = PvRcnnModel(
     spec=SPEC,
     settings=SETTINGS,
@@ -72,7 +84,7 @@ def batch(detector: PvRcnnDetector, *frames: LabeledFrame) -> LabeledVoxels:
     return detector.preparation.collate([detector.preparation.prepare(each, None) for each in frames])
 
 
-def tiny_config(**recipe: Any) -> Config:
+def tiny_config(model: PvRcnnModel = MODEL, **recipe: Any) -> Config:
     """Two epochs of two frames a step."""
     train = {"epochs": 2, "batch_size": 2, "learning_rate": 1e-2, "checkpoint_steps": 1} | recipe
-    return Config(name="tiny_pv_rcnn", model=MODEL, data=DataConfig(workers=0), train=TrainConfig(**train))
+    return Config(name="tiny_pv_rcnn", model=model, data=DataConfig(workers=0), train=TrainConfig(**train))
