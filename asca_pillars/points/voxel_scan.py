@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.points.anchor_proposals import AnchorProposals
-from asca_pillars.points.ball_query import ball_query
+from asca_pillars.points.ball_query import ball_query, three_nearest
 from asca_pillars.points.bilinear import bilinear_cells
 from asca_pillars.points.farthest_points import farthest_points
 from asca_pillars.tables.voxel_spec import VoxelSpec
 from asca_pillars.tables.voxel_tables import VoxelLevel, VoxelTableBuilder
 from asca_pillars.tables.voxels import voxelize
 
+Deform = Literal["none", "paper", "authors", "authors_frozen"]
 Source = Literal["points", "conv1", "conv2", "conv3", "conv4"]
 LEVEL_SOURCES: tuple[Source, ...] = ("conv1", "conv2", "conv3", "conv4")
 
@@ -50,6 +51,9 @@ class VoxelSetSettings:
     Attributes:
         keypoints: of a scan, at most.
         sources: what keypoints aggregate beside the map seen from above.
+        deform: where keypoints look for voxels. `none`: around themselves. `paper`: around a place learnt from their
+            surroundings, one for each level (Deformable PV-RCNN). `authors`: one for each level and radius, as in that
+            paper's code. `authors_frozen`: likewise, learning nothing through the place, as that code does.
         proposals: which of the first stage's boxes are refined.
         grid_size: grid points along each axis of a proposal.
         grid_radii_m: around grid points, in which keypoints are aggregated.
@@ -64,6 +68,7 @@ class VoxelSetSettings:
         SourceBalls("conv3", (1.2, 2.4), (16, 32)),
         SourceBalls("conv4", (2.4, 4.8), (16, 32)),
     )
+    deform: Deform = "none"
     proposals: AnchorProposals = field(default_factory=AnchorProposals)
     grid_size: int = 6
     grid_radii_m: tuple[float, ...] = (0.8, 1.6)
@@ -81,6 +86,24 @@ class VoxelSetSettings:
         names = [each.source for each in self.sources]
         if len(set(names)) < len(names):
             raise ConfigError(f"sources {', '.join(names)} must be different ones")
+        if self.deform != "none" and not self.deformed:
+            raise ConfigError(f"deform {self.deform} shifts where voxels are looked for; add a level to sources")
+
+    @property
+    def deformed(self) -> tuple[SourceBalls, ...]:
+        """The sources around whose shifted places keypoints look: the levels, if any."""
+        return tuple(each for each in self.sources if self.deform != "none" and each.source != "points")
+
+    @property
+    def nearest_wanted(self) -> bool:
+        """Whether the three nearest voxels of a keypoint are asked for."""
+        return self.deform == "paper"
+
+    def places(self, each: SourceBalls) -> int:
+        """How many places around which this source is looked at; 0: the keypoint itself."""
+        if each not in self.deformed:
+            return 0
+        return 1 if self.deform == "paper" else len(each.radii_m)
 
 
 class VoxelScan(NamedTuple):
@@ -98,6 +121,9 @@ class VoxelScan(NamedTuple):
     """Of each source, the (N, 3) that its indices count: points, or centers of voxels; metres."""
     ball_indices: tuple[tuple[NDArray[np.int32], ...], ...]
     """Of each source and radius (K, samples)."""
+    nearest: tuple[NDArray[np.int32], ...]
+    """Of each source (K, 3) voxels, see `three_nearest`; (0, 3) where they are not asked for."""
+    nearest_weights: tuple[NDArray[np.float32], ...]
     bev_cells: NDArray[np.int32]
     """(K, 4) flat indices into the map seen from above, see `bilinear_cells`."""
     bev_weights: NDArray[np.float32]
@@ -150,8 +176,23 @@ def with_neighbors(
         )
         for each, where in zip(settings.sources, positions, strict=True)
     )
-    places = bilinear_cells(keypoints, *spec.map_places_m())
-    return VoxelScan(features, levels, inside, keypoints, positions, balls, *places, counts)
+    asked = settings.deformed if settings.nearest_wanted else ()
+    nearest = [
+        three_nearest(where, keypoints if each in asked else keypoints[:0])
+        for each, where in zip(settings.sources, positions, strict=True)
+    ]
+    return VoxelScan(
+        features,
+        levels,
+        inside,
+        keypoints,
+        positions,
+        balls,
+        tuple(indices for indices, _ in nearest),
+        tuple(weights for _, weights in nearest),
+        *bilinear_cells(keypoints, *spec.map_places_m()),
+        counts,
+    )
 
 
 def _positions(

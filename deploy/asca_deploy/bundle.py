@@ -31,6 +31,7 @@ BACKBONE = "backbone"
 REFINE = "refine"
 PILLAR_GRAPHS = (ENCODER, BACKBONE)
 VOXELS = "voxels"
+DEFORM = "deform"
 KEYPOINTS = "keypoints"
 GRAPHS = {
     "pillar": PILLAR_GRAPHS,
@@ -243,6 +244,11 @@ class AnyBundle(Strict):
     license: str
     schema_version: int = SCHEMA_VERSION
 
+    @property
+    def graph_names(self) -> tuple[str, ...]:
+        """Which graphs a bundle of this kind has."""
+        return GRAPHS[self.kind]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle(AnyBundle):
@@ -262,6 +268,12 @@ class PvRcnnBundle(AnyBundle):
     kind: Literal["pv_rcnn"]
     spec: VoxelSpec
     pv_rcnn: PvRcnnSection
+
+    @property
+    def graph_names(self) -> tuple[str, ...]:
+        """With DEFORM where keypoints are shifted."""
+        shifts = (DEFORM,) if self.pv_rcnn.settings.deformed else ()
+        return (*GRAPHS[self.kind], *shifts)
 
 
 def default_bundle_path() -> Path:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from asca_deploy.bundle import (
-    GRAPHS,
     MANIFEST,
     PILLAR_GRAPHS,
     SCHEMA_VERSION,
@@ -82,9 +81,9 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
         _verify_refine(manifest, bundle)
     elif bundle.precision != "float32":
         raise BundleError(f"{manifest}: `precision` of kind {bundle.kind} is float32; {_EXPORT_AGAIN}")
-    if set(bundle.graphs) != set(GRAPHS[bundle.kind]):
+    if set(bundle.graphs) != set(bundle.graph_names):
         raise BundleError(
-            f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(GRAPHS[bundle.kind])}, not "
+            f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(bundle.graph_names)}, not "
             f"{_cut(', '.join(bundle.graphs)) or 'none'}; {_EXPORT_AGAIN}"
         )
     for graph in bundle.graphs.values():

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import PvRcnnBundle
 from asca_deploy.graph import Tensor
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls, VoxelScan
+from asca_pillars.points.ball_query import ball_query
+from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls, VoxelScan, VoxelSetSettings
 from asca_pillars.tables.voxel_tables import SUBMANIFOLD, VoxelLevel
 
 VOXEL_VALUES = 4
@@ -62,7 +63,27 @@ def keypoints_interface(bundle: PvRcnnBundle) -> Interface:
             inputs[f"{each.source}_positions"] = Tensor("float32", (None, 3))
         for number, samples in enumerate(each.samples):
             inputs[f"{each.source}_ball_{number}"] = Tensor("int32", (None, samples))
+        for number in range(bundle.pv_rcnn.settings.places(each)):
+            inputs[f"{each.source}_place_{number}"] = Tensor("float32", (None, 3))
     return inputs, {"features": Tensor("float32", (None, bundle.pv_rcnn.keypoint_channels))}
+
+
+def deform_interface(bundle: PvRcnnBundle) -> Interface:
+    """Of deform.onnx: around which places keypoints look at each deformed source."""
+    channels = dict(zip(LEVEL_SOURCES, bundle.pv_rcnn.voxel_channels[:-1], strict=True))
+    settings = bundle.pv_rcnn.settings
+    inputs, outputs = {"keypoints": Tensor("float32", (None, 3))}, {}
+    for each in settings.deformed:
+        inputs[each.source] = Tensor("float32", (None, channels[each.source]))
+        inputs[f"{each.source}_positions"] = Tensor("float32", (None, 3))
+        for number, samples in enumerate(each.samples):
+            inputs[f"{each.source}_ball_{number}"] = Tensor("int32", (None, samples))
+        if settings.nearest_wanted:
+            inputs[f"{each.source}_nearest"] = Tensor("int32", (None, 3))
+            inputs[f"{each.source}_nearest_weights"] = Tensor("float32", (None, 3))
+        for number in range(settings.places(each)):
+            outputs[f"{each.source}_place_{number}"] = Tensor("float32", (None, 3))
+    return inputs, outputs
 
 
 def refine_interface(bundle: PvRcnnBundle) -> Interface:
@@ -90,11 +111,47 @@ def keypoint_inputs(
     sources: Sequence[SourceBalls],
     levels: Mapping[str, NDArray[np.float32]],
     bev: NDArray[np.float32],
+    balls_of: Sequence[Sequence[NDArray[np.int32]]],
 ) -> dict[str, NDArray[Any]]:
-    """What keypoints.onnx takes: features (N, C) of levels by name, and the map (K, C) at the keypoints."""
+    """What keypoints.onnx takes: features (N, C) of levels by name, the map (K, C) at the keypoints, and balls."""
     given: dict[str, NDArray[Any]] = {"points": scan.points, "keypoints": scan.keypoints, "bev": bev}
-    for each, positions, balls in zip(sources, scan.positions, scan.ball_indices, strict=True):
+    for each, positions, balls in zip(sources, scan.positions, balls_of, strict=True):
         if each.source != "points":
             given |= {each.source: levels[each.source], f"{each.source}_positions": positions}
         given |= {f"{each.source}_ball_{number}": indices for number, indices in enumerate(balls)}
     return given
+
+
+def deform_inputs(
+    scan: VoxelScan, settings: VoxelSetSettings, levels: Mapping[str, NDArray[np.float32]]
+) -> dict[str, NDArray[Any]]:
+    """What deform.onnx takes: features (N, C) of levels by name, and what stands around the keypoints."""
+    given: dict[str, NDArray[Any]] = {"keypoints": scan.keypoints}
+    for number, each in enumerate(settings.sources):
+        if each in settings.deformed:
+            given |= {each.source: levels[each.source], f"{each.source}_positions": scan.positions[number]}
+            given |= {f"{each.source}_ball_{ball}": index for ball, index in enumerate(scan.ball_indices[number])}
+            given[f"{each.source}_nearest"] = scan.nearest[number]
+            given[f"{each.source}_nearest_weights"] = scan.nearest_weights[number]
+    return given
+
+
+def balls_around(
+    scan: VoxelScan, settings: VoxelSetSettings, places: Mapping[str, NDArray[np.float32]]
+) -> list[list[NDArray[np.int32]]]:
+    """Of each source and radius the rows (K, samples) that a keypoint aggregates, around places (K, 3) by name."""
+    balls = []
+    for number, each in enumerate(settings.sources):
+        count = settings.places(each)
+        centers = [
+            places[f"{each.source}_place_{min(ball, count - 1)}"] for ball in range(len(each.radii_m) if count else 0)
+        ]
+        balls.append(
+            [
+                ball_query(scan.positions[number], center, radius_m, samples)
+                for center, radius_m, samples in zip(centers, each.radii_m, each.samples, strict=True)
+            ]
+            if count
+            else list(scan.ball_indices[number])
+        )
+    return balls

@@ -9,13 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
-from asca_deploy.bundle import BACKBONE, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
+from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
 from asca_deploy.graph import Session, check_interface
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_deploy.pv_rcnn_graphs import (
     OUT,
     Interface,
     backbone_interface,
+    balls_around,
+    deform_inputs,
+    deform_interface,
     keypoint_inputs,
     keypoints_interface,
     map_channels,
@@ -111,6 +114,7 @@ class PvRcnnPipeline:
         self._backbone = opened(BACKBONE, backbone_interface(bundle), provider, precision)
         self._keypoints = opened(KEYPOINTS, keypoints_interface(bundle))
         self._refine = opened(REFINE, refine_interface(bundle))
+        self._deform = opened(DEFORM, deform_interface(bundle)) if self.settings.deformed else None
         self._map_channels = map_channels(bundle)
         self._canvases = [self._new_canvas()]
         self._builders = [self.spec.table_builder()]
@@ -150,7 +154,11 @@ class PvRcnnPipeline:
             return Detections.empty(self.spec.class_names)
         proposals = propose_anchors(raw.maps, self.spec, self.settings.proposals)
         laps.append(("propose", perf_counter()))
-        features = self.describe(raw.scan, raw.levels, raw.bev)
+        places = self.deform(raw.scan, raw.levels)
+        laps.append(("keypoints", perf_counter()))
+        balls = balls_around(raw.scan, self.settings, places)
+        laps.append(("neighbors", perf_counter()))
+        features = self.describe(raw.scan, raw.levels, raw.bev, places, balls)
         laps.append(("keypoints", perf_counter()))
         grid = grid_neighbors(raw.scan.keypoints, proposals.boxes, self.settings)
         laps.append(("neighbors", perf_counter()))
@@ -170,11 +178,32 @@ class PvRcnnPipeline:
         found = self._backbone.run(HeadMaps._fields, {"canvas": canvas})
         return HeadMaps(*(part[0].transpose(2, 0, 1) for part in found))
 
+    def deform(self, scan: VoxelScan, levels: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+        """Around which places (K, 3), metres, keypoints look at levels with features (N, C); by name, none without."""
+        if self._deform is None:
+            return {}
+        names = list(self._deform.outputs)
+        return dict(zip(names, _run(self._deform, names, deform_inputs(scan, self.settings, levels)), strict=True))
+
     def describe(
-        self, scan: VoxelScan, levels: Mapping[str, NDArray[np.float32]], bev: NDArray[np.float32]
+        self,
+        scan: VoxelScan,
+        levels: Mapping[str, NDArray[np.float32]],
+        bev: NDArray[np.float32],
+        places: Mapping[str, NDArray[np.float32]],
+        balls: Sequence[Sequence[NDArray[np.int32]]],
     ) -> NDArray[np.float32]:
-        """Weighted features (K, C) of the keypoints; `bev` is the map there, (K, C)."""
-        return _run(self._keypoints, ["features"], keypoint_inputs(scan, self.settings.sources, levels, bev))[0]
+        """Weighted features (K, C) of the keypoints.
+
+        Args:
+            scan: with the keypoints.
+            levels: features (N, C) by name.
+            bev: (K, C) the map at the keypoints.
+            places: what `deform` gave.
+            balls: what `balls_around` gave.
+        """
+        given = keypoint_inputs(scan, self.settings.sources, levels, bev, balls) | dict(places)
+        return _run(self._keypoints, ["features"], given)[0]
 
     def refine(
         self, keypoints: NDArray[np.float32], features: NDArray[np.float32], grid: GridNeighbors

@@ -15,7 +15,7 @@ import torch
 from onnxscript import opset20 as op
 from torch import Tensor, nn
 
-from asca_deploy.bundle import GRAPHS, AnyBundle
+from asca_deploy.bundle import AnyBundle
 from asca_deploy.manifest import essentials, graph_files
 from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
@@ -92,12 +92,12 @@ def graph_path(folder: Path, name: str) -> Path:
 def sign(folder: Path, bundle: B) -> B:
     """Stamp the graphs in `folder` with what they must not be separated from; the bundle with their SHA-256."""
     properties = {key: json.dumps(value) for key, value in essentials(bundle).items()}
-    for name in GRAPHS[bundle.kind]:
+    for name in bundle.graph_names:
         path = graph_path(folder, name)
         model = onnx.load(path)
         onnx.helper.set_model_props(model, properties)
         onnx.save(model, path)
-    return dataclasses.replace(bundle, graphs=graph_files(folder, GRAPHS[bundle.kind]))
+    return dataclasses.replace(bundle, graphs=graph_files(folder, bundle.graph_names))
 
 
 def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:

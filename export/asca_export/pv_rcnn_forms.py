@@ -1,6 +1,6 @@
 """PV-RCNN as four ONNX graphs, normalization folded into the layers before it; nothing is scattered in them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,17 +8,18 @@ import torch
 from torch import Tensor, nn
 
 from asca_deploy import pv_rcnn_graphs as interfaces
-from asca_deploy.bundle import BACKBONE, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
+from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
 from asca_deploy.graph import Tensor as Declared
 from asca_export.fast_forms import FastBackbone
 from asca_export.graphs import export_graph, graph_path
 from asca_export.refine_graph import fold_norms
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.pv_rcnn.deformation import Surroundings
 from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
 from asca_pillars.models.pv_rcnn.voxel_backbone import TableLayer, VoxelBackbone
 from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder, SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
-from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls
+from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls, VoxelSetSettings
 
 _EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
 
@@ -35,14 +36,28 @@ def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -
     _export(backbone, graph_path(folder, BACKBONE), inputs, {}, HeadMaps._fields)
     inputs, _ = interfaces.keypoints_interface(bundle)
     sources = bundle.pv_rcnn.settings.sources
-    of_source = {f"{each.source}{suffix}": each.source for each in sources for suffix in ("", "_positions")}
-    rows = {name: of_source.get(name, "keypoints") for name in inputs} | {"points": "points"}
-    _export(_Keypoints(network.encode, sources), graph_path(folder, KEYPOINTS), inputs, rows, ["features"])
+    rows = _source_rows(inputs, sources) | {"points": "points"}
+    keypoints = _Keypoints(network.encode, bundle.pv_rcnn.settings)
+    _export(keypoints, graph_path(folder, KEYPOINTS), inputs, rows, ["features"])
+    if bundle.pv_rcnn.settings.deformed:
+        export_deform(network, bundle, graph_path(folder, DEFORM))
     inputs, _ = interfaces.refine_interface(bundle)
     cells = network.refine.cells
     rows = {name: "keypoints" if name in ("keypoints", "features") else "proposals" for name in inputs}
     path = graph_path(folder, REFINE)
     _export(_Refine(network.refine), path, inputs, rows, ["confidence", "residuals"], {"proposals": cells})
+
+
+def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
+    """Write deform.onnx alone: the places that keypoints of a deformed source look around."""
+    inputs, outputs = interfaces.deform_interface(bundle)
+    _export(_Deform(network), path, inputs, _source_rows(inputs, bundle.pv_rcnn.settings.sources), list(outputs))
+
+
+def _source_rows(inputs: Mapping[str, Declared], sources: Sequence[SourceBalls]) -> dict[str, str]:
+    """What each input has a row of: a voxel of its source, or a keypoint."""
+    of_source = {f"{each.source}{suffix}": each.source for each in sources for suffix in ("", "_positions")}
+    return {name: of_source.get(name, "keypoints") for name in inputs}
 
 
 def _export(
@@ -119,22 +134,42 @@ class _Voxels(nn.Module):
 class _Keypoints(nn.Module):
     """Voxel set abstraction and keypoint weighting with one argument for each input of the graph."""
 
-    def __init__(self, encode: KeypointEncoder, sources: tuple[SourceBalls, ...]) -> None:
+    def __init__(self, encode: KeypointEncoder, settings: VoxelSetSettings) -> None:
         super().__init__()
-        self.encode, self.sources = encode, sources
+        self.encode, self.settings = encode, settings
 
     def forward(self, *inputs: Tensor) -> Tensor:
         points, keypoints, bev, *rest = inputs
-        rows, indices, left = [], [], iter(rest)
-        for each in self.sources:
+        rows, indices, centers, left = [], [], [], iter(rest)
+        for each in self.settings.sources:
             if each.source == "points":
                 rows.append(SourceRows(points[:, :3], points[:, 3:]))
             else:
                 features = next(left)
                 rows.append(SourceRows(next(left), features))
             indices += [next(left) for _ in each.radii_m]
-        features, _ = self.encode(rows, keypoints, bev, indices)
+            places = [next(left) for _ in range(self.settings.places(each))] or [keypoints]
+            centers += [places[min(ball, len(places) - 1)] for ball in range(len(each.radii_m))]
+        features, _ = self.encode(rows, keypoints, bev, indices, centers)
         return features
+
+
+class _Deform(nn.Module):
+    """The shifts of all deformed sources, likewise."""
+
+    def __init__(self, network: PvRcnn) -> None:
+        super().__init__()
+        self.deform, self.settings = network.deform, network.settings
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        keypoints, *rest = inputs
+        left, places = iter(rest), []
+        for each in self.settings.deformed:
+            features, positions = next(left), next(left)
+            balls = [next(left) for _ in each.radii_m]
+            nearest = (next(left), next(left)) if self.settings.nearest_wanted else ()
+            places += self.deform[each.source](Surroundings(features, positions, keypoints, balls, *nearest))
+        return tuple(places)
 
 
 class _Refine(nn.Module):

@@ -8,14 +8,14 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
-from asca_deploy.pv_rcnn_graphs import OUT
+from asca_deploy.pv_rcnn_graphs import OUT, balls_around
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.voxel_canvas import VoxelCanvas
 from asca_export.parity import YAW_TOLERANCE_RAD, nearest_partners, require_close
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
-from asca_pillars.models.pv_rcnn.voxel_batch import batch_scans
+from asca_pillars.models.pv_rcnn.voxel_batch import VoxelBatch, batch_scans
 from asca_pillars.points.anchor_proposals import propose_anchors
 from asca_pillars.points.bilinear import read_map
 from asca_pillars.points.refine_geometry import grid_neighbors
@@ -64,7 +64,12 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
             worst = max(worst, _require(f"head `{name}`", wanted, found, number))
         bev = read_map(canvas.rows, scan.bev_cells, scan.bev_weights)
         features = described.numpy()
-        worst = max(worst, _require("keypoints", features, runtime.describe(scan, levels, bev), number))
+        places = _places(network, batch, first.levels)
+        for name, found in runtime.deform(scan, levels).items():
+            worst = max(worst, _require(f"deform `{name}`", places[name], found, number))
+        # PyTorch's places for both sides: the last bit of one decides which voxels lie in its ball.
+        found = runtime.describe(scan, levels, bev, places, balls_around(scan, network.settings, places))
+        worst = max(worst, _require("keypoints", features, found, number))
         proposals = propose_anchors(maps, spec, network.settings.proposals)
         grid = grid_neighbors(scan.keypoints, proposals.boxes, network.settings)
         with torch.inference_mode():
@@ -84,6 +89,13 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
     if not compared:
         raise ExportError("none of the scans given to prove parity on has a point in the model's ranges; give others")
     return Parity(worst, worst_box, worst_yaw, compared, RELATIVE_TOLERANCE)
+
+
+def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[torch.Tensor]) -> dict[str, Array]:
+    """What PyTorch says of the shifted keypoints, by the names of the graph's outputs."""
+    with torch.inference_mode():
+        places = network.deformed_places(batch, levels)
+    return {f"{name}_place_{number}": each.numpy() for name, own in places.items() for number, each in enumerate(own)}
 
 
 def _require(stage: str, expected: Array, found: Array, scan: int) -> float:

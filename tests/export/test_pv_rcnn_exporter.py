@@ -12,24 +12,29 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
 from asca_deploy import Detector
-from asca_deploy.bundle import GRAPHS, MANIFEST, PvRcnnBundle
+from asca_deploy.bundle import DEFORM, GRAPHS, MANIFEST, PvRcnnBundle
 from asca_deploy.manifest import load_any_bundle, load_bundle
+from asca_deploy.pv_rcnn_graphs import balls_around, deform_inputs
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.voxel_canvas import VoxelCanvas
 from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
+from asca_export.pv_rcnn_forms import export_deform
 from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
 from asca_pillars.errors import BundleError, ExportError
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
+from asca_pillars.models.pv_rcnn.voxel_batch import batch_scans
 from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.points.voxel_scan import SourceBalls, voxel_scan
 from asca_pillars.training.loop import train
 from tests.export.test_refine_exporter import DETECT
 from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, MODEL, SPEC, tiny_config
+from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, MODEL, NETWORK, SETTINGS, SPEC, tiny_config, tiny_detector
 from tests.scenes import write_dataset
 
 Trained = tuple[Checkpoint, Path]
@@ -48,7 +53,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 def test_train_export_detect(trained: Trained, tmp_path: Path) -> None:
     checkpoint, folder = trained
     bundle = load_any_bundle(folder)
-    assert isinstance(bundle, PvRcnnBundle) and set(bundle.graphs) == set(GRAPHS["pv_rcnn"])
+    assert isinstance(bundle, PvRcnnBundle) and set(bundle.graphs) == {*GRAPHS["pv_rcnn"], DEFORM}
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.backbone_gmac > 0
     in_torch = ScanDetector(checkpoint.detector, SPEC.with_score_threshold(0.0))
     in_onnx = Detector(folder, score_threshold=0.0, threads=1)
@@ -93,7 +98,7 @@ def test_scans_with_little_or_nothing(trained: Trained) -> None:
 
 
 def test_graphs_scatter_nothing_and_have_no_normalization(trained: Trained) -> None:
-    for name in GRAPHS["pv_rcnn"]:
+    for name in (*GRAPHS["pv_rcnn"], DEFORM):
         kinds = {node.op_type for node in onnx.load(trained[1] / f"{name}.onnx").graph.node}
         assert not kinds & {"BatchNormalization", "ScatterND", "ScatterElements", "NonZero", "Loop"}, name
 
@@ -151,6 +156,7 @@ def test_a_pillar_detector_is_another_kind(trained: Trained, tmp_path: Path) -> 
         ("voxels.down.1.norm.bias", "voxels `conv3`|voxels `conv4`|voxels `out`"),
         ("neck.blocks.1.1.bias", "head `scores`"),
         ("encode.fuse.1.bias", "keypoints"),
+        ("deform.conv4.align.weight", "deform `conv4_place_0`"),
         ("refine.shared.1.bias", "refine `confidence`"),
     ],
 )
@@ -170,3 +176,29 @@ def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) ->
             weight.copy_(kept)
     with pytest.raises(ExportError, match="none of the scans"):
         prove_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), [np.empty((0, 4), np.float32)])
+
+
+def test_a_place_for_each_radius(trained: Trained, tmp_path: Path) -> None:
+    bundle = load_any_bundle(trained[1])
+    assert isinstance(bundle, PvRcnnBundle)
+    settings = dataclasses.replace(
+        SETTINGS, sources=(SETTINGS.sources[0], SourceBalls("conv2", (0.8, 1.6), (4, 6))), deform="authors"
+    )
+    bundle = dataclasses.replace(bundle, pv_rcnn=dataclasses.replace(bundle.pv_rcnn, settings=settings))
+    widths = dataclasses.replace(NETWORK, source_widths=((8, 8), (8, 8)))
+    network = tiny_detector(settings=settings, network=widths).eval().network
+    export_deform(network, bundle, tmp_path / "deform.onnx")
+    scan = voxel_scan(SCANS[0], SPEC, settings, SPEC.table_builder())
+    batch = batch_scans([scan], SPEC)
+    with torch.inference_mode():
+        levels = network.propose(batch).levels
+        wanted = network.deformed_places(batch, levels)["conv2"]
+    session = onnxruntime.InferenceSession(tmp_path / "deform.onnx", providers=["CPUExecutionProvider"])
+    given = deform_inputs(scan, settings, {"conv2": levels[1].numpy()})
+    found = session.run(None, {each.name: given[each.name] for each in session.get_inputs()})
+    assert [each.name for each in session.get_outputs()] == ["conv2_place_0", "conv2_place_1"]
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one, other.numpy(), atol=1e-5)
+        assert np.abs(one - scan.keypoints).max() > 1e-3
+    balls = balls_around(scan, settings, dict(zip(("conv2_place_0", "conv2_place_1"), found, strict=True)))
+    assert balls[0] == list(scan.ball_indices[0]) and [index.shape for index in balls[1]] == [(96, 4), (96, 6)]

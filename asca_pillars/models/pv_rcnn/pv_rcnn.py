@@ -1,6 +1,6 @@
 """PV-RCNN (arXiv 1912.13192): voxels propose, keypoints refine."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from torch import Tensor, nn
@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
 from asca_pillars.models.pillar.head import SSDHead
+from asca_pillars.models.pv_rcnn.deformation import AuthorsDeformation, PaperDeformation, Surroundings
 from asca_pillars.models.pv_rcnn.dual_attention import DualAttention
 from asca_pillars.models.pv_rcnn.voxel_backbone import VoxelBackbone
-from asca_pillars.models.pv_rcnn.voxel_batch import VoxelBatch
+from asca_pillars.models.pv_rcnn.voxel_batch import VoxelBatch, deformed_balls
 from asca_pillars.models.refine.keypoint_encoder import BallSource, KeypointEncoder, SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
 from asca_pillars.points.voxel_scan import LEVEL_SOURCES, Source, VoxelSetSettings
@@ -76,17 +77,20 @@ class PvRcnn(nn.Module):
         head: of the anchors, each with a score for every class.
         encode: voxel set abstraction and keypoint weighting (sections 3.2 and 3.3).
         refine: RoI-grid pooling and the second stage's heads (section 3.4).
+        deform: what shifts the keypoints of each deformed source, by its name.
     """
 
     def __init__(
         self,
         spec: VoxelSpec,
         settings: VoxelSetSettings,
+        *,
         voxels: VoxelBackbone,
         neck: MapBackbone,
         head: SSDHead,
         encode: KeypointEncoder,
         refine: RoiHead,
+        deform: Mapping[str, nn.Module],
     ) -> None:
         super().__init__()
         self.spec, self.settings = spec, settings
@@ -95,6 +99,7 @@ class PvRcnn(nn.Module):
         self.head = head
         self.encode = encode
         self.refine = refine
+        self.deform = nn.ModuleDict(deform).requires_grad_(settings.deform != "authors_frozen")
 
     def propose(self, batch: VoxelBatch[Tensor]) -> FirstStageOutputs:
         """Voxels -> features of every level and head maps."""
@@ -123,24 +128,41 @@ class PvRcnn(nn.Module):
             for corner in range(batch.bev_cells.shape[1])
         )
         assert isinstance(bev, Tensor)
-        return self.describe_at(batch.points, levels, batch.positions, batch.keypoints, bev, batch.ball_indices)
-
-    def describe_at(
-        self,
-        points: Tensor,
-        levels: Sequence[Tensor],
-        positions: Sequence[Tensor],
-        keypoints: Tensor,
-        bev: Tensor,
-        ball_indices: Sequence[Tensor],
-    ) -> tuple[Tensor, Tensor]:
-        """As `describe`, the map (K, C) at the keypoints given."""
         rows = [
-            SourceRows(where, _source_features(each.source, points, levels))
-            for each, where in zip(self.settings.sources, positions, strict=True)
+            SourceRows(where, _source_features(each.source, batch.points, levels))
+            for each, where in zip(self.settings.sources, batch.positions, strict=True)
         ]
-        features, logits = self.encode(rows, keypoints, bev, ball_indices)
+        if not self.settings.deformed:
+            features, logits = self.encode(rows, batch.keypoints, bev, batch.ball_indices)
+            return features, logits
+        places = self.deformed_places(batch, levels)
+        if self.settings.deform == "authors_frozen":
+            places = {name: [place.detach() for place in each] for name, each in places.items()}
+            rows = [
+                SourceRows(own.positions, own.features.detach()) if each.source in places else own
+                for each, own in zip(self.settings.sources, rows, strict=True)
+            ]
+        indices, centers = deformed_balls(batch, self.settings, places)
+        features, logits = self.encode(rows, batch.keypoints, bev, indices, centers)
         return features, logits
+
+    def deformed_places(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
+        """Around which places (K, 3) keypoints look at each deformed source: one, or one for each radius."""
+        places, first = {}, 0
+        for number, each in enumerate(self.settings.sources):
+            balls = batch.ball_indices[first : first + len(each.radii_m)]
+            first += len(balls)
+            if each in self.settings.deformed:
+                around = Surroundings(
+                    _source_features(each.source, batch.points, levels),
+                    batch.positions[number],
+                    batch.keypoints,
+                    balls,
+                    batch.nearest[number],
+                    batch.nearest_weights[number],
+                )
+                places[str(each.source)] = self.deform[each.source](around)
+        return places
 
 
 def _source_features(source: Source, points: Tensor, levels: Sequence[Tensor]) -> Tensor:
@@ -184,4 +206,10 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
             hidden=network.hidden,
             dropout=network.dropout,
         ),
+        deform={
+            each.source: PaperDeformation(channels[each.source])
+            if settings.deform == "paper"
+            else AuthorsDeformation(channels[each.source], len(each.radii_m))
+            for each in settings.deformed
+        },
     )

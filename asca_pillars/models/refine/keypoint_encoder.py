@@ -75,7 +75,12 @@ class KeypointEncoder(nn.Module):
         self.out_channels = out_channels
 
     def forward(
-        self, rows: Sequence[SourceRows], keypoints: Tensor, bev: Tensor, indices: Sequence[Tensor]
+        self,
+        rows: Sequence[SourceRows],
+        keypoints: Tensor,
+        bev: Tensor,
+        indices: Sequence[Tensor],
+        centers: Sequence[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Weighted features (K, out_channels), and logits (K,) of a keypoint's being part of an object.
 
@@ -84,12 +89,13 @@ class KeypointEncoder(nn.Module):
             keypoints: (K, 3).
             bev: (K, bev_channels) the map at the keypoints.
             indices: (K, T) rows of the source, source by source and radius by radius.
+            centers: (K, 3) of these balls; None where all are the keypoints.
         """
-        found, balls = [], iter(zip(self.balls, indices, strict=True))
+        found, balls = [], iter(zip(self.balls, indices, centers or [keypoints] * len(indices), strict=True))
         for number, (own, source) in enumerate(zip(rows, self.sources, strict=True)):
             of_radii = [
-                ball(own.positions, own.features, keypoints, index)
-                for ball, index in itertools.islice(balls, source.radii)
+                ball(own.positions, own.features, center, index)
+                for ball, index, center in itertools.islice(balls, source.radii)
             ]
             features = torch.cat(of_radii, dim=1)
             found.append(self.gates[str(number)](features) if source.gated else features)

@@ -45,6 +45,7 @@ def test_the_published_model_has_its_published_size() -> None:
     assert dataclasses.replace(model, spec=PvRcnnModel().spec) == PvRcnnModel(), "the defaults are the published sizes"
     network = build_pv_rcnn(model)
     counts = {name: sum(weight.numel() for weight in part.parameters()) for name, part in network.named_children()}
+    assert not counts.pop("deform"), "nothing is deformed"
     assert counts == {
         "voxels": 711_872,
         "neck": 4_576_768,

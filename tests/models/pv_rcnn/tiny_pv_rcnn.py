@@ -54,10 +54,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "dual attention": {"network": dataclasses.replace(NETWORK, attention="dual")},
     "residual dual attention": {"network": dataclasses.replace(NETWORK, attention="rda")},
     "distance IoU": {"box_loss": "va"},
+    "deformed": {"settings": dataclasses.replace(SETTINGS, deform="paper")},
+    "deformed as the authors": {"settings": dataclasses.replace(SETTINGS, deform="authors")},
 }
 """What differs from `MODEL`."""
 EVERYTHING: dict[str, Any] = {
     "network": dataclasses.replace(NETWORK, gate="keypoint", attention="rda"),
+    "settings": dataclasses.replace(SETTINGS, deform="paper"),
     "box_loss": "va",
 }
 MODEL = PvRcnnModel(
