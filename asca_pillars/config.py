@@ -14,6 +14,8 @@ from pydantic import Discriminator, Tag
 from asca_pillars.bounds import require_bounds
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillar_config import PillarModel
+from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.schema import Strict
 from asca_pillars.settings import read_settings, shipped_configs
@@ -29,7 +31,10 @@ def _family(settings: Any) -> Any:
 
 # A family joins as one more `Annotated[OtherModel, Tag("other")]`; `models.build` is where it is built.
 ModelConfig: TypeAlias = Annotated[
-    Annotated[PillarModel, Tag("pillar")] | Annotated[RefineModel, Tag("pillar_refine")], Discriminator(_family)
+    Annotated[PillarModel, Tag("pillar")]
+    | Annotated[RefineModel, Tag("pillar_refine")]
+    | Annotated[PvRcnnModel, Tag("pv_rcnn")],
+    Discriminator(_family),
 ]
 
 
@@ -194,6 +199,18 @@ class Config(Strict):
                     f"augment.{name} = {value}: model.kind pillar_refine learns from proposals that are computed once, "
                     f"so only the scene as a whole may move; set augment.{name}={still}"
                 )
+
+
+def pillar_spec(config: Config) -> PillarSpec:
+    """The numbers of a pillar detector, with or without a second stage.
+
+    Raises:
+        ConfigError: the model is of another kind.
+    """
+    spec = config.model.spec
+    if not isinstance(spec, PillarSpec):
+        raise ConfigError(f"model.kind = {config.model.kind}: has no pillars; give a configuration of kind pillar")
+    return spec
 
 
 def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:

@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from asca_pillars.config import load_config
+from asca_pillars.config import load_config, pillar_spec
 from asca_pillars.data.frames import read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.evaluation.report import markdown_table
@@ -33,7 +33,7 @@ def main(
     whole_scans: Annotated[bool, typer.Option(help="Not cut to what the camera sees.")] = False,
 ) -> None:
     """Print a row for each rule."""
-    spec = load_config(config).model.spec
+    spec = pillar_spec(load_config(config))
     split = KittiSplit(folder, frame_list)
     frames = [
         within_ranges(read_frame(split, name, spec.class_names, camera_view=not whole_scans, min_points=1), spec.ranges)

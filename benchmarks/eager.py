@@ -28,6 +28,7 @@ from asca_deploy.benchmark import compare
 from asca_deploy.providers import Precision, Provider
 from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.commands.bench_tables import comparison_table
+from asca_pillars.config import pillar_spec
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError
@@ -99,7 +100,7 @@ def main(
 
 
 def _forms(model: Checkpoint) -> dict[str, PaddedDetector]:
-    network, spec = model.detector, model.config.model.spec
+    network, spec = model.detector, pillar_spec(model.config)
     assert isinstance(network, PillarDetector), "padded forms are of pillar detectors"
     reordered = copy.deepcopy(network).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return {

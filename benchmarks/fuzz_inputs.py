@@ -17,6 +17,7 @@ from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import shipped_configs
 from asca_pillars.sim.simulation_configs import load_simulation_config
+from asca_pillars.tables.voxel_spec import VoxelSpec
 
 LABEL = "Car 0.00 0 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57"
 CALIBRATION = """P0: 721.5 0 609.6 0 0 721.5 172.9 0 0 0 1 0
@@ -161,5 +162,5 @@ def _sections(text: str) -> list[tuple[str, str]]:
 
 def _numbers(config: Config) -> Any:
     """The numbers of a config, and those of the grid that follow from it."""
-    grid = config.model.spec.grid
-    return to_dict(config), grid.nx, grid.ny
+    spec = config.model.spec
+    return to_dict(config), spec.anchors.shape[:2] if isinstance(spec, VoxelSpec) else (spec.grid.nx, spec.grid.ny)

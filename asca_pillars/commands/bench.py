@@ -78,7 +78,8 @@ def bench(
 
     from rich.console import Console
 
-    from asca_deploy import load_bundle, sample_scan_path
+    from asca_deploy import sample_scan_path
+    from asca_deploy.manifest import load_any_bundle
     from asca_pillars.commands.bench_parts import Parts, measure_parts, named_bundles
     from asca_pillars.commands.models import open_detector
     from asca_pillars.commands.scan_input import ScanInput, scan_settings
@@ -104,7 +105,7 @@ def bench(
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
     bundles = named_bundles([bundle, *(compare or ())])
     for folder in bundles.values():
-        load_bundle(folder)  # a damaged one is named now and not after minutes
+        load_any_bundle(folder)  # a damaged one is named now and not after minutes
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     detector = open_detector(options, mounting=scan_input.mounting, around=around)
     parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from asca_deploy import Detector, find_bundle, load_bundle
+from asca_deploy import Detector, find_bundle
+from asca_deploy.manifest import load_any_bundle
 from asca_deploy.tracker import Tracker
 from asca_pillars.commands import detect_tables as show
 from asca_pillars.commands.detect_files import RUN_FILE
@@ -163,7 +164,7 @@ class _Run:
 
 def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track."""
-    spec = load_bundle(find_bundle(bundle)).spec
+    spec = load_any_bundle(find_bundle(bundle)).spec
     return {one.name: one.score_threshold if score is None else score for one in spec.classes}
 
 

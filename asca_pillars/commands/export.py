@@ -82,8 +82,9 @@ def export(
     import numpy as np
     from rich.console import Console
 
-    from asca_deploy.bundle import MANIFEST
+    from asca_deploy.bundle import MANIFEST, AnyBundle
     from asca_export.exporter import export_bundle
+    from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
     from asca_export.refine_exporter import export_refine_bundle
     from asca_pillars.commands.export_steps import (
         CALIBRATION_SCANS,
@@ -99,18 +100,18 @@ def export(
     from asca_pillars.errors import ConfigError
     from asca_pillars.files import require_replaceable
     from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.refine_config import RefineModel
 
     console = Console(markup=False)
     require_replaceable(out, "asca export", MANIFEST)  # before minutes of work
     loaded = load_checkpoint(checkpoint)
     spec = loaded.config.model.spec.with_score_threshold(dict(class_score(text) for text in score or ()))
-    loaded = loaded._replace(config=replace(loaded.config, model=replace(loaded.config.model, spec=spec)))
+    model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
+    loaded = loaded._replace(config=replace(loaded.config, model=model))
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
-    refined = isinstance(loaded.config.model, RefineModel)
-    if int8 and refined:
-        raise ConfigError(f"--int8: {checkpoint} is of kind pillar_refine, which is exported in float32; leave it out")
+    kind = loaded.config.model.kind
+    if int8 and kind != "pillar":
+        raise ConfigError(f"--int8: {checkpoint} is of kind {kind}, which is exported in float32; leave it out")
     if loaded.expected_input is None and scans is None:
         raise ConfigError(
             f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
@@ -122,10 +123,10 @@ def export(
     view: View = "camera" if loaded.config.data.camera_view else "full"
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
     with console.status("Exporting") as status:
-        if refined:
-            bundle = export_refine_bundle(
-                loaded, out, points, trained_on=trained_on, command=command, progress=status.update
-            )
+        bundle: AnyBundle
+        if kind != "pillar":
+            export_kind = export_refine_bundle if kind == "pillar_refine" else export_pv_rcnn_bundle
+            bundle = export_kind(loaded, out, points, trained_on=trained_on, command=command, progress=status.update)
         else:
             bundle = export_bundle(
                 loaded,

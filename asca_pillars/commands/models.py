@@ -15,7 +15,7 @@ from asca_pillars.commands.extras import require
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ConfigError
-from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.system import check_threads
 
 
@@ -34,7 +34,7 @@ class Model:
 
     name: str
     detect: Callable[[NDArray[np.float32]], Detections]
-    spec: PillarSpec
+    spec: DetectorSpec
     camera_view: bool
     about: dict[str, Any]
     unlike: list[str] = field(default_factory=list)

@@ -6,10 +6,13 @@ from asca_pillars.config import DataConfig, ModelConfig
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import PillarPreparation
+from asca_pillars.models.pv_rcnn.pv_rcnn_detector import build_pv_rcnn_detector
+from asca_pillars.models.pv_rcnn.voxel_preparation import VoxelPreparation
 from asca_pillars.models.refine.refine_detector import build_refine_detector
 from asca_pillars.models.second_stage.refine_preparation import cached_preparation
 from asca_pillars.models.trainable import Preparation, Trainable
 from asca_pillars.pillar_config import PillarModel
+from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.refine_config import RefineModel
 
 
@@ -24,6 +27,8 @@ def build_model(model: ModelConfig) -> Trainable:
             return build_pillar_detector(model)
         case RefineModel():
             return build_refine_detector(model)
+        case PvRcnnModel():
+            return build_pv_rcnn_detector(model)
         case _:
             assert_never(model)
 
@@ -40,5 +45,7 @@ def build_preparation(model: ModelConfig, split: LabeledSplit, data: DataConfig)
             return PillarPreparation(model.spec, network.active_cells if network.neck == "sparse" else None)
         case RefineModel():
             return cached_preparation(model, split, data)
+        case PvRcnnModel():
+            return VoxelPreparation(model.spec, model.settings)
         case _:
             assert_never(model)

@@ -24,6 +24,14 @@ def bilinear_cells(
     return np.stack(cells, axis=1).astype(np.int32), np.stack(weights, axis=1).astype(np.float32)
 
 
+def read_map(rows: NDArray[np.float32], cells: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A map's features at K positions, (K, C), from its cells (H * W, C) and what `bilinear_cells` gave, (K, 4)."""
+    read = np.zeros((len(cells), rows.shape[1]), np.float32)
+    for corner in range(cells.shape[1]):
+        read += rows[cells[:, corner]] * weights[:, corner, None]
+    return read
+
+
 def _between(
     values: NDArray[np.floating[Any]], centers: NDArray[np.floating[Any]]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

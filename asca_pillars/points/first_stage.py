@@ -10,7 +10,7 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.points.bilinear import bilinear_cells
+from asca_pillars.points.bilinear import bilinear_cells, read_map
 from asca_pillars.points.farthest_points import farthest_points, near_boxes
 from asca_pillars.points.proposals import ProposalSettings, propose
 
@@ -112,6 +112,4 @@ def proposed_from(
     near = points[near_boxes(points, proposals.boxes, settings.keypoints.margin_m)]
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
     cells, weights = bilinear_cells(keypoints, *spec.head_centers_m())
-    rows = neck.reshape(-1, neck.shape[2])
-    bev = sum(rows[cells[:, corner]] * weights[:, corner, None] for corner in range(4))
-    return Proposed(proposals, keypoints, np.asarray(bev, np.float32))
+    return Proposed(proposals, keypoints, read_map(neck.reshape(-1, neck.shape[2]), cells, weights))

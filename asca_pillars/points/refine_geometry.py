@@ -1,7 +1,7 @@
 """What the host computes for the second stage of one scan: neighbours of keypoints and of the grids of proposals."""
 
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,31 @@ class RefineSettings:
                 raise ConfigError(f"{field.name} {value} of the second stage must be positive")
 
 
+class GridSettings(Protocol):
+    """The part of a second stage's settings that RoI-grid pooling reads, see `RefineSettings`."""
+
+    @property
+    def grid_size(self) -> int:
+        """Grid points along each axis of a proposal."""
+
+    @property
+    def grid_radii_m(self) -> tuple[float, ...]:
+        """Around grid points."""
+
+    @property
+    def grid_samples(self) -> int:
+        """Keypoints of each ball."""
+
+
+class GridNeighbors(NamedTuple):
+    """The grid points of R proposals and the keypoints around them."""
+
+    points: NDArray[np.float32]
+    """(R * cells, 3), metres, LiDAR frame."""
+    indices: tuple[NDArray[np.int32], ...]
+    """Of each radius (R * cells, samples); the number of keypoints stands for nothing."""
+
+
 @dataclass(frozen=True)
 class RefineScan:
     """One scan as the second stage takes it; `models.refine.pillar_refiner.RefineInputs` says what each array is."""
@@ -67,15 +92,23 @@ def refine_scan(
     all_boxes = proposed.proposals.boxes
     margin_m = max(settings.ball_radii_m) + _keypoint_margin_m(keypoints, all_boxes)
     near = np.ascontiguousarray(points[near_boxes(points, all_boxes, margin_m)])
-    grid_points = roi_grid_points(proposals.boxes, settings.grid_size).reshape(-1, 3)
+    grid = grid_neighbors(keypoints, proposals.boxes, settings)
     return RefineScan(
         points=near,
         keypoints=keypoints,
         bev=proposed.bev,
         ball_indices=tuple(ball_query(near, keypoints, r, settings.ball_samples) for r in settings.ball_radii_m),
-        grid_points=grid_points,
-        grid_indices=tuple(ball_query(keypoints, grid_points, r, settings.grid_samples) for r in settings.grid_radii_m),
+        grid_points=grid.points,
+        grid_indices=grid.indices,
         roi_features=roi_features(proposals),
+    )
+
+
+def grid_neighbors(keypoints: NDArray[np.float32], boxes: NDArray[np.float32], settings: GridSettings) -> GridNeighbors:
+    """What RoI-grid pooling aggregates (PV-RCNN, section 3.3), for boxes (R, 7) among keypoints (K, 3), metres."""
+    points = np.ascontiguousarray(roi_grid_points(boxes, settings.grid_size).reshape(-1, 3), np.float32)
+    return GridNeighbors(
+        points, tuple(ball_query(keypoints, points, r, settings.grid_samples) for r in settings.grid_radii_m)
     )
 
 

@@ -1,5 +1,6 @@
 """The last stop of two stages: proposals, confidences and residuals -> Detections."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,15 @@ def reported_detections(
     kept = np.flatnonzero(finite & (scores >= thresholds[proposals.labels]))
     found = refined_detections(proposals[kept], scores[kept], residuals[kept], spec.post)
     return replace(found, non_finite=int((~finite).sum()))
+
+
+def reported_frames(
+    proposals: Sequence[Detections], confidence: NDArray[np.float32], residuals: NDArray[np.float32], spec: DetectorSpec
+) -> list[Detections]:
+    """`reported_detections` of several frames, whose logits (R,) and residuals (R, 7) follow one another."""
+    ends = np.cumsum([len(frame) for frame in proposals])[:-1]
+    frames = zip(proposals, np.split(confidence, ends), np.split(residuals, ends), strict=True)
+    return [reported_detections(*frame, spec) for frame in frames]
 
 
 def refined_detections(

@@ -1,11 +1,13 @@
 """Tables of a backbone over voxels: strided convolutions join its levels (SECOND, PV-RCNN)."""
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.tables.batching import stack_rows
 from asca_pillars.tables.cell_map import CellMap
 from asca_pillars.tables.convolution import Convolution, Shape
 
@@ -19,16 +21,20 @@ PV_RCNN_STRIDED = (
 """conv2, conv3, conv4 and conv_out; they take 41 cells along z to 21, 11, 5 and 2."""
 
 
-class VoxelLevel(NamedTuple):
-    """N active cells of one level."""
+Array = TypeVar("Array")
 
-    cells: NDArray[np.int64]
-    """(N,) flat index (y * nx + x) * nz + z on this level's lattice, ascending."""
-    same: NDArray[np.int32]
+
+class VoxelLevel(NamedTuple, Generic[Array]):
+    """N active cells of one level, of one scan (NumPy) or of a batch (tensors)."""
+
+    cells: Array
+    """(N,) int64 flat index (y * nx + x) * nz + z on this level's lattice, ascending; of a batch, frame by frame,
+    counted through the lattices of its frames."""
+    same: Array
     """(N, 27) of submanifold convolutions; empty on a level that has none."""
-    strided: NDArray[np.int32]
+    strided: Array
     """(N, K) rows of the level before; empty on the first."""
-    strided_back: NDArray[np.int32]
+    strided_back: Array
     """(rows of the level before, K) the inverse of `strided`, for training; empty without."""
 
 
@@ -61,7 +67,7 @@ class VoxelTableBuilder:
         for convolution in strided:
             self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
 
-    def build(self) -> list[VoxelLevel]:
+    def build(self) -> list[VoxelLevel[NDArray[Any]]]:
         """Tables for the active cells of `maps[0]`, level by level."""
         before, levels = self.maps[0], [self._level(self.maps[0], 0)]
         for number, (convolution, level) in enumerate(zip(self.strided, self.maps[1:], strict=True), start=1):
@@ -73,11 +79,33 @@ class VoxelTableBuilder:
             before = level
         return levels
 
-    def _level(self, level: CellMap, number: int) -> VoxelLevel:
+    def _level(self, level: CellMap, number: int) -> VoxelLevel[NDArray[Any]]:
         same = _none(SUBMANIFOLD.taps)
         if self.submanifold[number]:
             same = level.table(level, SUBMANIFOLD.inputs(level.shape, level.shape))
         return VoxelLevel(level.cells, same, _none(0), _none(0))
+
+
+def stack_voxel_levels(
+    frames: Sequence[Sequence[VoxelLevel[NDArray[Any]]]], shapes: Sequence[Shape]
+) -> list[VoxelLevel[NDArray[Any]]]:
+    """Levels of a batch from those of its frames; `shapes` are the levels' lattices, cells along z, y, x."""
+    stacked: list[VoxelLevel[NDArray[Any]]] = []
+    before: list[int] = []
+    for number, shape in enumerate(shapes):
+        parts = [frame[number] for frame in frames]
+        rows = [len(part.cells) for part in parts]
+        starts = [frame * math.prod(shape) for frame in range(len(frames))]
+        stacked.append(
+            VoxelLevel(
+                cells=np.concatenate([part.cells + start for part, start in zip(parts, starts, strict=True)]),
+                same=stack_rows([part.same for part in parts], rows),
+                strided=stack_rows([part.strided for part in parts], before or rows),
+                strided_back=stack_rows([part.strided_back for part in parts], rows),
+            )
+        )
+        before = rows
+    return stacked
 
 
 def _none(taps: int) -> NDArray[np.int32]:

@@ -71,12 +71,27 @@ class VoxelGrid(Strict):
         x, y, z = (round((high - low) / size) for (low, high), size in sizes)
         return z + self.empty_layers, y, x
 
-    def centers_m(self, cells: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Centers x, y, z of these voxels: (N,) -> (N, 3), metres."""
-        yx, z = np.divmod(cells, self.shape[0])
-        y, x = np.divmod(yx, self.shape[2])
+    def centers_m(
+        self, cells: NDArray[np.int64], shape: Shape | None = None, strides: Shape = (1, 1, 1)
+    ) -> NDArray[np.float32]:
+        """Centers x, y, z of these voxels: (N,) -> (N, 3), metres.
+
+        Args:
+            cells: flat indices on the lattice.
+            shape: of a coarser lattice, cells along z, y, x; None for the grid's own.
+            strides: voxels of the grid along z, y, x that one of its cells stands for.
+        """
+        nz, _, nx = shape or self.shape
+        yx, z = np.divmod(cells, nz)
+        y, x = np.divmod(yx, nx)
         lows = np.array([low for low, _ in self.ranges_m])
-        return (lows + (np.stack([x, y, z], axis=-1) + 0.5) * self.size_m).astype(np.float32)
+        sizes = np.array(self.size_m) * strides[::-1]
+        return (lows + (np.stack([x, y, z], axis=-1) + 0.5) * sizes).astype(np.float32)
+
+    def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which points (M, >= 3), metres, LiDAR frame, lie in a voxel: (M,)."""
+        lows_m, highs_m = (np.array(ends, np.float32) for ends in zip(*self.ranges_m, strict=True))
+        return np.asarray(((points[:, :3] >= lows_m) & (points[:, :3] < highs_m)).all(axis=1))
 
 
 class Voxels(NamedTuple):

@@ -12,8 +12,8 @@ from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.pillars.pillar_spec import PillarSpec
 
 REFERENCE: tuple[Provider, Precision] = ("cpu", "float32")
 
@@ -64,7 +64,7 @@ def choose(
     names: Iterable[tuple[Provider, Precision]],
     open_network: Callable[[Provider, Precision], Network],
     detect: Callable[[Network], Detections],
-    spec: PillarSpec,
+    spec: DetectorSpec,
     precision: Precision | None = None,
     clock: Callable[[], float] = time.perf_counter,
     weights: str = "float32",
@@ -114,7 +114,7 @@ def summary(runs_on: str, candidates: Iterable[Candidate]) -> str:
     return f"auto takes {runs_on}: {'; '.join(map(str, candidates))}"
 
 
-def disagreement(expected: Detections, found: Detections, spec: PillarSpec) -> str | None:
+def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) -> str | None:
     """The first box of either side without a partner on the other; None if every box has one.
 
     Partners have the same class and are as near as the limits above demand. A box whose score ties with its class's
@@ -141,7 +141,7 @@ def _try(
     open_network: Callable[[Provider, Precision], Network],
     detect: Callable[[Network], Detections],
     expected: Detections,
-    spec: PillarSpec,
+    spec: DetectorSpec,
     clock: Callable[[], float],
 ) -> _Trial[Network]:
     try:
@@ -182,6 +182,6 @@ def _have_partners(boxes: Detections, partners: Detections) -> NDArray[np.bool_]
     return (same & (iou_3d(boxes.boxes, partners.boxes) >= MIN_IOU)).any(axis=1)
 
 
-def _ties(boxes: Detections, spec: PillarSpec) -> NDArray[np.bool_]:
+def _ties(boxes: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
     thresholds = np.array([class_.score_threshold for class_ in spec.classes])
     return boxes.scores - thresholds[boxes.labels] <= MAX_SCORE_DIFFERENCE

@@ -15,11 +15,14 @@ from typing import Literal
 
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import BundleError, ConfigError
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStageSettings
 from asca_pillars.points.refine_geometry import RefineSettings
+from asca_pillars.points.voxel_scan import VoxelSetSettings
 from asca_pillars.schema import Strict
 from asca_pillars.tables.neck_tables import MaskRule
+from asca_pillars.tables.voxel_spec import VoxelSpec
 
 SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
@@ -27,7 +30,14 @@ ENCODER = "encoder"
 BACKBONE = "backbone"
 REFINE = "refine"
 PILLAR_GRAPHS = (ENCODER, BACKBONE)
-GRAPHS = {"pillar": PILLAR_GRAPHS, "pillar_refine": (*PILLAR_GRAPHS, REFINE)}
+VOXELS = "voxels"
+DEFORM = "deform"
+KEYPOINTS = "keypoints"
+GRAPHS = {
+    "pillar": PILLAR_GRAPHS,
+    "pillar_refine": (*PILLAR_GRAPHS, REFINE),
+    "pv_rcnn": (VOXELS, BACKBONE, KEYPOINTS, REFINE),
+}
 """Names of the graphs of each kind."""
 NECK = "neck"
 """Output of the backbone of a `pillar_refine` bundle: the head's input (1, H, W, C)."""
@@ -130,7 +140,8 @@ class Parity(Strict):
     """How far the exported float graphs are from the trained model, largest over the compared scans."""
 
     head_maps_max_abs_error: float
-    """Of a `pillar_refine` bundle also of the neck's map and of the second stage's confidences and residuals."""
+    """Of a `pillar_refine` bundle also of the neck's map and of the second stage's confidences and residuals; of a
+    `pv_rcnn` bundle of what every graph gives, relative to its largest value where that is above 1."""
     box_max_error_m: float
     yaw_max_error_rad: float
     scans: int
@@ -188,14 +199,34 @@ class Provenance(Strict):
 
 
 @dataclass(frozen=True)
-class Bundle(Strict):
-    """The contents of bundle.json, but for `pillar.layout`, which follows from `spec`."""
+class PvRcnnSection(Strict):
+    """What only bundles of kind pv_rcnn have.
+
+    Raises:
+        ConfigError: no such number of channels.
+    """
+
+    voxel_channels: tuple[int, int, int, int, int]
+    """Of conv1 to conv4 and of conv_out."""
+    keypoint_channels: int
+    """Of a keypoint's fused feature."""
+    settings: VoxelSetSettings
+    """Keypoints, proposals and neighbors."""
+
+    def __post_init__(self) -> None:
+        for channels in (*self.voxel_channels, self.keypoint_channels):
+            if not 1 <= channels <= _MOST_CHANNELS:
+                raise ConfigError(f"channels {str(channels)[:20]} must lie between 1 and {_MOST_CHANNELS}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnyBundle(Strict):
+    """What bundle.json holds of a detector of any kind."""
 
     name: str
-    kind: Literal["pillar", "pillar_refine"]
+    kind: str
     """The family of detectors; the section of that name holds what only this family has."""
-    spec: PillarSpec
-    pillar: PillarSection
+    spec: DetectorSpec
     precision: Literal["float32", "int8"]
     """What the slowest graph, backbone.onnx, computes in."""
     backbone_gmac: float
@@ -211,9 +242,38 @@ class Bundle(Strict):
     """The scans that `expected_input` was measured on: those trained on, or those given to the export."""
     provenance: Provenance
     license: str
+    schema_version: int = SCHEMA_VERSION
+
+    @property
+    def graph_names(self) -> tuple[str, ...]:
+        """Which graphs a bundle of this kind has."""
+        return GRAPHS[self.kind]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bundle(AnyBundle):
+    """Of a pillar detector, with or without a second stage; but for `pillar.layout`, which follows from `spec`."""
+
+    kind: Literal["pillar", "pillar_refine"]
+    spec: PillarSpec
+    pillar: PillarSection
     refine: RefineSection | None = None
     """None of kind pillar, whose bundle.json does not have the key."""
-    schema_version: int = SCHEMA_VERSION
+
+
+@dataclass(frozen=True, kw_only=True)
+class PvRcnnBundle(AnyBundle):
+    """Of PV-RCNN."""
+
+    kind: Literal["pv_rcnn"]
+    spec: VoxelSpec
+    pv_rcnn: PvRcnnSection
+
+    @property
+    def graph_names(self) -> tuple[str, ...]:
+        """With DEFORM where keypoints are shifted."""
+        shifts = (DEFORM,) if self.pv_rcnn.settings.deformed else ()
+        return (*GRAPHS[self.kind], *shifts)
 
 
 def default_bundle_path() -> Path:

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
-from asca_deploy.bundle import Bundle, find_bundle, sample_scan_path
-from asca_deploy.manifest import load_bundle
+from asca_deploy.bundle import AnyBundle, Bundle, PvRcnnBundle, find_bundle, sample_scan_path
+from asca_deploy.manifest import load_any_bundle
 from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_deploy.stream import overlapped
 from asca_pillars.data.input_check import InputWarning, UsablePoints, check_input, usable_points
@@ -99,7 +100,7 @@ class Detector:
         self.threads = check_threads(threads)
         check_onnxruntime()
         providers.require(provider, precision or "float32")
-        self.bundle: Bundle = load_bundle(self.folder)
+        self.bundle: AnyBundle = load_any_bundle(self.folder)
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
         self.pipeline, self.provider, self.precision, self.candidates = self._choose(provider, precision)
@@ -241,10 +242,14 @@ class Detector:
     def _choose(
         self, provider: providers.Provider | Literal["auto"], precision: providers.Precision | None
     ) -> auto.Choice[Pipeline[Any, Any]]:
-        family = PillarPipeline if self.bundle.kind == "pillar" else RefinePipeline
+        bundle = self.bundle
 
         def open_pipeline(name: providers.Provider, digits: providers.Precision) -> Pipeline[Any, Any]:
-            return family(self.folder, self.bundle, name, digits, self.threads)
+            if isinstance(bundle, PvRcnnBundle):
+                return PvRcnnPipeline(self.folder, bundle, name, digits, self.threads)
+            assert isinstance(bundle, Bundle), "there are no other kinds"
+            family = PillarPipeline if bundle.kind == "pillar" else RefinePipeline
+            return family(self.folder, bundle, name, digits, self.threads)
 
         if provider != providers.AUTO:
             digits = precision or "float32"

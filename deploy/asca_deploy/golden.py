@@ -21,6 +21,7 @@ from asca_deploy.pillar_backbone import HeadAnswer
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.refine_pipeline import RefinePipeline, refine_inputs
 from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import BundleError
 from asca_pillars.files import atomic_directory, write_json
 from asca_pillars.geometry.decode import HeadMaps, decode_candidates, sigmoid, suppress
 from asca_pillars.geometry.detections import Detections
@@ -53,13 +54,15 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
         OutputError: `out` holds something else.
     """
     detector = Detector(bundle, threads=1)
-    assert isinstance(detector.pipeline, PillarPipeline | RefinePipeline), "there are no other kinds"
+    described = detector.bundle
+    if not (isinstance(described, Bundle) and isinstance(detector.pipeline, PillarPipeline | RefinePipeline)):
+        raise BundleError(f"{bundle}: golden vectors are written of pillar detectors, and this is {described.kind}")
     stages = golden_stages(detector.pipeline, read_scan(scan).points)
     with atomic_directory(out, "asca export --golden", GOLDEN) as folder:
         for stage, arrays in stages.items():
             for name, array in arrays.items():
                 np.save(folder / _file(stage, name), np.ascontiguousarray(array), allow_pickle=False)
-        write_json(folder / GOLDEN, _contents(detector.bundle, scan, stages))
+        write_json(folder / GOLDEN, _contents(described, scan, stages))
     return stages
 
 

@@ -11,7 +11,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from asca_deploy.bundle import GRAPHS, MANIFEST, PILLAR_GRAPHS, SCHEMA_VERSION, Bundle, GraphFile
+from asca_deploy.bundle import (
+    MANIFEST,
+    PILLAR_GRAPHS,
+    SCHEMA_VERSION,
+    AnyBundle,
+    Bundle,
+    GraphFile,
+    PvRcnnBundle,
+)
 from asca_deploy.layout import difference, layout_of
 from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.errors import AscaError, BundleError
@@ -21,7 +29,7 @@ from asca_pillars.schema import parse, to_dict
 ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
 
-_ESSENTIALS_REFINE = (*ESSENTIALS, "refine")
+_ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTIALS[:-1], "pv_rcnn")}
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
 # Of `pillar` and `spec.grid`, and what they are where they are not written: in bundles made before there were sparse
 # necks and pooled maps. The graphs' metadata tells whether they were taken out.
@@ -33,6 +41,18 @@ _EXPORT_AGAIN = "export the bundle again with `asca export`"
 
 
 def load_bundle(folder: str | Path) -> Bundle:
+    """A pillar detector's bundle, with or without a second stage, see `load_any_bundle`.
+
+    Raises:
+        BundleError: as `load_any_bundle`, or the bundle is of another kind.
+    """
+    bundle = load_any_bundle(folder)
+    if not isinstance(bundle, Bundle):
+        raise BundleError(f"{folder}: a bundle of kind {bundle.kind}, where one of a pillar detector is needed")
+    return bundle
+
+
+def load_any_bundle(folder: str | Path) -> AnyBundle:
     """Read and verify a bundle: every key, the graphs' SHA-256, their stamped metadata, the derived layout.
 
     Raises:
@@ -46,6 +66,37 @@ def load_bundle(folder: str | Path) -> Bundle:
     stamped = {key: data.get(key) for key in (_ESSENTIALS_2 if old else _stamped_keys(data))}
     if old:
         data = upgrade_schema_2(data)
+    family: type[AnyBundle] = PvRcnnBundle if data.get("kind") == "pv_rcnn" else Bundle
+    layout = _take_out_layout(manifest, data) if family is Bundle else None
+    try:
+        bundle = parse(family, data, str(manifest))
+        if ignored := _first_difference(data, to_dict(bundle)):
+            raise BundleError(f"`{ignored}` is missing or of the wrong type")
+    except AscaError as error:
+        # The grid and the classes check themselves and do not know the file they were read from.
+        raise BundleError(f"{_blamed(manifest, error)}; {_EXPORT_AGAIN}") from None
+    except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
+        raise BundleError(f"{manifest}: a value makes no sense ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
+    if isinstance(bundle, Bundle):
+        _verify_refine(manifest, bundle)
+    elif bundle.precision != "float32":
+        raise BundleError(f"{manifest}: `precision` of kind {bundle.kind} is float32; {_EXPORT_AGAIN}")
+    if set(bundle.graphs) != set(bundle.graph_names):
+        raise BundleError(
+            f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(bundle.graph_names)}, not "
+            f"{_cut(', '.join(bundle.graphs)) or 'none'}; {_EXPORT_AGAIN}"
+        )
+    for graph in bundle.graphs.values():
+        _verify_graph(folder, graph, stamped)
+    if isinstance(bundle, Bundle) and (differs := difference(layout, layout_of(bundle.spec))):
+        raise BundleError(
+            f"{manifest}: `pillar.layout.{differs}` is not what this version derives from `spec`; {_EXPORT_AGAIN}"
+        )
+    return bundle
+
+
+def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
+    """The layout that a pillar detector's manifest writes down; keys that came later get their first meaning."""
     if data.get("kind") == "pillar":
         if "refine" in data:
             raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {_EXPORT_AGAIN}")
@@ -56,28 +107,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         layout = data["pillar"].pop("layout", None)
     if isinstance(spec := data.get("spec"), dict) and isinstance(grid := spec.get("grid"), dict):
         data["spec"] = spec | {"grid": _LATER_GRID_KEYS | grid}
-    try:
-        bundle = parse(Bundle, data, str(manifest))
-        if ignored := _first_difference(data, to_dict(bundle)):
-            raise BundleError(f"`{ignored}` is missing or of the wrong type")
-    except AscaError as error:
-        # The grid and the classes check themselves and do not know the file they were read from.
-        raise BundleError(f"{_blamed(manifest, error)}; {_EXPORT_AGAIN}") from None
-    except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
-        raise BundleError(f"{manifest}: a value makes no sense ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
-    _verify_refine(manifest, bundle)
-    if set(bundle.graphs) != set(GRAPHS[bundle.kind]):
-        raise BundleError(
-            f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(GRAPHS[bundle.kind])}, not "
-            f"{_cut(', '.join(bundle.graphs)) or 'none'}; {_EXPORT_AGAIN}"
-        )
-    for graph in bundle.graphs.values():
-        _verify_graph(folder, graph, stamped)
-    if differs := difference(layout, layout_of(bundle.spec)):
-        raise BundleError(
-            f"{manifest}: `pillar.layout.{differs}` is not what this version derives from `spec`; {_EXPORT_AGAIN}"
-        )
-    return bundle
+    return layout
 
 
 def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
@@ -101,7 +131,7 @@ def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
+def write_bundle_manifest(folder: str | Path, bundle: AnyBundle) -> None:
     """Write bundle.json beside the graphs in `folder`, which must lie there already, stamped with `essentials`."""
     data = bundle_to_json(bundle)
     for graph in bundle.graphs.values():
@@ -110,16 +140,17 @@ def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
         path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
+def bundle_to_json(bundle: AnyBundle) -> dict[str, Any]:
     """What bundle.json holds: the bundle's fields, and the layout that readers in other languages need."""
     data = {"schema_version": bundle.schema_version, **to_dict(bundle)}
-    data["pillar"]["layout"] = layout_of(bundle.spec)
-    if bundle.refine is None:
-        del data["refine"]
+    if isinstance(bundle, Bundle):
+        data["pillar"]["layout"] = layout_of(bundle.spec)
+        if bundle.refine is None:
+            del data["refine"]
     return data
 
 
-def essentials(bundle: Bundle) -> dict[str, Any]:
+def essentials(bundle: AnyBundle) -> dict[str, Any]:
     """What the export stamps into the metadata of each graph, see ESSENTIALS."""
     data = bundle_to_json(bundle)
     return {key: data[key] for key in _stamped_keys(data)}
@@ -132,7 +163,7 @@ def graph_files(folder: str | Path, names: Iterable[str] = PILLAR_GRAPHS) -> dic
 
 
 def _stamped_keys(data: dict[str, Any]) -> tuple[str, ...]:
-    return _ESSENTIALS_REFINE if data.get("kind") == "pillar_refine" else ESSENTIALS
+    return _ESSENTIALS_OF.get(str(data.get("kind")), ESSENTIALS)
 
 
 def _verify_refine(manifest: Path, bundle: Bundle) -> None:

@@ -99,8 +99,10 @@ class OrtSession:
         BundleError: onnxruntime cannot read or run the graph at all.
     """
 
-    def __init__(self, path: Path, provider: str, precision: str, threads: int) -> None:
-        session = _open(path, provider, precision, threads)
+    def __init__(self, path: Path, provider: str, precision: str, threads: int, *, keep_memory: bool = True) -> None:
+        options = _session_options(threads)
+        options.enable_cpu_mem_arena = keep_memory
+        session = _open(path, provider, precision, options)
         self.inputs = {node.name: _tensor(node) for node in session.get_inputs()}
         self.outputs = {node.name: _tensor(node) for node in session.get_outputs()}
         self.run: Callable[[Sequence[str], Mapping[str, NDArray[Any]]], list[NDArray[Any]]] = session.run
@@ -111,7 +113,7 @@ def _tensor(node: Any) -> Tensor:
     return Tensor(_TYPES.get(node.type, node.type), shape)
 
 
-def _open(path: Path, name: str, precision: str, threads: int) -> onnxruntime.InferenceSession:
+def _open(path: Path, name: str, precision: str, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession:
     if name != "cpu":
         onnxruntime.preload_dlls()  # CUDA and cuDNN from pip's nvidia packages lie where no loader looks
     chain = [ORT_PROVIDERS[link] for link in (name, *ORT_PROVIDERS[name].helpers)]
@@ -121,7 +123,7 @@ def _open(path: Path, name: str, precision: str, threads: int) -> onnxruntime.In
     try:
         session = onnxruntime.InferenceSession(
             str(path),
-            _session_options(threads),
+            options,
             providers=providers,
             enable_fallback=0,
             disabled_optimizers=_DISABLED_OPTIMIZERS,

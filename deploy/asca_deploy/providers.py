@@ -67,8 +67,13 @@ def available() -> list[tuple[Provider, Precision]]:
     return found
 
 
-def open_session(path: Path, provider: Provider, precision: Precision, threads: int) -> Session:
+def open_session(
+    path: Path, provider: Provider, precision: Precision, threads: int, *, keep_memory: bool = True
+) -> Session:
     """Open an ONNX file with a provider and precision that `require` allows.
+
+    With `keep_memory` onnxruntime keeps what a run took for the next one: faster, but of a graph whose rows differ in
+    number from scan to scan ever more pieces.
 
     Raises:
         ProviderError: the provider does not start.
@@ -76,4 +81,4 @@ def open_session(path: Path, provider: Provider, precision: Precision, threads: 
     """
     if provider == "openvino":
         return openvino_session.OpenVinoSession(path, precision, threads)
-    return ort_session.OrtSession(path, provider, precision, threads)
+    return ort_session.OrtSession(path, provider, precision, threads, keep_memory=keep_memory)

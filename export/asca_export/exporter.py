@@ -27,6 +27,7 @@ from asca_export.int8 import quantize_bundle
 from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
+from asca_pillars.config import pillar_spec
 from asca_pillars.data.expected_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
@@ -113,7 +114,7 @@ def draft_bundle(
     return Bundle(
         name=config.name,
         kind="pillar" if refine is None else "pillar_refine",
-        spec=config.model.spec,
+        spec=pillar_spec(config),
         pillar=pillar,
         precision="float32",
         backbone_gmac=backbone_gmac,
@@ -122,7 +123,7 @@ def draft_bundle(
         quantization=None,
         expected_input=expected or measure_expected_input(scans, config.data.camera_view),
         expected_input_from="training" if expected else "export",
-        provenance=_provenance(checkpoint, trained_on, command),
+        provenance=provenance(checkpoint, trained_on, command),
         license=LICENSE,
         refine=refine,
     )
@@ -141,7 +142,8 @@ def write_proven(folder: Path, draft: Bundle, prove: Callable[[Bundle], Parity])
     return bundle
 
 
-def _provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provenance:
+def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provenance:
+    """Where the weights of a checkpoint come from; see `export_bundle` for the arguments."""
     return Provenance(
         command=command,
         created=datetime.datetime.now(datetime.UTC).date().isoformat(),

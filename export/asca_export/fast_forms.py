@@ -10,14 +10,14 @@
   of each channel go into that convolution's weights. Offsets are exact because nothing is padded after them.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from asca_pillars.models.pillar.head import SSDHead
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
 
 # What one step of an 8-bit tensor counts for in the graph: any number would do but one, which OpenVINO leaves out and
 # then takes the tensor for a float.
@@ -31,6 +31,18 @@ class CanvasSteps(NamedTuple):
     """(C,) positive."""
     empty: Tensor
     """(C,) whole numbers 0..255: the step that stands for zero."""
+
+
+class NeckAndHead(Protocol):
+    """A detector with blocks on a map, each followed by an upsampling, and a head of 1x1 convolutions."""
+
+    @property
+    def neck(self) -> Any:
+        """With `blocks` and `deblocks`."""
+
+    @property
+    def head(self) -> Any:
+        """An `SSDHead`."""
 
 
 class Stage(NamedTuple):
@@ -47,14 +59,25 @@ class FastBackbone(nn.Module):
     Args:
         detector: in evaluation mode; it stays as it is.
         steps: of the pseudo-image, which then holds STEP_VALUE times the step; None for real values.
+        padded: whether the pseudo-image comes with the first convolution's padding.
+        attention: a module after each block, if there is any.
     """
 
-    def __init__(self, detector: PillarDetector, steps: CanvasSteps | None = None) -> None:
+    def __init__(
+        self,
+        detector: NeckAndHead,
+        steps: CanvasSteps | None = None,
+        *,
+        padded: bool = True,
+        attention: Iterable[nn.Module] | None = None,
+    ) -> None:
         super().__init__()
         self.blocks = nn.ModuleList(_folded(block) for block in detector.neck.blocks)
         self.upsamples = nn.ModuleList(Upsample(deblock) for deblock in detector.neck.deblocks)
+        self.attention = nn.ModuleList(attention or [nn.Identity()] * len(self.blocks))
         self.head = _Head(detector.head)
-        _take_padded(next(iter(self.stages()[0].convolutions.values())), steps)
+        if padded:
+            _take_padded(next(iter(self.stages()[0].convolutions.values())), steps)
 
     def stages(self) -> list[Stage]:
         """The blocks, from the finest map to the coarsest."""
@@ -66,10 +89,13 @@ class FastBackbone(nn.Module):
         return stages
 
     def forward(self, canvas: Tensor) -> tuple[Tensor, ...]:
-        """(1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A)."""
+        """(1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A).
+
+        Without padding in it the pseudo-image is (1, ny, nx, C).
+        """
         features, maps = canvas.permute(0, 3, 1, 2), []
-        for block, upsample in zip(self.blocks, self.upsamples, strict=True):
-            features = block(features)
+        for block, attend, upsample in zip(self.blocks, self.attention, self.upsamples, strict=True):
+            features = attend(block(features))
             maps.append(upsample(features))
         return self.head(torch.cat(maps, dim=-1))
 

@@ -8,20 +8,22 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import onnx
 import torch
 from onnxscript import opset20 as op
 from torch import Tensor, nn
 
-from asca_deploy.bundle import GRAPHS, Bundle
+from asca_deploy.bundle import AnyBundle
 from asca_deploy.manifest import essentials, graph_files
 from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillarize import FEATURES
+
+B = TypeVar("B", bound=AnyBundle)
 
 OPSET = 20
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
@@ -87,15 +89,15 @@ def graph_path(folder: Path, name: str) -> Path:
     return folder / f"{name}.onnx"
 
 
-def sign(folder: Path, bundle: Bundle) -> Bundle:
+def sign(folder: Path, bundle: B) -> B:
     """Stamp the graphs in `folder` with what they must not be separated from; the bundle with their SHA-256."""
     properties = {key: json.dumps(value) for key, value in essentials(bundle).items()}
-    for name in GRAPHS[bundle.kind]:
+    for name in bundle.graph_names:
         path = graph_path(folder, name)
         model = onnx.load(path)
         onnx.helper.set_model_props(model, properties)
         onnx.save(model, path)
-    return dataclasses.replace(bundle, graphs=graph_files(folder, GRAPHS[bundle.kind]))
+    return dataclasses.replace(bundle, graphs=graph_files(folder, bundle.graph_names))
 
 
 def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:

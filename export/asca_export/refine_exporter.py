@@ -18,6 +18,7 @@ from asca_export.exporter import MIN_SCANS, draft_bundle, export_bundle, write_p
 from asca_export.neck_output import add_neck_output
 from asca_export.refine_graph import export_refine
 from asca_export.refine_parity import prove_refine_parity
+from asca_pillars.config import pillar_spec
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
@@ -48,7 +49,7 @@ def export_refine_bundle(
     config, detector = checkpoint.config, checkpoint.detector
     if not isinstance(detector, RefineDetector):
         raise ExportError(f"model.kind {config.model.kind}: not a second stage")
-    model = with_first_stage(dataclasses.replace(detector.model, spec=config.model.spec))
+    model = with_first_stage(dataclasses.replace(detector.model, spec=pillar_spec(config)))
     stage = open_first_stage(model.first_stage)
     with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, "asca export", MANIFEST) as folder:
         first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, progress)

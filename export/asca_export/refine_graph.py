@@ -2,6 +2,7 @@
 
 import copy
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -12,6 +13,8 @@ from asca_export.graphs import export_graph
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner, RefineInputs
 from asca_pillars.models.refine.set_abstraction import SetAbstraction
 from asca_pillars.points.refine_geometry import ROI_FEATURES, RefineSettings
+
+M = TypeVar("M", bound=nn.Module)
 
 
 class Shift(nn.Module):
@@ -26,9 +29,9 @@ class Shift(nn.Module):
         return rows + self.shift
 
 
-def fold_norms(refiner: PillarRefiner) -> PillarRefiner:
-    """A copy without normalization that computes the same in evaluation mode."""
-    folded = copy.deepcopy(refiner).eval()
+def fold_norms(network: M) -> M:
+    """A copy without normalization of point features that computes the same in evaluation mode."""
+    folded = copy.deepcopy(network).eval()
     with torch.no_grad():
         for module in folded.modules():
             if isinstance(module, SetAbstraction):

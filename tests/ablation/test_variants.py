@@ -13,7 +13,7 @@ from asca_pillars.ablation import variants
 from asca_pillars.ablation.variants import VARIANTS, Variant, runs, train_runs
 from asca_pillars.commands import ablate_steps
 from asca_pillars.commands.ablate import ablate
-from asca_pillars.config import load_config
+from asca_pillars.config import load_config, pillar_spec
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
@@ -53,7 +53,7 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: py
     assert "6 frames for training, 8 for validation" in text and "2 runs" in text
     assert sum(line.startswith("| K=2 | - | - | - | - |") for line in text.splitlines()) == 2
     trained = load_config(out / "baseline" / "seed0" / "config.yaml")
-    assert (trained.train.learning_rate, trained.model.spec.grid.zones) == (2e-3, 1)
+    assert (trained.train.learning_rate, pillar_spec(trained).grid.zones) == (2e-3, 1)
     weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
 
     monkeypatch.setattr(ablate_steps, "time_variants", lambda *_: {})  # which is all that is done again

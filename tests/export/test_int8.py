@@ -16,6 +16,7 @@ from asca_deploy.canvas_backbone import CanvasBackbone
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import int8
 from asca_export.exporter import export_bundle
+from asca_pillars.config import pillar_spec
 from asca_pillars.errors import ExportError
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillar_config import CpaReading
@@ -28,9 +29,9 @@ CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
 
 def export_int8(folder: Path) -> Bundle:
     checkpoint = tiny_checkpoint("channel")
-    spec = checkpoint.config.model.spec.with_score_threshold(0.02)  # random weights are never sure of anything
+    spec = pillar_spec(checkpoint.config).with_score_threshold(0.02)  # random weights are never sure of anything
     checkpoint = checkpoint._replace(
-        config=replace(checkpoint.config, model=replace(checkpoint.config.model, spec=spec))
+        config=replace(checkpoint.config, model=replace(checkpoint.config.model, spec=spec))  # type: ignore[arg-type]
     )
     # Two of the compared scans are given to calibrate on as well.
     return export_bundle(checkpoint, folder, SCANS, calibration=[*CALIBRATION, SCANS[3], SCANS[0].copy()])

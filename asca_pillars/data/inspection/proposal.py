@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.config import Config
+from asca_pillars.config import Config, pillar_spec
 from asca_pillars.data.inspection.findings import FEWEST_BOXES
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
@@ -75,19 +75,20 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
         )
     measured = {kind: np.array(found[kind], np.float64) for kind in names}
     of_classes = [np.array(findable[kind] or found[kind], np.float64) for kind in names]
-    grid = _grid(config.model.spec.grid, np.concatenate(of_classes))
+    before = pillar_spec(config)
+    grid = _grid(before.grid, np.concatenate(of_classes))
     classes = tuple(_class(kind, boxes, grid) for kind, boxes in measured.items())
     fullest = max(len(np.unique(cells[cells >= 0])) for cells in map(grid.cells, clouds))
-    limits = config.model.spec.limits
+    limits = before.limits
     if fullest > limits.max_pillars:
         limits = replace(limits, max_pillars=math.ceil(fullest * SPARE_PILLARS / 1000) * 1000)
-    spec = replace(config.model.spec, grid=grid, limits=limits, classes=classes)
+    spec = replace(before, grid=grid, limits=limits, classes=classes)
     insert = config.augment.insert
     kept = {kind: share for kind, share in insert.proportions.items() if kind in names}
     proposed = replace(
         config,
         name=f"{config.name}_own",
-        model=replace(config.model, spec=spec),
+        model=replace(config.model, spec=spec),  # type: ignore[arg-type]  # as `before` was
         augment=replace(config.augment, insert=replace(insert, proportions=kept)),
         data=replace(config.data, camera_view=config.data.camera_view and split.has_camera),
     )

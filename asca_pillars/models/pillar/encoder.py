@@ -5,11 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from asca_pillars.models.map_layers import NORM_EPS, NORM_MOMENTUM
 from asca_pillars.models.pillar.attention import ChannelAttention, PaperAttention, PointAttention
 from asca_pillars.pillar_config import CpaReading
 from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
-
-NORM_EPS, NORM_MOMENTUM = 1e-3, 0.01  # of every batch normalisation, as in PointPillars
 
 
 @torch.library.custom_op("asca::pillar_max", mutates_args=())

@@ -13,19 +13,20 @@ POSITIVE_PRIOR = 0.01  # what an untrained head says of every anchor: focal loss
 class SSDHead(nn.Module):
     """Class logit, seven box residuals and two direction logits for each of A anchors per cell.
 
-    An anchor belongs to one class and is only ever matched with that class, so it carries one class logit.
+    An anchor belongs to one class and is only ever matched with that class, so it carries one class logit;
+    `scores_per_anchor` is for the head of SECOND and PV-RCNN, whose every anchor has a logit for each class.
     """
 
-    def __init__(self, in_channels: int, anchors_per_cell: int) -> None:
+    def __init__(self, in_channels: int, anchors_per_cell: int, scores_per_anchor: int = 1) -> None:
         super().__init__()
-        self.scores = nn.Conv2d(in_channels, anchors_per_cell, 1)
+        self.scores = nn.Conv2d(in_channels, anchors_per_cell * scores_per_anchor, 1)
         self.boxes = nn.Conv2d(in_channels, anchors_per_cell * 7, 1)
         self.directions = nn.Conv2d(in_channels, anchors_per_cell * 2, 1)
         nn.init.constant_(self.scores.bias, -math.log((1 - POSITIVE_PRIOR) / POSITIVE_PRIOR))  # type: ignore[arg-type]
         nn.init.normal_(self.boxes.weight, std=0.001)
 
     def forward(self, features: Tensor) -> HeadMaps[Tensor]:
-        """(B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W)."""
+        """(B, C, H, W) -> scores (B, A * scores_per_anchor, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W)."""
         return HeadMaps(self.scores(features), self.boxes(features), self.directions(features))
 
     def at_cells(self, features: Tensor) -> HeadMaps[Tensor]:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
+from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillar_config import LossConfig
 
@@ -43,14 +44,15 @@ def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossCon
     """Eq. (15): focal loss over anchors, smooth L1 and direction over the positive ones, per positive anchor.
 
     Args:
-        maps: scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W); or rows (M, A), (M, 7A), (M, 2A) at
-            active head cells.
+        maps: scores (B, A, H, W), or (B, A * classes, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W); or rows
+            (M, A), (M, 7A), (M, 2A) at active head cells.
         targets: what they should be; of rows those that `targets_at` returns.
         config: weights and shape parameters.
     """
     positives = max(len(targets.positives), 1)
-    logits = _by_anchor(maps.scores, values=1)[:, 0].float()
-    classification = focal_loss(logits, targets.state.flatten(), config.focal_alpha, config.focal_gamma)
+    states = states_by_class(targets.state, maps.scores.shape[1] // targets.state.shape[-1])
+    logits = _by_anchor(maps.scores, values=states.shape[1]).float()
+    classification = focal_loss(logits, states, config.focal_alpha, config.focal_gamma)
     residuals = _by_anchor(maps.boxes, values=7)[targets.positives].float()
     directions = _by_anchor(maps.directions, values=2)[targets.positives].float()
     box = box_loss(residuals, targets.residuals, config.smooth_l1_beta)
@@ -60,6 +62,20 @@ def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossCon
         config.class_weight * classification / positives,
         config.direction_weight * direction / positives,
     )
+
+
+def states_by_class(state: Tensor, scores: int) -> Tensor:
+    """What each of an anchor's class logits should say: (..., A) -> (anchors, scores), as `TargetBatch.state`.
+
+    With one score it is the anchor's own. With one for each class a positive anchor is a negative of the others.
+    """
+    states = state.reshape(-1, 1)
+    if scores == 1:
+        return states
+    own = torch.arange(state.shape[-1], device=state.device) // len(ANCHOR_YAWS_RAD)
+    is_own = own[:, None] == torch.arange(scores, device=state.device)  # (A, scores)
+    is_own = is_own.expand(len(states) // len(own), -1, -1).flatten(0, 1)
+    return torch.where((states == 1) & ~is_own, torch.zeros_like(states), states)
 
 
 def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:

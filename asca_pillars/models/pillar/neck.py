@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.pillar.encoder import NORM_EPS, NORM_MOMENTUM
+from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
 from asca_pillars.models.table_conv import at_active_cells, table_conv
 from asca_pillars.pillars.grid import HEAD_STRIDE, NECK_STRIDE
 from asca_pillars.tables.neck_tables import MaskRule, NeckTables
@@ -36,8 +36,8 @@ class RPNLayers(nn.Module):
         stride = 1
         for channels, convs in zip(block_channels, block_convs, strict=True):
             stride *= 2
-            self.blocks.append(_block(in_channels, channels, convs))
-            self.deblocks.append(_deblock(channels, upsample_channels, stride // HEAD_STRIDE))
+            self.blocks.append(convolution_block(in_channels, channels, convs))
+            self.deblocks.append(upsampling(channels, upsample_channels, stride // HEAD_STRIDE))
             in_channels = channels
         if stride != NECK_STRIDE:
             raise ValueError(f"{len(block_channels)} blocks end at stride {stride}, the grid is made for {NECK_STRIDE}")
@@ -49,11 +49,7 @@ class RPNNeck(RPNLayers):
 
     def forward(self, canvas: Tensor) -> Tensor:
         """Unitless (B, C, H, W) -> (B, out_channels, H / 2, W / 2); 384 channels with Table 1's widths."""
-        maps = []
-        for block, deblock in zip(self.blocks, self.deblocks, strict=True):
-            canvas = block(canvas)
-            maps.append(deblock(canvas))
-        return torch.cat(maps, dim=1)
+        return joined_maps(canvas, self.blocks, self.deblocks)
 
 
 class SparseRPNNeck(RPNLayers):
@@ -113,26 +109,3 @@ def _upsampled(deblock: nn.Module, features: Tensor, places: Tensor) -> Tensor:
     outputs = (features @ by_place.transpose(0, 1).flatten(1)).view(-1, by_place.shape[2])
     outputs = torch.relu(at_active_cells(norm, outputs))  # (N * stride^2, channels), one parent after the other
     return F.pad(outputs, (0, 0, 0, 1)).index_select(0, places)
-
-
-def _block(in_channels: int, channels: int, convs: int) -> nn.Sequential:
-    # Table 1 prints padding 0 for some strided convolutions and yet halves the maps exactly: one pixel of zeros is
-    # what both need.
-    layers = _normed(nn.Conv2d(in_channels, channels, 3, stride=2, padding=1, bias=False), channels)
-    for _ in range(convs):
-        layers += _normed(nn.Conv2d(channels, channels, 3, padding=1, bias=False), channels)
-    return nn.Sequential(*layers)
-
-
-def _deblock(in_channels: int, channels: int, stride: int) -> nn.Sequential:
-    return nn.Sequential(
-        *_normed(nn.ConvTranspose2d(in_channels, channels, stride, stride=stride, bias=False), channels)
-    )
-
-
-def _normed(convolution: nn.Module, channels: int) -> list[nn.Module]:
-    return [
-        convolution,
-        nn.BatchNorm2d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM),
-        nn.ReLU(inplace=True),
-    ]

@@ -100,7 +100,7 @@ class PillarPreparation:
         """Frames as one batch."""
         return LabeledPillars(
             batch_pillars([frame.pillars for frame in frames], [frame.placement for frame in frames]),
-            _batch_targets([frame.targets for frame in frames]),
+            batch_targets([frame.targets for frame in frames]),
         )
 
     def place(self, pillars: Pillars) -> Placement:
@@ -161,7 +161,8 @@ def _batch_poolings(
     )
 
 
-def _batch_targets(frames: Sequence[Targets]) -> TargetBatch:
+def batch_targets(frames: Sequence[Targets]) -> TargetBatch:
+    """Targets of the anchors of several frames, one frame's after the other's."""
     anchors_per_frame = frames[0].state.size
     return TargetBatch(
         state=torch.from_numpy(np.stack([frame.state for frame in frames])),

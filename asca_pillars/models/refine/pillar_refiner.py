@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 
-from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder
+from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder, SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
 
 
@@ -38,6 +39,11 @@ class Refinements(NamedTuple):
     """(K,) of a keypoint's being part of an object."""
 
 
+def zero_of_weights(module: nn.Module) -> Tensor:
+    """A scalar 0 from which every weight has a gradient of zero."""
+    return 0 * torch.stack([weight.sum() for weight in module.parameters()]).sum()
+
+
 class PillarRefiner(nn.Module):
     """Keypoints from raw points and the first stage's map; RoI-grid pooling; confidence and residuals."""
 
@@ -48,7 +54,8 @@ class PillarRefiner(nn.Module):
 
     def forward(self, inputs: RefineInputs) -> Refinements:
         """See `RefineInputs` and `Refinements`."""
-        features, logits = self.encode(inputs.points, inputs.keypoints, inputs.bev, inputs.ball_indices)
+        points = SourceRows(inputs.points[:, :3], inputs.points[:, 3:])
+        features, logits = self.encode([points], inputs.keypoints, inputs.bev, inputs.ball_indices)
         confidence, residuals = self.head(
             inputs.keypoints, features, inputs.grid_points, inputs.grid_indices, inputs.roi_features
         )

@@ -4,20 +4,19 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder
-from asca_pillars.models.refine.pillar_refiner import PillarRefiner, RefineInputs, Refinements
+from asca_pillars.models.refine.keypoint_encoder import BallSource, KeypointEncoder
+from asca_pillars.models.refine.pillar_refiner import PillarRefiner, RefineInputs, Refinements, zero_of_weights
 from asca_pillars.models.refine.refine_loss import RefineTargets, refine_loss
 from asca_pillars.models.refine.roi_head import RoiHead
 from asca_pillars.models.second_stage.refine_preparation import LabeledProposals, RefinePreparation, live_preparation
 from asca_pillars.points.refine_geometry import ROI_FEATURES
-from asca_pillars.points.refined_detections import reported_detections
+from asca_pillars.points.refined_detections import reported_frames
 from asca_pillars.refine_config import RefineConfig, RefineModel
 
 POINT_CHANNELS = 1  # reflectance
@@ -79,13 +78,11 @@ class RefineDetector(nn.Module):
     def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
         """Refined boxes of each frame, with the thresholds of `spec`."""
         confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
-        ends = np.cumsum([len(proposals) for proposals in outputs.proposals])[:-1]
-        frames = zip(outputs.proposals, np.split(confidence, ends), np.split(residuals, ends), strict=True)
-        return [reported_detections(*frame, spec) for frame in frames]
+        return reported_frames(outputs.proposals, confidence, residuals, spec)
 
     def _silence(self, inputs: RefineInputs) -> Refinements:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
-        nothing = 0 * torch.stack([weight.sum() for weight in self.parameters()]).sum()
+        nothing = zero_of_weights(self)
         rois, keypoints = len(inputs.roi_features), len(inputs.keypoints)
         zeros = inputs.points.new_zeros
         return Refinements(zeros(rois) + nothing, zeros(rois, 7) + nothing, zeros(keypoints) + nothing)
@@ -110,11 +107,10 @@ def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> Pill
     network, neighbors = refine.network, refine.neighbors
     return PillarRefiner(
         KeypointEncoder(
-            POINT_CHANNELS,
+            [BallSource(POINT_CHANNELS, len(neighbors.ball_radii_m), network.ball_widths)],
             bev_channels,
-            radii=len(neighbors.ball_radii_m),
-            widths=network.ball_widths,
-            out_channels=network.keypoint_channels,
+            network.keypoint_channels,
+            weighting_channels=network.keypoint_channels,
         ),
         RoiHead(
             network.keypoint_channels,

@@ -78,17 +78,39 @@ def corner_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
     return F.smooth_l1_loss(way_m, torch.zeros_like(way_m), beta=_CORNER_BETA, reduction="none").mean(dim=1)
 
 
+def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
+    """1 - IoU + (distance of the centers / diagonal of the box around both)^2, seen from above (AFE-RCNN, eq. 17).
+
+    Both boxes as rectangles along the axes of their proposals, which have these sizes: (R, 7), (R, 7), (R, 3) -> (R,).
+    """
+    (center, half), (wanted, wanted_half) = (_boxes_in_frames(each, sizes) for each in (residuals, targets))
+    ends = [
+        (at[:, :2] - reach[:, :2], at[:, :2] + reach[:, :2]) for at, reach in ((center, half), (wanted, wanted_half))
+    ]
+    (low, high), (wanted_low, wanted_high) = ends
+    shared = (torch.minimum(high, wanted_high) - torch.maximum(low, wanted_low)).clamp(min=0).prod(dim=1)
+    union = 4 * (half[:, :2].prod(dim=1) + wanted_half[:, :2].prod(dim=1)) - shared
+    around = torch.maximum(high, wanted_high) - torch.minimum(low, wanted_low)
+    apart = (center - wanted)[:, :2].square().sum(dim=1)
+    return 1 - shared / union + apart / around.square().sum(dim=1)
+
+
 def corners_in_frames(residuals: Tensor, sizes: Tensor) -> Tensor:
     """Corners of refined boxes, seen from their proposals of these sizes: (R, 7), (R, 3) -> (R, 8, 3) metres.
 
     The order is that of `geometry.boxes.corners`; residuals as in `points.refinement`.
     """
-    diagonal = torch.hypot(sizes[:, 0], sizes[:, 1])
-    center = torch.stack([residuals[:, 0] * diagonal, residuals[:, 1] * diagonal, residuals[:, 2] * sizes[:, 2]], dim=1)
-    # Held as `decode_boxes` holds them: an untrained head must not make corners that are not finite.
-    half = sizes * residuals[:, 3:6].clamp(-math.log(100.0), math.log(100.0)).exp() / 2
+    center, half = _boxes_in_frames(residuals, sizes)
     signs = half.new_tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]]).tile(2, 1)  # (8, 2)
     along, across = signs[:, 0] * half[:, 0:1], signs[:, 1] * half[:, 1:2]  # (R, 8)
     cos, sin = torch.cos(residuals[:, 6:]), torch.sin(residuals[:, 6:])
     up = half.new_tensor([-1.0] * 4 + [1.0] * 4) * half[:, 2:3]
     return torch.stack([cos * along - sin * across, sin * along + cos * across, up], dim=2) + center[:, None]
+
+
+def _boxes_in_frames(residuals: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+    """Centers and half sizes of refined boxes, seen from their proposals: (R, 7), (R, 3) -> 2 x (R, 3) metres."""
+    diagonal = torch.hypot(sizes[:, 0], sizes[:, 1])
+    center = torch.stack([residuals[:, 0] * diagonal, residuals[:, 1] * diagonal, residuals[:, 2] * sizes[:, 2]], dim=1)
+    # Held as `decode_boxes` holds them: an untrained head must not make corners that are not finite.
+    return center, sizes * residuals[:, 3:6].clamp(-math.log(100.0), math.log(100.0)).exp() / 2

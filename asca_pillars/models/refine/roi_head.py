@@ -49,7 +49,7 @@ class RoiHead(nn.Module):
         features: Tensor,
         grid_points: Tensor,
         indices: Sequence[Tensor],
-        roi_features: Tensor,
+        roi_features: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Confidence logits (R,) and residuals (R, 7), see `encode_refinement`.
 
@@ -58,12 +58,12 @@ class RoiHead(nn.Module):
             features: (K, in_channels).
             grid_points: (R * cells, 3), see `roi_grid_points`.
             indices: of each radius (R * cells, T) keypoints.
-            roi_features: (R, roi_channels).
+            roi_features: (R, roi_channels); None where there are no such channels.
         """
         pooled = [
             pool(keypoints, features, grid_points, index) for pool, index in zip(self.pools, indices, strict=True)
         ]
         grid = torch.cat(pooled, dim=1)  # (R * cells, C)
         shared = self.shared(grid.reshape(-1, self.cells * grid.shape[1]))
-        joined = torch.cat([shared, roi_features], dim=1)
+        joined = shared if roi_features is None else torch.cat([shared, roi_features], dim=1)
         return self.confidence(joined)[:, 0], self.residuals(joined)

@@ -29,9 +29,11 @@ class CheckpointFirstStage:
     def __init__(self, path: str | Path) -> None:
         checkpoint = load_checkpoint(path)
         model, detector = checkpoint.config.model, checkpoint.detector
-        neck = model.network.neck if isinstance(model, PillarModel) else "dense"
-        require_dense_map(path, model.kind, neck, pooled=model.spec.grid.pools)
-        assert isinstance(detector, PillarDetector), "it is of kind pillar"
+        neck, pooled = "dense", False
+        if isinstance(model, PillarModel):
+            neck, pooled = model.network.neck, model.spec.grid.pools
+        require_dense_map(path, model.kind, neck, pooled=pooled)
+        assert isinstance(model, PillarModel) and isinstance(detector, PillarDetector), "it is of kind pillar"
         self._network = detector
         self.spec = model.spec
         with Path(path).open("rb") as file:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.config import Config, DataConfig, InsertConfig
+from asca_pillars.config import Config, DataConfig, InsertConfig, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
@@ -155,7 +155,7 @@ def test_per_frame_labels_need_their_scan(root: Path) -> None:
 
 
 def test_inspection_and_insertion_read_it(root: Path) -> None:
-    split, spec = open_split(root, "train"), CONFIG.model.spec
+    split, spec = open_split(root, "train"), pillar_spec(CONFIG)
     inspection = inspect_dataset(split, spec, CONFIG.data)
     assert inspection.types == {"Car": 3, "Forklift": 3} and [facts.boxes for facts in inspection.classes] == [3, 3]
     assert not [finding for finding in findings(inspection, spec, 1) if finding.level == "error"]
@@ -168,7 +168,7 @@ def test_inspection_and_insertion_read_it(root: Path) -> None:
 
 def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
     """The scenes are ahead of the sensor only: with x to the right they stand to the left."""
-    spec = CONFIG.model.spec
+    spec = pillar_spec(CONFIG)
     right = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
     assert not [finding for finding in right if finding.about == "axes"]
     level = Mounting(axes="y-forward").level

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.config import Config, DataConfig
+from asca_pillars.config import Config, DataConfig, pillar_spec
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dataset
@@ -50,11 +50,11 @@ def with_grid(**changes: Any) -> Config:
 
 def inspected(root: Path, config: Config, *, split: str | None = None, frames: int = 500) -> Inspection:
     wanted = KittiSplit(root, config.data.train_set if split is None else split)
-    return inspect_dataset(wanted, config.model.spec, config.data, frames=frames)
+    return inspect_dataset(wanted, pillar_spec(config), config.data, frames=frames)
 
 
 def found(root: Path, config: Config = CONFIG) -> list[Finding]:
-    return findings(inspected(root, config), config.model.spec, config.data.min_points)
+    return findings(inspected(root, config), pillar_spec(config), config.data.min_points)
 
 
 def change_scans(root: Path, change: Callable[[Points], object], every: int = 1) -> None:
@@ -97,7 +97,7 @@ def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
 
 def test_points_of_a_box_by_a_plain_loop(clean: Path) -> None:
     split = KittiSplit(clean)
-    measure = measure_frame(split, "000000", CONFIG.model.spec, CONFIG.data)
+    measure = measure_frame(split, "000000", pillar_spec(CONFIG), CONFIG.data)
     counts = [0] * len(measure.boxes)
     for x, y, z, _ in read_scan(split.scan_path("000000")).points.tolist():  # the camera sees all of the boxes
         for row, (bx, by, bz, length, width, height, yaw) in enumerate(measure.boxes.tolist()):
@@ -179,7 +179,7 @@ def test_evenly_spaced_frames(clean: Path) -> None:
     inspection = inspected(clean, CONFIG, frames=4)
     assert (inspection.frames, inspection.frames_in_split, inspection.sampled) == (4, FRAMES, True)
     chosen = [
-        measure_frame(KittiSplit(clean), frame_id, CONFIG.model.spec, CONFIG.data)
+        measure_frame(KittiSplit(clean), frame_id, pillar_spec(CONFIG), CONFIG.data)
         for frame_id in ("000000", "000003", "000006", "000009")
     ]
     assert inspection.scans.points.largest == max(frame.scan.points for frame in chosen)

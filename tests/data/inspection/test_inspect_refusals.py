@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from asca_pillars.commands.inspect import inspect
-from asca_pillars.config import Config
+from asca_pillars.config import Config, pillar_spec
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError
@@ -77,9 +77,8 @@ def test_a_class_missing_in_a_sample_may_be_in_the_rest(data: Path) -> None:
         path = KittiSplit(data).label_path(frame_id)
         path.write_text(re.sub("Cyclist.*\n", "", path.read_text()))
     inspection = inspected(data, CONFIG, frames=2)
-    assert (
-        "look at all frames with --frames 12" in findings(inspection, CONFIG.model.spec, CONFIG.data.min_points)[0].text
-    )
+    (first, *_) = findings(inspection, pillar_spec(CONFIG), CONFIG.data.min_points)
+    assert "look at all frames with --frames 12" in first.text
 
 
 def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path) -> None:

@@ -9,7 +9,7 @@ import yaml
 from typer.testing import CliRunner
 
 from asca_pillars.cli import app
-from asca_pillars.config import Config, DataConfig, load_config
+from asca_pillars.config import Config, DataConfig, load_config, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.inspection.findings import findings
@@ -63,7 +63,7 @@ def test_anchors_have_the_size_of_the_boxes(tmp_path: Path) -> None:
 
 def test_the_grid_looks_where_the_boxes_are(tmp_path: Path) -> None:
     split = BoxSplit(write_around(tmp_path, 60, reach_m=30, z_m=0.3))
-    spec = propose(split, CONFIG).config.model.spec
+    spec = pillar_spec(propose(split, CONFIG).config)
     assert spec.grid.zones == 1 and spec.grid.x_range_m[0] == -spec.grid.x_range_m[1]
     centers = np.concatenate([split.labeled_boxes(frame_id).boxes for frame_id in split.frame_ids])
     assert spec.ranges.hold_centers(centers).mean() >= 0.94
@@ -84,13 +84,14 @@ def test_a_range_ahead_is_widened_to_legal_ones(tmp_path: Path) -> None:
     narrow = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-2.56, 2.56), v_max_m=0.32, zones=2)
     config = replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=narrow)))
     split = BoxSplit(write_box_dataset(tmp_path, 12))
-    grid = propose(split, config).config.model.spec.grid
+    grid = pillar_spec(propose(split, config).config).grid
     assert grid.zones == 2 and grid.x_range_m[1] > 20 and grid.y_range_m == (-grid.y_range_m[1], grid.y_range_m[1])
 
 
 def test_pillars_get_room(tmp_path: Path) -> None:
     config = replace(CONFIG, model=PillarModel(spec=replace(SPEC, limits=replace(SPEC.limits, max_pillars=100))))
-    assert propose(BoxSplit(write_box_dataset(tmp_path, 12)), config).config.model.spec.limits.max_pillars >= 1000
+    proposed = propose(BoxSplit(write_box_dataset(tmp_path, 12)), config).config
+    assert pillar_spec(proposed).limits.max_pillars >= 1000
 
 
 def test_a_type_with_few_boxes_is_no_class(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder
+from asca_pillars.models.refine.keypoint_encoder import BallSource, KeypointEncoder
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.refine.refine_loss import refine_loss
 from asca_pillars.models.refine.roi_head import RoiHead
@@ -28,7 +28,7 @@ BEV_CHANNELS = 3
 
 def small_refiner(seed: int = 0) -> PillarRefiner:
     torch.manual_seed(seed)
-    encode = KeypointEncoder(1, BEV_CHANNELS, radii=2, widths=(8, 16), out_channels=16)
+    encode = KeypointEncoder([BallSource(1, 2, (8, 16))], BEV_CHANNELS, 16, weighting_channels=16)
     head = RoiHead(16, 3, radii=2, widths=(16, 16), roi_channels=len(NAMES) + 4, hidden=32, dropout=0.0)
     return PillarRefiner(encode, head)
 
@@ -85,7 +85,7 @@ def test_every_weight_learns() -> None:
 
 def test_gradients() -> None:
     torch.manual_seed(0)
-    encode = KeypointEncoder(1, BEV_CHANNELS, radii=1, widths=(3,), out_channels=4)
+    encode = KeypointEncoder([BallSource(1, 1, (3,))], BEV_CHANNELS, 4, weighting_channels=4)
     network = PillarRefiner(encode, RoiHead(4, 2, 1, (3,), roi_channels=7, hidden=4, dropout=0.0)).double().eval()
     settings = RefineSettings(ball_radii_m=(0.8,), ball_samples=3, grid_size=2, grid_radii_m=(1.6,), grid_samples=3)
     frame, proposed = proposed_frame(0)

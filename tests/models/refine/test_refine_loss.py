@@ -9,7 +9,13 @@ from hypothesis import given
 
 from asca_pillars.geometry.boxes import corners
 from asca_pillars.models.refine.pillar_refiner import Refinements
-from asca_pillars.models.refine.refine_loss import RefineTargets, corner_loss, corners_in_frames, refine_loss
+from asca_pillars.models.refine.refine_loss import (
+    RefineTargets,
+    corner_loss,
+    corners_in_frames,
+    distance_iou_loss,
+    refine_loss,
+)
 from asca_pillars.points.refinement import encode_refinement
 from asca_pillars.points.roi_grid import boxes_in_frames
 from tests.points.boxes_near import CHANGES, PROPOSALS, changed
@@ -77,3 +83,27 @@ def test_a_batch_without_positive_keypoints_does_not_outweigh_others() -> None:
         for states in (none, few)
     ]
     assert losses[0] < losses[1]
+
+
+def test_distance_iou_of_boxes_equal_apart_and_one_in_the_other() -> None:
+    sizes = torch.tensor([[4.0, 2.0, 1.5]]).double()
+    here = torch.zeros(1, 7).double()
+    assert distance_iou_loss(here, here, sizes) == 0
+    beside = here.clone()
+    beside[0, 0] = 8 / math.hypot(4, 2)  # eight metres ahead: they do not meet, and lie in 12 m by 2 m together
+    assert distance_iou_loss(beside, here, sizes).item() == pytest.approx(1 + 64 / 148)
+    inside = here.clone()
+    inside[0, 3:5] = math.log(0.5)  # a quarter of the area, the same center
+    assert distance_iou_loss(inside, here, sizes).item() == pytest.approx(0.75)
+    assert distance_iou_loss(here[:0], here[:0], sizes[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize("moved", [0.3, 5.0])
+def test_distance_iou_has_the_gradient_that_it_says(moved: float) -> None:
+    torch.manual_seed(0)
+    residuals = 0.2 * torch.randn(3, 7, dtype=torch.float64)
+    residuals[:, 0] += moved
+    targets, sizes = 0.1 * torch.randn(3, 7, dtype=torch.float64), torch.rand(3, 3, dtype=torch.float64) + 1
+    assert torch.autograd.gradcheck(lambda each: distance_iou_loss(each, targets, sizes), residuals.requires_grad_())
+    distance_iou_loss(residuals, targets, sizes).sum().backward()
+    assert residuals.grad is not None and (residuals.grad[:, :2] != 0).all(), "also of boxes that do not meet"

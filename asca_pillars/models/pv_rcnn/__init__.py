@@ -1,0 +1,1 @@
+"""PV-RCNN in PyTorch: voxels and keypoints, both stages trained together."""

@@ -1,0 +1,74 @@
+"""A checkpoint of PV-RCNN becomes a bundle, or a clear refusal."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.bundle import BACKBONE, MANIFEST, PvRcnnBundle, PvRcnnSection
+from asca_deploy.manifest import load_any_bundle, write_bundle_manifest
+from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
+from asca_export import graphs
+from asca_export.exporter import LICENSE, MIN_SCANS, provenance
+from asca_export.pv_rcnn_forms import export_pv_rcnn_graphs
+from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
+from asca_pillars.data.expected_input import measure_expected_input
+from asca_pillars.errors import ExportError
+from asca_pillars.files import atomic_directory
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
+from asca_pillars.pv_rcnn_config import PvRcnnModel
+from asca_pillars.system import default_threads
+
+
+def export_pv_rcnn_bundle(
+    checkpoint: Checkpoint,
+    out: str | Path,
+    scans: Sequence[NDArray[np.float32]],
+    *,
+    trained_on: str = "not stated",
+    command: str = "not stated",
+    progress: Callable[[str], None] = lambda _: None,
+) -> PvRcnnBundle:
+    """Write the four graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
+
+    Arguments as of `exporter.export_bundle`.
+
+    Raises:
+        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
+    """
+    if len(scans) < MIN_SCANS:
+        raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
+    config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
+    model = config.model
+    if not (isinstance(model, PvRcnnModel) and isinstance(detector, PvRcnnDetector)):
+        raise ExportError(f"model.kind {model.kind}: not PV-RCNN")
+    progress("Exporting and proving parity")
+    with atomic_directory(out, "asca export", MANIFEST) as folder:
+        draft = PvRcnnBundle(
+            name=config.name,
+            kind="pv_rcnn",
+            spec=model.spec,
+            pv_rcnn=PvRcnnSection(model.network.voxel_channels, model.network.keypoint_channels, model.settings),
+            precision="float32",
+            backbone_gmac=0.0,
+            graphs={},
+            parity=None,
+            quantization=None,
+            expected_input=expected or measure_expected_input(scans, config.data.camera_view),
+            expected_input_from="training" if expected else "export",
+            provenance=provenance(checkpoint, trained_on, command),
+            license=LICENSE,
+        )
+        export_pv_rcnn_graphs(detector.network, draft, folder)
+        gmac = graphs.multiply_accumulates(graphs.graph_path(folder, BACKBONE)) / 1e9
+        draft = graphs.sign(folder, dataclasses.replace(draft, backbone_gmac=gmac))
+        write_bundle_manifest(folder, draft)
+        opened = load_any_bundle(folder)
+        assert isinstance(opened, PvRcnnBundle), "as it was written"
+        pipeline = PvRcnnPipeline(folder, opened, threads=default_threads())
+        bundle = dataclasses.replace(draft, parity=prove_pv_rcnn_parity(detector.network, pipeline, scans))
+        write_bundle_manifest(folder, bundle)
+    return bundle

@@ -1,0 +1,185 @@
+"""PV-RCNN as four ONNX graphs, normalization folded into the layers before it; nothing is scattered in them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from asca_deploy import pv_rcnn_graphs as interfaces
+from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
+from asca_deploy.graph import Tensor as Declared
+from asca_export.fast_forms import FastBackbone
+from asca_export.graphs import export_graph, graph_path
+from asca_export.refine_graph import fold_norms
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.pv_rcnn.deformation import Surroundings
+from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
+from asca_pillars.models.pv_rcnn.voxel_backbone import TableLayer, VoxelBackbone
+from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder, SourceRows
+from asca_pillars.models.refine.roi_head import RoiHead
+from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls, VoxelSetSettings
+
+_EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
+
+
+def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -> None:
+    """Write the graphs that `bundle` describes, see `asca_deploy.pv_rcnn_graphs`; every number of rows is dynamic."""
+    network = fold_norms(network)
+    inputs, outputs = interfaces.voxels_interface(bundle)
+    levels = [name for name in (*LEVEL_SOURCES, interfaces.OUT) if name in outputs]
+    rows = {"features": "voxels_0"} | {name: f"voxels_{name.partition('_')[2]}" for name in list(inputs)[1:]}
+    _export(_Voxels(network.voxels, levels), graph_path(folder, VOXELS), inputs, rows, levels)
+    inputs, _ = interfaces.backbone_interface(bundle)
+    backbone = FastBackbone(network, padded=False, attention=network.neck.attention)
+    _export(backbone, graph_path(folder, BACKBONE), inputs, {}, HeadMaps._fields)
+    inputs, _ = interfaces.keypoints_interface(bundle)
+    sources = bundle.pv_rcnn.settings.sources
+    rows = _source_rows(inputs, sources) | {"points": "points"}
+    keypoints = _Keypoints(network.encode, bundle.pv_rcnn.settings)
+    _export(keypoints, graph_path(folder, KEYPOINTS), inputs, rows, ["features"])
+    if bundle.pv_rcnn.settings.deformed:
+        export_deform(network, bundle, graph_path(folder, DEFORM))
+    inputs, _ = interfaces.refine_interface(bundle)
+    cells = network.refine.cells
+    rows = {name: "keypoints" if name in ("keypoints", "features") else "proposals" for name in inputs}
+    path = graph_path(folder, REFINE)
+    _export(_Refine(network.refine), path, inputs, rows, ["confidence", "residuals"], {"proposals": cells})
+
+
+def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
+    """Write deform.onnx alone: the places that keypoints of a deformed source look around."""
+    inputs, outputs = interfaces.deform_interface(bundle)
+    _export(_Deform(network), path, inputs, _source_rows(inputs, bundle.pv_rcnn.settings.sources), list(outputs))
+
+
+def _source_rows(inputs: Mapping[str, Declared], sources: Sequence[SourceBalls]) -> dict[str, str]:
+    """What each input has a row of: a voxel of its source, or a keypoint."""
+    of_source = {f"{each.source}{suffix}": each.source for each in sources for suffix in ("", "_positions")}
+    return {name: of_source.get(name, "keypoints") for name in inputs}
+
+
+def _export(
+    module: nn.Module,
+    path: Path,
+    inputs: Mapping[str, Declared],
+    rows: Mapping[str, str],
+    outputs: Any,
+    multiples: Mapping[str, int] | None = None,
+) -> None:
+    """Write one graph; `rows` names what each input has a row of, `multiples` how many rows one of them has."""
+    multiples = multiples or {}
+    sizes = {name: torch.export.Dim(f"{name}_rows") for name in dict.fromkeys(rows.values())}
+    example, dynamic = [], []
+    for name, (kind, shape) in inputs.items():
+        own = rows.get(name, "")
+        count = _EXAMPLE_ROWS * multiples.get(own, 1)
+        size = [count if extent is None else extent for extent in shape]
+        example.append(torch.zeros(size, dtype=torch.int32) if kind == "int32" else torch.rand(size))
+        dynamic.append({0: multiples.get(own, 1) * sizes[own]} if own else {})
+    names: dict[str, Any] = {"input_names": list(inputs), "output_names": list(outputs)}
+    if rows:
+        names["dynamic_shapes"] = (tuple(dynamic),)
+    export_graph(module, example, path, **names)
+
+
+class _TableProduct(nn.Module):
+    """A convolution by table with its normalization: gather, one matrix product, ReLU."""
+
+    def __init__(self, layer: TableLayer) -> None:
+        super().__init__()
+        norm, weight = layer.norm, layer.convolution.weight.detach()
+        assert norm.running_var is not None and norm.running_mean is not None
+        scale = (norm.weight / torch.sqrt(norm.running_var + norm.eps)).detach()
+        matrix = (weight * scale[:, None, None, None, None]).flatten(2).transpose(1, 2).flatten(1)
+        self.product = nn.Linear(matrix.shape[1], matrix.shape[0])
+        with torch.no_grad():
+            self.product.weight.copy_(matrix)
+            self.product.bias.copy_(norm.bias - norm.running_mean * scale)
+
+    def forward(self, features: Tensor, table: Tensor) -> Tensor:
+        """Unitless (N, C) by indices (M, taps) -> (M, outputs)."""
+        padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
+        gathered = padded.index_select(0, table.reshape(-1)).view(table.shape[0], self.product.in_features)
+        return torch.relu(self.product(gathered))
+
+
+class _Voxels(nn.Module):
+    """The sparse backbone; `levels` names what it returns."""
+
+    def __init__(self, backbone: VoxelBackbone, levels: list[str]) -> None:
+        super().__init__()
+        self.levels = levels
+        self.same = nn.ModuleList(
+            nn.ModuleList(_TableProduct(layer) for layer in level.children())  # type: ignore[arg-type]
+            for level in backbone.same
+        )
+        self.down = nn.ModuleList(_TableProduct(layer) for layer in backbone.down)  # type: ignore[arg-type]
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        features, *tables = inputs
+        same, strided = tables[: len(self.same)], tables[len(self.same) :]
+        found = {}
+        for number, name in enumerate((*LEVEL_SOURCES, interfaces.OUT)):
+            if number:
+                features = self.down[number - 1](features, strided[number - 1])
+            if number < len(same):
+                for layer in self.same[number].children():
+                    features = layer(features, same[number])
+            found[name] = features
+        return tuple(found[name] for name in self.levels)
+
+
+class _Keypoints(nn.Module):
+    """Voxel set abstraction and keypoint weighting with one argument for each input of the graph."""
+
+    def __init__(self, encode: KeypointEncoder, settings: VoxelSetSettings) -> None:
+        super().__init__()
+        self.encode, self.settings = encode, settings
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        points, keypoints, bev, *rest = inputs
+        rows, indices, centers, left = [], [], [], iter(rest)
+        for each in self.settings.sources:
+            if each.source == "points":
+                rows.append(SourceRows(points[:, :3], points[:, 3:]))
+            else:
+                features = next(left)
+                rows.append(SourceRows(next(left), features))
+            indices += [next(left) for _ in each.radii_m]
+            places = [next(left) for _ in range(self.settings.places(each))] or [keypoints]
+            centers += [places[min(ball, len(places) - 1)] for ball in range(len(each.radii_m))]
+        features, _ = self.encode(rows, keypoints, bev, indices, centers)
+        return features
+
+
+class _Deform(nn.Module):
+    """The shifts of all deformed sources, likewise."""
+
+    def __init__(self, network: PvRcnn) -> None:
+        super().__init__()
+        self.deform, self.settings = network.deform, network.settings
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        keypoints, *rest = inputs
+        left, places = iter(rest), []
+        for each in self.settings.deformed:
+            features, positions = next(left), next(left)
+            balls = [next(left) for _ in each.radii_m]
+            nearest = (next(left), next(left)) if self.settings.nearest_wanted else ()
+            places += self.deform[each.source](Surroundings(features, positions, keypoints, balls, *nearest))
+        return tuple(places)
+
+
+class _Refine(nn.Module):
+    """The second stage's head, likewise."""
+
+    def __init__(self, head: RoiHead) -> None:
+        super().__init__()
+        self.head = head
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        keypoints, features, grid_points, *indices = inputs
+        found: tuple[Tensor, Tensor] = self.head(keypoints, features, grid_points, indices)
+        return found

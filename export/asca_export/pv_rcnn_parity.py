@@ -1,0 +1,104 @@
+"""The proof that a pv_rcnn bundle is the trained model: graph by graph on the same inputs, then the boxes."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from asca_deploy.bundle import Parity
+from asca_deploy.pv_rcnn_graphs import OUT, balls_around
+from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
+from asca_deploy.voxel_canvas import VoxelCanvas
+from asca_export.parity import YAW_TOLERANCE_RAD, nearest_partners, require_close
+from asca_pillars.errors import ExportError
+from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
+from asca_pillars.models.pv_rcnn.voxel_batch import VoxelBatch, batch_scans
+from asca_pillars.points.anchor_proposals import propose_anchors
+from asca_pillars.points.bilinear import read_map
+from asca_pillars.points.refine_geometry import grid_neighbors
+from asca_pillars.points.refined_detections import reported_detections
+from asca_pillars.points.voxel_scan import LEVEL_SOURCES, voxel_scan
+
+RELATIVE_TOLERANCE = 1e-4  # of what a graph gives, to its largest value where that is above 1
+
+Array = NDArray[np.float32]
+
+
+def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequence[Array]) -> Parity:
+    """Compare every stage in PyTorch with the exported graph on what PyTorch gave for the stage before.
+
+    A proposal that one side has and the other lacks, by a tie between scores, would hide what a graph does.
+
+    Args:
+        network: in evaluation mode.
+        runtime: opened on the bundle.
+        scans: (N, 4) each, at least one of them with points in the ranges.
+
+    Raises:
+        ExportError: they differ; names the first stage that does, and the scan.
+    """
+    worst = worst_box = worst_yaw = 0.0
+    spec, builder, compared = network.spec, network.spec.table_builder(), 0
+    every_box = spec.with_score_threshold(0.0)
+    every_box = replace(every_box, post=replace(every_box.post, nms_iou=1.0, max_detections=10_000))
+    for number, points in enumerate(scans):
+        scan = voxel_scan(points[np.isfinite(points).all(axis=1)], spec, network.settings, builder)
+        if not len(scan.features):
+            continue
+        compared += 1
+        batch = batch_scans([scan], spec)
+        with torch.inference_mode():
+            first = network.propose(batch)
+            described, _ = network.describe(batch, first.levels, first.canvas)
+        levels = dict(zip((*LEVEL_SOURCES, OUT), (level.numpy() for level in first.levels), strict=True))
+        for name, found in runtime.encode(scan).items():
+            worst = max(worst, _require(f"voxels `{name}`", levels[name], found, number))
+        canvas = VoxelCanvas(spec.level_shapes[-1], first.canvas.shape[3])
+        canvas.scatter(levels[OUT], scan.levels[-1].cells)
+        worst = max(worst, _require("scatter", first.canvas.numpy(), canvas.image, number))
+        maps = HeadMaps(*(part[0].numpy() for part in first.maps))
+        for name, wanted, found in zip(maps._fields, maps, runtime.neck_and_head(canvas.image), strict=True):
+            worst = max(worst, _require(f"head `{name}`", wanted, found, number))
+        bev = read_map(canvas.rows, scan.bev_cells, scan.bev_weights)
+        features = described.numpy()
+        places = _places(network, batch, first.levels)
+        for name, found in runtime.deform(scan, levels).items():
+            worst = max(worst, _require(f"deform `{name}`", places[name], found, number))
+        # PyTorch's places for both sides: the last bit of one decides which voxels lie in its ball.
+        found = runtime.describe(scan, levels, bev, places, balls_around(scan, network.settings, places))
+        worst = max(worst, _require("keypoints", features, found, number))
+        proposals = propose_anchors(maps, spec, network.settings.proposals)
+        grid = grid_neighbors(scan.keypoints, proposals.boxes, network.settings)
+        with torch.inference_mode():
+            indices = [torch.from_numpy(part) for part in grid.indices]
+            refined = network.refine(batch.keypoints, described, torch.from_numpy(grid.points), indices)
+        ours, theirs = tuple(part.numpy() for part in refined), runtime.refine(scan.keypoints, features, grid)
+        for name, wanted, found in zip(("confidence", "residuals"), ours, theirs, strict=True):
+            worst = max(worst, _require(f"refine `{name}`", wanted, found, number))
+        boxes, partners = (reported_detections(proposals, c, r, every_box) for c, r in (ours, theirs))
+        difference, lone = nearest_partners(boxes, partners)
+        if len(lone):
+            raise ExportError(
+                f"scan {number}: stage decode: {len(lone)} refined boxes have no partner within "
+                f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees and a centimetre"
+            )
+        worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
+    if not compared:
+        raise ExportError("none of the scans given to prove parity on has a point in the model's ranges; give others")
+    return Parity(worst, worst_box, worst_yaw, compared, RELATIVE_TOLERANCE)
+
+
+def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[torch.Tensor]) -> dict[str, Array]:
+    """What PyTorch says of the shifted keypoints, by the names of the graph's outputs."""
+    with torch.inference_mode():
+        places = network.deformed_places(batch, levels)
+    return {f"{name}_place_{number}": each.numpy() for name, own in places.items() for number, each in enumerate(own)}
+
+
+def _require(stage: str, expected: Array, found: Array, scan: int) -> float:
+    """The largest difference, relative to the largest value where that is above 1."""
+    scale = max(1.0, float(np.abs(expected).max(initial=0.0)))
+    return require_close(stage, expected, found, RELATIVE_TOLERANCE * scale, scan) / scale

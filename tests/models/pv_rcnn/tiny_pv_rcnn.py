@@ -1,0 +1,93 @@
+"""PV-RCNN on a grid so coarse and with so few channels that it is trained in seconds, and frames for it."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+
+from asca_pillars.config import Config, DataConfig, TrainConfig
+from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.geometry.decode import PostProcess
+from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector, build_pv_rcnn_detector
+from asca_pillars.models.pv_rcnn.voxel_batch import LabeledVoxels
+from asca_pillars.points.anchor_proposals import AnchorProposals
+from asca_pillars.points.voxel_scan import SourceBalls, VoxelSetSettings
+from asca_pillars.pv_rcnn_config import PvRcnnModel, PvRcnnNetwork
+from asca_pillars.tables.voxel_spec import VoxelSpec
+from asca_pillars.tables.voxels import VoxelGrid
+from tests.scenes import make_scene
+
+SPEC = VoxelSpec(
+    post=PostProcess(nms_iou=0.1),
+    grid=VoxelGrid((4.8, 25.6), (-6.4, 8.0), (-3.0, 1.0), (0.2, 0.2, 0.1)),
+    last_stride=1,
+    anchor_places="cells",
+)
+SETTINGS = VoxelSetSettings(
+    keypoints=96,
+    sources=(
+        SourceBalls("points", (0.6, 1.2), (6, 6)),
+        SourceBalls("conv2", (1.2,), (6,)),
+        SourceBalls("conv4", (2.4,), (8,)),
+    ),
+    proposals=AnchorProposals(candidates=200, nms_iou=0.7, count=24),
+    grid_size=3,
+    grid_radii_m=(0.8, 1.6),
+    grid_samples=6,
+)
+NETWORK = PvRcnnNetwork(
+    voxel_channels=(4, 6, 8, 8, 12),
+    block_channels=(16, 24),
+    block_convs=(1, 1),
+    upsample_channels=16,
+    source_widths=((8, 8), (8, 8), (8, 8)),
+    keypoint_channels=16,
+    weighting_channels=16,
+    grid_widths=(16, 16),
+    hidden=32,
+    dropout=0.0,
+)
+VARIANTS: dict[str, dict[str, Any]] = {
+    "published": {},
+    "gate": {"network": dataclasses.replace(NETWORK, gate="keypoint")},
+    "dual attention": {"network": dataclasses.replace(NETWORK, attention="dual")},
+    "residual dual attention": {"network": dataclasses.replace(NETWORK, attention="rda")},
+    "distance IoU": {"box_loss": "va"},
+    "deformed": {"settings": dataclasses.replace(SETTINGS, deform="paper")},
+    "deformed as the authors": {"settings": dataclasses.replace(SETTINGS, deform="authors")},
+}
+"""What differs from `MODEL`."""
+EVERYTHING: dict[str, Any] = {
+    "network": dataclasses.replace(NETWORK, gate="keypoint", attention="rda"),
+    "settings": dataclasses.replace(SETTINGS, deform="paper"),
+    "box_loss": "va",
+}
+MODEL = PvRcnnModel(
+    spec=SPEC,
+    settings=SETTINGS,
+    network=NETWORK,
+    training_proposals=AnchorProposals(candidates=400, nms_iou=0.8, count=64),
+    rois=24,
+)
+
+
+def tiny_detector(**changes: Any) -> PvRcnnDetector:
+    """The same random weights each time."""
+    torch.manual_seed(0)
+    return build_pv_rcnn_detector(dataclasses.replace(MODEL, **changes))
+
+
+def frame(seed: int) -> LabeledFrame:
+    points, boxes, _ = make_scene(seed)
+    return LabeledFrame(f"{seed:06d}", points, boxes, np.array([0, 0, 1, 2]))
+
+
+def batch(detector: PvRcnnDetector, *frames: LabeledFrame) -> LabeledVoxels:
+    return detector.preparation.collate([detector.preparation.prepare(each, None) for each in frames])
+
+
+def tiny_config(model: PvRcnnModel = MODEL, **recipe: Any) -> Config:
+    """Two epochs of two frames a step."""
+    train = {"epochs": 2, "batch_size": 2, "learning_rate": 1e-2, "checkpoint_steps": 1} | recipe
+    return Config(name="tiny_pv_rcnn", model=model, data=DataConfig(workers=0), train=TrainConfig(**train))

@@ -1,0 +1,56 @@
+"""PV-RCNN through the same training as the other families: resume, evaluation of a checkpoint, what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.config import Config, load_config, pillar_spec
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.errors import ConfigError
+from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.schema import parse, to_dict
+from asca_pillars.training.loop import train
+from tests.models.pv_rcnn.tiny_pv_rcnn import SPEC, tiny_config
+from tests.scenes import write_dataset
+
+
+def test_a_run_made_longer_is_the_longer_run(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 5)
+    straight = load_checkpoint(train(tiny_config(), data, tmp_path / "straight"))
+    train(tiny_config(epochs=1), data, tmp_path / "resumed")
+    resumed = load_checkpoint(train(tiny_config(), data, tmp_path / "resumed"))
+    assert straight.steps == resumed.steps == 4
+    for (name, expected), found in zip(
+        straight.detector.state_dict().items(), resumed.detector.state_dict().values(), strict=True
+    ):
+        torch.testing.assert_close(found, expected, msg=name, rtol=0, atol=0)
+    points = KittiSplit(data, "val").points("000004", camera_view=True)
+    detect = ScanDetector(resumed.detector, SPEC.with_score_threshold(0.0))
+    found = detect(points)
+    assert len(found) > 0 and np.isfinite(found.boxes).all()
+    assert len(detect(np.empty((0, 4), np.float32))) == 0
+
+
+def test_a_configuration_comes_back_from_its_file() -> None:
+    config = load_config("pvrcnn_small_sim")
+    assert parse(Config, to_dict(config), "config.yaml") == config
+    assert config.model.kind == "pv_rcnn"
+
+
+def test_what_cannot_be() -> None:
+    for override, message in (
+        ("model.rois=1", "model.rois = 1: must be at least 2"),
+        ("model.spec.grid.size_m=[0.1, 0.1, 0.05]", "81 voxels along z are more than 64"),
+        ("model.spec.grid.y_range_m=[-30.3, 30.3]", "606 voxels along y must be a multiple of 8"),
+        ("model.settings.sources=[{source: conv5, radii_m: [1], samples: [2]}]", "conv5"),
+        ("model.settings.keypoint=3", "did you mean `keypoints`"),
+        ("model.network.source_widths=[[8]]", "give one for each of model.settings.sources"),
+        ("model.kind=pvrcnn", "input should be"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load_config("pvrcnn_small_sim", [override])
+    with pytest.raises(ConfigError, match=r"model.kind = pv_rcnn: has no pillars"):
+        pillar_spec(load_config("pvrcnn_small_sim"))
