@@ -155,7 +155,7 @@ class VoxelizedScan(NamedTuple):
 
 
 def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelTableBuilder) -> VoxelizedScan:
-    """Voxels and tables of finite points (N, 4), see `voxel_scan`."""
+    """Voxels and tables of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
     voxels = voxelize(points, spec.grid, builder.maps[0])
     counts = ScanCounts(len(points), voxels.points_outside, 0)
     return VoxelizedScan(voxels.features, tuple(builder.build()), counts)
@@ -164,7 +164,7 @@ def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelTab
 def with_neighbors(
     points: NDArray[np.float32], voxelized: VoxelizedScan, spec: VoxelSpec, settings: VoxelSetSettings
 ) -> VoxelScan:
-    """Keypoints among the points (N, 4) and what lies around them, see `voxel_scan`."""
+    """Keypoints among the points (N, 4), metres, LiDAR frame, and what lies around them, see `voxel_scan`."""
     features, levels, counts = voxelized
     inside = np.ascontiguousarray(points[spec.grid.inside(points)])
     keypoints = np.ascontiguousarray(inside[farthest_points(inside, settings.keypoints), :3])

@@ -147,7 +147,7 @@ class PvRcnn(nn.Module):
         return features, logits
 
     def deformed_places(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
-        """Around which places (K, 3) keypoints look at each deformed source: one, or one for each radius."""
+        """Around which places (K, 3), metres, keypoints look at each deformed source: one, or one for each radius."""
         places, first = {}, 0
         for number, each in enumerate(self.settings.sources):
             balls = batch.ball_indices[first : first + len(each.radii_m)]
