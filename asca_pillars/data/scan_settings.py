@@ -86,7 +86,7 @@ class ScanSettings(Strict):
 
 
 def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
-    """Points (N, >=3), metres, of up to SAMPLE_SCANS of the scans, evenly spaced; those that cannot be read are left out."""
+    """Points (N, >=3), metres, of up to SAMPLE_SCANS scans, evenly spaced; unreadable ones are left out."""
     for path in paths[:: max(-(-len(paths) // SAMPLE_SCANS), 1)]:
         try:
             yield read(path)

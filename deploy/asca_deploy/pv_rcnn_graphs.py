@@ -139,7 +139,7 @@ def deform_inputs(
 def balls_around(
     scan: VoxelScan, settings: VoxelSetSettings, places: Mapping[str, NDArray[np.float32]]
 ) -> list[list[NDArray[np.int32]]]:
-    """Of each source and radius the indices (K, samples) of the rows that a keypoint aggregates, around places (K, 3), metres, by name."""
+    """Of each source and radius the indices (K, samples) that a keypoint aggregates, around places (K, 3), metres."""
     balls = []
     for number, each in enumerate(settings.sources):
         count = settings.places(each)

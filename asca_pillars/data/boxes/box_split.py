@@ -143,7 +143,7 @@ class BoxSplit:
         self.frame_ids  # noqa: B018
 
     def points(self, frame_id: str, *, camera_view: bool = False) -> NDArray[np.float32]:
-        """(N, 4) of the scan in the level frame, metres and reflectance; with `camera_view` those within the labelled angle."""
+        """(N, 4) of the scan, metres, level frame; with `camera_view` those within the labelled angle."""
         points = self._levelled(self._read(self.scan_path(frame_id)))
         if camera_view and self.has_camera:
             points = points[_within(points, self.settings.labeled_view_deg)]

@@ -97,7 +97,7 @@ def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch[Tenso
 def deformed_balls(
     batch: VoxelBatch[Tensor], settings: VoxelSetSettings, places: Mapping[str, Sequence[Tensor]]
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Indices of rows (K, samples) and centers (K, 3), metres, of all balls; those of deformed sources around `places`, on the host."""
+    """Indices (K, samples) and centers (K, 3), metres, of all balls; deformed sources' around `places`."""
     indices, centers, given = [], [], iter(batch.ball_indices)
     for number, each in enumerate(settings.sources):
         for radius, (radius_m, samples) in enumerate(zip(each.radii_m, each.samples, strict=True)):
