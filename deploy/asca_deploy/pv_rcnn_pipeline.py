@@ -19,6 +19,7 @@ from asca_deploy.pv_rcnn_graphs import (
     balls_around,
     deform_inputs,
     deform_interface,
+    keeps_memory,
     keypoint_inputs,
     keypoints_interface,
     map_channels,
@@ -108,9 +109,7 @@ class PvRcnnPipeline:
             digits: providers.Precision = "float32",
         ) -> Session:
             path = folder / bundle.graphs[name].file
-            # Whole scans at full size took 2.0 GB at their peak with kept memory and take 0.8 GB without, for 15 % more
-            # time: gathered rows are hundreds of MB, of another number in every scan.
-            session = providers.open_session(path, where, digits, threads, keep_memory=False)
+            session = providers.open_session(path, where, digits, threads, keep_memory=keeps_memory(bundle.pv_rcnn))
             return check_interface(path, session, *interface)
 
         self._voxels = opened(VOXELS, voxels_interface(bundle))

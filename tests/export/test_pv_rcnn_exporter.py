@@ -17,20 +17,22 @@ import pytest
 import torch
 
 from asca_deploy import Detector
-from asca_deploy.bundle import DEFORM, GRAPHS, MANIFEST, PvRcnnBundle
+from asca_deploy.bundle import DEFORM, GRAPHS, MANIFEST, PvRcnnBundle, PvRcnnSection
 from asca_deploy.manifest import load_any_bundle, load_bundle
-from asca_deploy.pv_rcnn_graphs import balls_around, deform_inputs
+from asca_deploy.pv_rcnn_graphs import balls_around, deform_inputs, keeps_memory
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.voxel_canvas import VoxelCanvas
 from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
 from asca_export.pv_rcnn_forms import export_deform
 from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
+from asca_pillars.config import load_config
 from asca_pillars.errors import BundleError, ExportError
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
 from asca_pillars.models.pv_rcnn.voxel_batch import batch_scans
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.points.voxel_scan import SourceBalls, voxel_scan
+from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.training.loop import train
 from tests.export.test_refine_exporter import DETECT
 from tests.export.tiny import SCANS, tiny_checkpoint
@@ -112,6 +114,16 @@ def test_a_canvas_forgets_the_scan_before() -> None:
         wanted[cells] = features
         np.testing.assert_array_equal(canvas.image.reshape(24, 3), wanted)
     assert np.shares_memory(canvas.rows, canvas.image) and canvas.rows.shape == (12, 6)
+
+
+def test_large_networks_give_their_memory_back() -> None:
+    kept = {}
+    for name in ("pv_rcnn_kitti", "pvrcnn_small_sim"):
+        model = load_config(name).model
+        assert isinstance(model, PvRcnnModel)
+        network = model.network
+        kept[name] = keeps_memory(PvRcnnSection(network.voxel_channels, network.keypoint_channels, model.settings))
+    assert kept == {"pv_rcnn_kitti": False, "pvrcnn_small_sim": True}
 
 
 def changed_manifest(folder: Path, out: Path, change: Callable[[Any], object]) -> Path:
