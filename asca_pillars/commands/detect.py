@@ -9,6 +9,7 @@ from asca_pillars.commands.options import (
     AroundOption,
     AxesOption,
     BundleOption,
+    ClusterOption,
     ColumnsOption,
     PoseOption,
     PrecisionOption,
@@ -19,7 +20,7 @@ from asca_pillars.commands.options import (
     SensorHeightOption,
     ThreadsOption,
 )
-from asca_pillars.errors import ScanError
+from asca_pillars.errors import ConfigError, ScanError
 
 TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
 
@@ -34,8 +35,12 @@ def detect(
         typer.Option("--score", help="Report detections from this score on. Default: the bundle's, per class."),
     ] = None,
     pictures: Annotated[
-        bool, typer.Option("--pictures/--no-pictures", help="Draw a bird's-eye picture of each scan; without, faster.")
-    ] = True,
+        bool | None,
+        typer.Option(
+            "--pictures/--no-pictures",
+            help="Draw a bird's-eye picture of each scan; without, faster. Default: drawn, but not with --cluster.",
+        ),
+    ] = None,
     provider: ProviderOption = "cpu",
     precision: PrecisionOption = None,
     threads: ThreadsOption = None,
@@ -45,6 +50,7 @@ def detect(
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
 
@@ -54,11 +60,15 @@ def detect(
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
 
+    With --cluster only OUT/detections.jsonl is written, and the same command goes on where a broken run stopped.
+
     Examples:
 
     asca detect drive1/ drive2/ --out results --no-pictures
 
     asca detect sweeps/ --around --axes y-forward --sensor-height auto
+
+    asca detect /mnt/archive --out /mnt/boxes --cluster local
     """
     import logging
     import sys
@@ -82,12 +92,20 @@ def detect(
     )
     scan_input = ScanInput(settings, [path for path, _ in named])
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    if cluster is not None:
+        from asca_pillars.commands.detect_archive import detect_archive
+
+        if pictures:
+            raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
+        paths = [path for path, _ in named]
+        detect_archive(paths, scan_input, settings, options, out, score=score, around=around, address=cluster)
+        return
     detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     results: list[show.Result] = []
     unreadable = 0
-    with ResultWriter(out, pictures=pictures) as write:
+    with ResultWriter(out, pictures=pictures is not False) as write:
         for path, name in track(named, "Detecting", console=console, disable=len(named) == 1):
             try:
                 scan = scan_input.read(path)

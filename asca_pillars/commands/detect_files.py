@@ -52,9 +52,9 @@ class ResultWriter:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
         if self._lines is None:
             self._lines = self._open()
-        content = _content(path, scan, detections)
+        content = scan_content(path, scan, detections)
         write_json(self._named(name, ".json"), content)
-        self._lines.write(json.dumps(content) + "\n")
+        self._lines.write(as_line(content))
         if self._pictures:
             write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=self._labels(path)))
         calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
@@ -96,7 +96,13 @@ def _write_kitti(path: Path, detections: Detections, calibration: Calibration, i
         temporary.write_text(detections.to_kitti(calibration, size_wh), encoding="utf-8")
 
 
-def _content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
+def as_line(content: dict[str, Any]) -> str:
+    """A line of `detections.jsonl`, with its end."""
+    return json.dumps(content) + "\n"
+
+
+def scan_content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
+    """What is written of one scan, as plain values; `path` names it."""
     report, notes = detections.report, scan.notes
     return {
         "scan": str(path),

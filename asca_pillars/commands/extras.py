@@ -10,6 +10,7 @@ EXTRAS = {
     "openvino": ("openvino",),
     "eval": ("matplotlib",),
     "import": ("pyarrow",),
+    "cluster": ("ray",),
 }
 
 

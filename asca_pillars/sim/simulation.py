@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import track
 
+from asca_pillars.cluster.run_shards import run_each
 from asca_pillars.data.kitti import (
     Calibration,
     KittiObject,
@@ -31,6 +32,9 @@ from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import measure
 from asca_pillars.sim.world.scene import build, draw_scene
+
+_ABOUT = "simulation.json"
+_SHARD_FRAMES = 20  # of a cluster's worker: a second or two
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,8 @@ def simulate(
     config: SimulationConfig | None = None,
     val_share: float = 0.1,
     progress: bool = True,
+    *,
+    cluster: str | None = None,
 ) -> Path:
     """Write `frames` labelled frames below `out` in KITTI's layout; returns `out`.
 
@@ -94,7 +100,18 @@ def simulate(
     bytes. A run that was interrupted, or asked for fewer frames, goes on where it stopped; simulation.json in the
     folder tells what it holds.
 
+    Args:
+        out: the folder; with a cluster, one that every machine mounts at the same place.
+        frames: how many.
+        seed: of the whole data set.
+        workers: processes, without a cluster.
+        config: what to simulate.
+        val_share: 0..1.
+        progress: whether it is shown.
+        cluster: address of a Ray cluster that does the work, `local` for one on this machine; None: processes.
+
     Raises:
+        ClusterError: the cluster cannot be used, or a frame ended each process that worked on it.
         ConfigError: a number of frames or workers below 1, or a share outside 0..1.
         DatasetError: `out` holds frames of another seed or configuration.
     """
@@ -107,8 +124,19 @@ def simulate(
     _claim_folder(root, seed, config)
     split = KittiSplit(root)
     todo = [index for index in range(frames) if not _is_complete(split, index)]
-    job = partial(_write_frame, root, seed, config)
-    if workers > 1 and len(todo) > 1:
+    job = partial(_write_frame, root.absolute(), seed, config)
+    if cluster is not None:
+        run_each(
+            job,
+            todo,
+            cluster,
+            shard_size=_SHARD_FRAMES,
+            seen=root / _ABOUT,
+            folders=[split.folder / name for name in ("velodyne", "label_2", "calib")],
+            title="Simulating",
+            progress=progress,
+        )
+    elif workers > 1 and len(todo) > 1:
         # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
         with (
             _one_thread_per_process(),
@@ -131,7 +159,7 @@ def frame_id(index: int) -> str:
 
 def _claim_folder(root: Path, seed: int, config: SimulationConfig) -> None:
     """Note in simulation.json what the frames of a folder depend on; refuse a folder of other frames."""
-    path = root / "simulation.json"
+    path = root / _ABOUT
     text = json.dumps({"seed": seed, **asdict(config)}, indent=2) + "\n"
     if not path.exists():
         scans = KittiSplit(root).folder / "velodyne"
