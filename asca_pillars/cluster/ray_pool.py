@@ -19,6 +19,7 @@ LOCAL = "local"
 _OBJECT_STORE_BYTES = 100 * 2**20  # nothing but names and counts passes through it
 _LEAST_IN_FLIGHT = 8
 _RESOURCES_HOLD_S = 10.0
+_CONNECT_S = 10.0
 
 
 @contextlib.contextmanager
@@ -33,6 +34,7 @@ def connected(address: str) -> Iterator[str]:
 
     own = {"num_cpus": default_threads(), "include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES}
     try:
+        _knock(address)
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **(own if address == LOCAL else {}))
     except (OSError, RuntimeError, ValueError) as error:
         reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
@@ -88,6 +90,13 @@ class RayPool(Generic[Result]):
             return []
         ended, _ = ray.wait(list(self._running), num_returns=1)
         return [_outcome(reference, self._running.pop(reference)) for reference in ended]
+
+
+def _knock(address: str) -> None:
+    """Raise OSError if nothing listens at HOST:PORT: Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
 
 
 def _outcome(reference: Any, shard: Shard) -> Outcome[Any]:

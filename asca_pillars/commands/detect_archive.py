@@ -218,7 +218,7 @@ def _job(
         mounting=mounting,
         around=around,
         columns=columns,
-        bundle_sha256=_sha256(bundle),
+        bundle_sha256=bundle_digest(bundle),
     )
 
 
@@ -241,11 +241,11 @@ def _detector(job: DetectShard) -> Detector:
     """Opened once in a worker's process."""
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # warnings are in the lines
     detector = open_detector(job.options, job.score, job.mounting, around=job.around)
-    if _sha256(detector.folder) != job.bundle_sha256:
+    if bundle_digest(detector.folder) != job.bundle_sha256:
         raise BundleError(f"{detector.folder}: is another bundle than the command's; give every machine the same one")
     return detector
 
 
-def _sha256(bundle: Path) -> str:
-    """Of the manifest, which holds those of the graphs."""
+def bundle_digest(bundle: Path) -> str:
+    """SHA-256 of the manifest, which holds those of the graphs."""
     return hashlib.sha256((bundle / MANIFEST).read_bytes()).hexdigest()
