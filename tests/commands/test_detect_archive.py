@@ -13,7 +13,7 @@ from asca_pillars.cluster.shards import Shard
 from asca_pillars.commands import detect_archive as archive
 from asca_pillars.commands import extras
 from asca_pillars.commands.detect import detect
-from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError, BundleError, ConfigError, OutputError, ScanError
 from tests.deploy.conftest import make_scan, write_bundle
 
@@ -174,14 +174,12 @@ def test_a_scan_that_ends_its_worker_is_a_line(
 def test_an_error_that_nobody_foresaw_is_a_line(
     scans: Path, bundle: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read = archive.read_scan
-
     def fail(path: Path, **options: Any) -> Any:
         if path.name == "3.bin":
             raise ZeroDivisionError("a bug")
-        return read(path, **options)
+        return read_scan(path, **options)
 
-    monkeypatch.setattr(archive, "read_scan", fail)
+    monkeypatch.setattr(f"{archive.__name__}.read_scan", fail)
     with pytest.raises(ScanError, match="2 of 40"):
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
     assert '{"error": "ZeroDivisionError: a bug"' in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
