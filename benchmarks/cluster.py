@@ -8,11 +8,12 @@ cluster undisturbed, and on the cluster while the second node is killed (SIGKILL
 work is there. What is written has to be the same bytes each time. Scans have 300 points and the model has random
 weights and a tiny grid, so that the cost of the cluster is not lost beside that of the network.
 
-Costs are processor time of all processes below this one, looked at 20 times a second. That of a scan is without the
-start of the processes: what a run costs more than one of a few scans. The work itself is what a worker does for a
-shard, measured in this process: read, detect, write. The cost of the cluster is the difference.
+Costs are processor time, of the command, of the workers (with their start) and of Ray's own processes, looked at 20
+times a second. The work itself is what a worker does for a shard, measured in this process: read, detect, write. What
+the undisturbed run takes beyond it is the cost of the cluster.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -37,26 +38,26 @@ from asca_pillars.data.scans.scan_reader import write_scan
 from tests.deploy.conftest import make_scan, write_bundle
 
 POINTS = 300
-START_SCANS = 32  # of the run whose cost is that of starting
 POLL_S = 0.05
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
+AT_WORK = "ray::_on_worker"  # what a worker's process is called while it is at a shard
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
 class Run:
-    """A command that ran: seconds of processor time and of wall time, and what it printed."""
+    """A command that ran: seconds of processor time by kind of process, seconds of wall time, and what it printed."""
 
-    cpu_s: float
+    cpu_s: dict[str, float]
     wall_s: float
     text: str
 
 
 class CpuMeter:
-    """Processor time of all processes below this one, also of those that have ended."""
+    """Processor time of all processes below this one, also of those that have ended: workers, Ray's own, others."""
 
     def __enter__(self) -> "CpuMeter":
-        self._first, self._last = self._look(), dict[tuple[int, int], float]()
+        self._first, self._last = self._look(), dict[tuple[str, int, int], float]()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
@@ -68,30 +69,67 @@ class CpuMeter:
         self._last |= self._look()
 
     @property
-    def seconds(self) -> float:
-        """Since the block was entered."""
-        return sum(seconds - self._first.get(process, 0.0) for process, seconds in self._last.items())
+    def seconds(self) -> dict[str, float]:
+        """Since the block was entered, by kind."""
+        sums = dict.fromkeys(("command", "workers", "Ray"), 0.0)
+        for process, seconds in self._last.items():
+            sums[process[0]] += seconds - self._first.get(process, 0.0)
+        return {kind: round(seconds, 2) for kind, seconds in sums.items()}
 
     def _watch(self) -> None:
         while not self._stop.wait(POLL_S):
             self._last |= self._look()
 
     @staticmethod
-    def _look() -> dict[tuple[int, int], float]:
-        parents, seconds, ids = {}, {}, {}
-        for path in Path("/proc").glob("[0-9]*/stat"):
-            try:
-                fields = path.read_text().rpartition(")")[2].split()
-            except OSError:  # it has ended
-                continue
-            number = int(path.parent.name)
-            parents[number], ids[number] = int(fields[1]), (number, int(fields[19]))
-            seconds[number] = (int(fields[11]) + int(fields[12])) / _TICKS
-        below = {os.getpid()}
-        for number in sorted(parents, key=lambda one: ids[one][1]):  # parents are older
-            if parents[number] in below:
-                below.add(number)
-        return {ids[number]: seconds[number] for number in below - {os.getpid()}}
+    def _look() -> dict[tuple[str, int, int], float]:
+        found = {}
+        for number, fields in _processes_below(os.getpid()).items():
+            seconds = (int(fields[11]) + int(fields[12])) / _TICKS
+            found[_kind(_command_line(number)), number, int(fields[19])] = seconds
+        return found
+
+
+def _kind(command_line: str) -> str:
+    if "asca_pillars.cli" in command_line:
+        return "command"
+    return "workers" if _is_worker(command_line) else "Ray"
+
+
+def _is_worker(command_line: str) -> bool:
+    return command_line.startswith((AT_WORK, "ray::IDLE")) or "default_worker.py" in command_line
+
+
+def _processes_below(root: int) -> dict[int, list[str]]:
+    """Processes that descend from `root`: what /proc/ID/stat says after their names."""
+    stats = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            stats[int(path.parent.name)] = path.read_text().rpartition(")")[2].split()
+    below = {root}
+    for number in sorted(stats, key=lambda one: int(stats[one][19])):  # parents are older
+        if int(stats[number][1]) in below:
+            below.add(number)
+    return {number: stats[number] for number in below - {root} if number in stats}
+
+
+def _command_line(number: int) -> str:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{number}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    return ""
+
+
+def _kill_at_work(cluster: Any, node: Any) -> bool:
+    """Kill a node while a worker of it is at a shard; False, and nothing done, if none is just now."""
+    raylet = node.all_processes["raylet"][0].process.pid
+    for number in _processes_below(raylet):
+        if _command_line(number).startswith(AT_WORK):
+            os.kill(number, signal.SIGSTOP)
+            if _command_line(number).startswith(AT_WORK):  # and not at its end
+                os.kill(number, signal.SIGKILL)
+                cluster.remove_node(node, allow_graceful=False)
+                return True
+            os.kill(number, signal.SIGCONT)
+    return False
 
 
 def main(
@@ -121,43 +159,33 @@ def _detect(cluster: Any, root: Path, scans: int, console: Console) -> dict[str,
     bundle = write_bundle(root / "bundle")
     for number in range(scans):
         write_scan(root / "scans" / f"{number}.bin", make_scan(number, POINTS))
-        if number < START_SCANS:
-            write_scan(root / "few" / f"{number}.bin", make_scan(number, POINTS))
 
-    def command(out: str, source: str = "scans") -> list[str]:
-        return ["detect", str(root / source), "--out", str(root / out), "--bundle", str(bundle)]
+    def command(out: str) -> list[str]:
+        return ["detect", str(root / "scans"), "--out", str(root / out), "--bundle", str(bundle)]
 
     def shards(out: str) -> int:
         return sum(1 for _ in (root / out / "shards").glob("0*.jsonl"))
 
     work_ms = _work_itself(root, bundle)
-    one = ["--threads", "1", "--no-pictures"]
+    alone = _run([*command("alone"), "--threads", "1", "--no-pictures"])
     there = ["--cluster", cluster.address]
-    few, alone = _run(command("alone few", "few") + one), _run(command("alone") + one)
     node = cluster.add_node(**NODE)
-    started, whole = _run(command("few on cluster", "few") + there), _run(command("whole") + there)
-    wanted = shards("whole") // 2
-    killed = _run(
-        command("killed") + there,
-        when=lambda: shards("killed") >= wanted,
-        then=lambda: cluster.remove_node(node, allow_graceful=False),
-    )
+    whole = _run(command("whole") + there)
+    count = shards("whole")
+    killed = _run(command("killed") + there, lambda: shards("killed") >= count // 2 and _kill_at_work(cluster, node))
     results = {name: (root / name / "detections.jsonl").read_bytes() for name in ("alone", "whole", "killed")}
-    more = scans - START_SCANS
     figures = {
         "scans": scans,
         "results": len(results["killed"].splitlines()),
-        "shards": shards("whole"),
+        "shards": count,
         "undisturbed: the same": results["whole"] == results["alone"],
         "killed: the same": results["killed"] == results["alone"] and not _left(root / "killed"),
-        "killed when done": wanted / shards("whole"),
-        "begun again": next((line for line in killed.text.splitlines() if "begun again" in line), "nothing"),
-        "one process, CPU ms per scan": 1e3 * (alone.cpu_s - few.cpu_s) / more,
-        "the work itself, CPU ms per scan": work_ms,
-        "cluster, CPU ms per scan": 1e3 * (whole.cpu_s - started.cpu_s) / more,
-        "one process, CPU s to start": few.cpu_s,
-        "cluster, CPU s to start": started.cpu_s,
-        "wall s: one process / cluster / with a kill": [alone.wall_s, whole.wall_s, killed.wall_s],
+        "after the kill": next((line for line in killed.text.splitlines() if "begun again" in line), "nothing"),
+        "CPU ms per scan: one process": round(1e3 * alone.cpu_s["command"] / scans, 2),
+        "CPU ms per scan: the work itself": round(work_ms, 2),
+        "CPU ms per scan: cluster": round(1e3 * sum(whole.cpu_s.values()) / scans, 2),
+        "CPU s: cluster": whole.cpu_s,
+        "wall s: one process, cluster, with a kill": [round(run.wall_s, 1) for run in (alone, whole, killed)],
     }
     console.print(json.dumps(figures, indent=1))
     return figures
@@ -192,8 +220,7 @@ def _simulate(cluster: Any, root: Path, frames: int, console: Console) -> dict[s
     scans = root / "frames killed" / "training" / "velodyne"
     _run(
         [*command("frames killed"), "--cluster", cluster.address],
-        when=lambda: sum(1 for _ in scans.glob("0*.bin")) >= frames // 2,
-        then=lambda: cluster.remove_node(node, allow_graceful=False),
+        lambda: sum(1 for _ in scans.glob("0*.bin")) >= frames // 2 and _kill_at_work(cluster, node),
     )
     alone, killed = (_files(root / name) for name in ("frames alone", "frames killed"))
     figures = {"frames": frames, "frames killed: the same": alone == killed and not _left(root / "frames killed")}
@@ -201,11 +228,11 @@ def _simulate(cluster: Any, root: Path, frames: int, console: Console) -> dict[s
     return figures
 
 
-def _run(arguments: list[str], when: Callable[[], bool] | None = None, then: Callable[[], None] = lambda: None) -> Run:
-    """Run `asca ARGUMENTS`; do `then` once, as soon as `when` is true.
+def _run(arguments: list[str], kill: Callable[[], bool] | None = None) -> Run:
+    """Run `asca ARGUMENTS`, and `kill` again and again until it says that it has killed.
 
     Raises:
-        RuntimeError: the command failed, or `when` never was.
+        RuntimeError: the command failed, or ended before the kill.
     """
     start = time.perf_counter()
     with CpuMeter() as meter:
@@ -217,16 +244,15 @@ def _run(arguments: list[str], when: Callable[[], bool] | None = None, then: Cal
             start_new_session=True,
         )
         try:
-            while process.poll() is None and when is not None:
-                if when():
-                    then()
-                    when = None
+            while process.poll() is None and kill is not None:
+                if kill():
+                    kill = None
                 time.sleep(0.01)
             text, _ = process.communicate()
         except BaseException:
             os.killpg(process.pid, signal.SIGKILL)
             raise
-    if process.returncode or when is not None:
+    if process.returncode or kill is not None:
         raise RuntimeError(f"asca {' '.join(arguments)}: {text[-3000:] if process.returncode else 'ended too early'}")
     return Run(meter.seconds, time.perf_counter() - start, text)
 

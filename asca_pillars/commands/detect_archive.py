@@ -3,6 +3,8 @@
 import hashlib
 import json
 import logging
+import socket
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -23,8 +25,9 @@ from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.commands.scan_input import ScanInput
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scan_settings import ScanSettings
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import BundleError, ConfigError, ScanError
+from asca_pillars.data.scans.reflectance import ReflectanceScale
+from asca_pillars.data.scans.scan_reader import Scan, read_scan
+from asca_pillars.errors import BundleError, ClusterError, ConfigError, ScanError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict
 from asca_pillars.system import package_versions
@@ -35,11 +38,13 @@ _SHARD_SCANS = (16, 256)
 """Fewest and most. A shard of the most takes some ten seconds, so that little is done twice; the fewest make the cost
 of a shard small beside that of its scans."""
 _SHARDS_WANTED = 256
+READ_AGAIN_AFTER_S = (1.0, 5.0)
+"""Pauses before a scan that the system cannot read is tried again: network mounts have bad moments."""
 _ERROR = '{"error": '
 
 
 class Counts(NamedTuple):
-    """Of a shard: scans with results, and scans that could not be read."""
+    """Scans with results, and scans that could not be read."""
 
     detected: int
     unreadable: int
@@ -67,27 +72,41 @@ class DetectShard:
     columns: int | None
     bundle_sha256: str
 
-    def __call__(self, shard: Shard) -> Counts:
+    def __call__(self, shard: Shard) -> None:
         """Items are (path, reflectance scale).
 
         Raises:
-            AscaError: the detector cannot be opened here.
+            AscaError: the detector cannot be opened here, or a folder of scans not be seen.
             OSError: the results cannot be written.
         """
         detector = _detector(self)
-        lines = [self._line(detector, path, scale) for path, scale in shard.items]
+        lines = (self._line(detector, path, scale) for path, scale in shard.items)
         ShardFolder(self.shards).write(shard, lines)
-        unreadable = sum(line.startswith(_ERROR) for line in lines)
-        return Counts(len(lines) - unreadable, unreadable)
 
-    def _line(self, detector: Detector, path: str, scale: object) -> str:
+    def _line(self, detector: Detector, path: str, scale: ReflectanceScale) -> str:
         try:
-            scan = read_scan(self.start / path, columns=self.columns, reflectance_scale=scale)  # type: ignore[arg-type]
+            scan = self._read(self.start / path, scale)
             return as_line(scan_content(Path(path), scan, detector(scan.points)))
-        except (ScanError, OSError) as error:
+        except ClusterError:
+            raise
+        except ScanError as error:
             return error_line(path, str(error))
         except Exception as error:  # one scan in millions must not end a run of days
             return error_line(path, f"{type(error).__name__}: {error}")
+
+    def _read(self, path: Path, scale: ReflectanceScale) -> Scan:
+        for pause_s in (*READ_AGAIN_AFTER_S, None):
+            try:
+                return read_scan(path, columns=self.columns, reflectance_scale=scale)
+            except ScanError as error:
+                if not path.parent.is_dir():  # the command has seen it
+                    host = socket.gethostname()
+                    raise ClusterError(f"{host}: does not see {path.parent}; mount it on every machine") from None
+                system = error.__cause__
+                if pause_s is None or not isinstance(system, OSError) or isinstance(system, FileNotFoundError):
+                    raise
+                time.sleep(pause_s)
+        raise AssertionError("the last try returns or raises")
 
 
 def error_line(path: str, reason: str) -> str:

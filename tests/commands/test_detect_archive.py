@@ -1,7 +1,9 @@
 """`asca detect --cluster`: what its workers write and what becomes of it, with and without Ray."""
 
+import errno
 import json
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from asca_pillars.commands import detect_archive as archive
 from asca_pillars.commands import extras
 from asca_pillars.commands.detect import detect
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
-from asca_pillars.errors import AscaError, BundleError, ConfigError, OutputError, ScanError
+from asca_pillars.errors import AscaError, BundleError, ClusterError, ConfigError, OutputError, ScanError
 from tests.deploy.conftest import make_scan, write_bundle
 
 SCANS = 40
@@ -183,6 +185,41 @@ def test_an_error_that_nobody_foresaw_is_a_line(
     with pytest.raises(ScanError, match="2 of 40"):
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
     assert '{"error": "ZeroDivisionError: a bug"' in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+
+
+def test_a_bad_moment_of_the_mount_is_waited_out(
+    scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = Counter[str]()
+
+    def fail_at_first(path: Path, **options: Any) -> Any:
+        tries[path.name] += 1
+        if path.name in ("3.bin", "4.bin") and tries[path.name] < 3 + (path.name == "4.bin"):
+            raise ScanError(f"{path}: cannot be read") from OSError(errno.EIO, "Input/output error")
+        return read_scan(path, **options)
+
+    monkeypatch.setattr(archive, "READ_AGAIN_AFTER_S", (0.0, 0.0))
+    monkeypatch.setattr(f"{archive.__name__}.read_scan", fail_at_first)
+    with pytest.raises(ScanError, match="2 of 40"):
+        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
+    assert (tries["3.bin"], tries["4.bin"], tries[f"{BAD}.bin"]) == (3, 3, 1)
+    assert "4.bin: cannot be read" in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+
+
+def test_a_machine_that_does_not_see_the_scans_ends_the_run(
+    scans: Path, bundle: Path, here: Here, tmp_path: Path
+) -> None:
+    """Instead of a line for each scan that says it were not there."""
+    moved = Path(shutil.copytree(scans, tmp_path / "scans"))
+
+    def end(shard: Shard) -> Iterator[Outcome[Any]]:
+        moved.rename(tmp_path / "not mounted")
+        yield here.done(shard)
+
+    here.end = end
+    with pytest.raises(ClusterError, match=r"does not see .*scans; mount it on every machine"):
+        detect([moved], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
+    assert not list((tmp_path / "out" / "shards").glob("*.jsonl"))
 
 
 def test_a_machine_with_another_bundle_ends_the_run(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
