@@ -10,7 +10,8 @@ weights and a tiny grid, so that the cost of the cluster is not lost beside that
 
 Costs are processor time, of the command, of the workers (with their start) and of Ray's own processes, looked at 20
 times a second. The work itself is what a worker does for a shard, measured in this process: read, detect, write. What
-the undisturbed run takes beyond it is the cost of the cluster.
+the undisturbed run takes beyond it is the cost of the cluster; one more scan costs what the run costs more than a run
+over a quarter of the scans, in the command and the workers.
 """
 
 import contextlib
@@ -158,10 +159,11 @@ def main(
 def _detect(cluster: Any, root: Path, scans: int, console: Console) -> dict[str, Any]:
     bundle = write_bundle(root / "bundle")
     for number in range(scans):
-        write_scan(root / "scans" / f"{number}.bin", make_scan(number, POINTS))
+        for name in ("scans", "quarter of scans")[: 1 + (4 * number < scans)]:
+            write_scan(root / name / f"{number}.bin", make_scan(number, POINTS))
 
-    def command(out: str) -> list[str]:
-        return ["detect", str(root / "scans"), "--out", str(root / out), "--bundle", str(bundle)]
+    def command(out: str, source: str = "scans") -> list[str]:
+        return ["detect", str(root / source), "--out", str(root / out), "--bundle", str(bundle)]
 
     def shards(out: str) -> int:
         return sum(1 for _ in (root / out / "shards").glob("0*.jsonl"))
@@ -170,7 +172,8 @@ def _detect(cluster: Any, root: Path, scans: int, console: Console) -> dict[str,
     alone = _run([*command("alone"), "--threads", "1", "--no-pictures"])
     there = ["--cluster", cluster.address]
     node = cluster.add_node(**NODE)
-    whole = _run(command("whole") + there)
+    quarter, whole = _run(command("quarter", "quarter of scans") + there), _run(command("whole") + there)
+    more = [whole.cpu_s[kind] - quarter.cpu_s[kind] for kind in ("command", "workers")]
     count = shards("whole")
     killed = _run(command("killed") + there, lambda: shards("killed") >= count // 2 and _kill_at_work(cluster, node))
     results = {name: (root / name / "detections.jsonl").read_bytes() for name in ("alone", "whole", "killed")}
@@ -184,6 +187,7 @@ def _detect(cluster: Any, root: Path, scans: int, console: Console) -> dict[str,
         "CPU ms per scan: one process": round(1e3 * alone.cpu_s["command"] / scans, 2),
         "CPU ms per scan: the work itself": round(work_ms, 2),
         "CPU ms per scan: cluster": round(1e3 * sum(whole.cpu_s.values()) / scans, 2),
+        "CPU ms per scan: cluster, one more scan": round(1e3 * sum(more) / (scans - -(-scans // 4)), 2),
         "CPU s: cluster": whole.cpu_s,
         "wall s: one process, cluster, with a kill": [round(run.wall_s, 1) for run in (alone, whole, killed)],
     }
