@@ -33,6 +33,10 @@ class ExportError(AscaError):
     """An export whose graphs do not reproduce the trained model."""
 
 
+class ClusterError(AscaError):
+    """A cluster that cannot be reached, or whose machines are not set up alike."""
+
+
 class TrainingError(AscaError):
     """A training run that cannot start or must not go on."""
 

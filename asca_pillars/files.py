@@ -27,6 +27,7 @@ except ImportError:  # Windows: nothing is locked, so that leftovers of a killed
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.asca-[0-9a-f]{8}(?P<retired>-old)?(?:\.[^.]*)?")
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _cleared: set[Path] = set()  # folders whose leftovers this process has looked for
+_shares_folders = False
 
 
 @contextlib.contextmanager
@@ -140,13 +141,23 @@ def require_own(folder: str | Path, command: str, *markers: str, text: str = "")
         )
 
 
-def recover(folder: str | Path) -> None:
-    """Remove what killed writers left in `folder`; put back what one had moved aside and not replaced. Once a process.
+def share_folders() -> None:
+    """Let this process take nothing for a leftover: other machines write to its folders, too.
 
-    What a living process writes just now is left alone, and so is everything that has not our temporary names.
+    Not every network mount shows one machine the locks of another.
+    """
+    global _shares_folders
+    _shares_folders = True
+
+
+def recover(folder: str | Path, *, again: bool = False) -> None:
+    """Remove what killed writers left in `folder`; put back what one had moved aside and not replaced.
+
+    Once a process, unless `again`. What a living process writes just now is left alone, and so is everything that has
+    not our temporary names.
     """
     folder = Path(os.path.realpath(folder))
-    if folder in _cleared or fcntl is None or not folder.is_dir():
+    if _shares_folders or (folder in _cleared and not again) or fcntl is None or not folder.is_dir():
         return
     _cleared.add(folder)
     for path in sorted(folder.glob(".*.asca-*")):

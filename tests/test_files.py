@@ -277,6 +277,27 @@ def test_files_and_folders_are_synced_before_they_get_their_names(
     assert synced == [str(path) for path in wanted]
 
 
+def test_a_worker_beside_those_of_other_machines_clears_nothing_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The locks of another machine may not be seen here."""
+    monkeypatch.setattr(files, "_shares_folders", False)
+    recover(tmp_path)
+    left = tmp_path / ".a.asca-00000000.txt"
+    left.touch()
+    recover(tmp_path)
+    assert left.exists(), "once a process"
+    files.share_folders()
+    recover(tmp_path, again=True)
+    files._cleared.clear()
+    with atomic_path(tmp_path / "b.txt") as path:
+        path.write_text("b")
+    assert left.exists()
+    monkeypatch.setattr(files, "_shares_folders", False)
+    recover(tmp_path, again=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["b.txt"]
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
 def test_other_threads_keep_their_umask(tmp_path: Path) -> None:
     previous, stop, modes = os.umask(0o077), threading.Event(), set()

@@ -13,7 +13,7 @@ SHARED_NAMES = {"__init__.py", "conftest.py"}
 LAYERS = (  # what is in one of them imports from those before it
     {"errors"},
     {"files", "schema", "system", "yaml_text"},
-    {"geometry"},
+    {"cluster", "geometry"},
     {"pillars", "tables"},
     {"points"},
     {"bounds", "settings"},

@@ -9,6 +9,7 @@ from asca_pillars.commands.options import (
     AroundOption,
     AxesOption,
     BundleOption,
+    ClusterOption,
     ColumnsOption,
     PoseOption,
     PrecisionOption,
@@ -19,9 +20,7 @@ from asca_pillars.commands.options import (
     SensorHeightOption,
     ThreadsOption,
 )
-from asca_pillars.errors import ConfigError, ScanError
-
-TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
+from asca_pillars.errors import ConfigError
 
 
 def detect(
@@ -34,8 +33,12 @@ def detect(
         typer.Option("--score", help="Report detections from this score on. Default: the bundle's, per class."),
     ] = None,
     pictures: Annotated[
-        bool, typer.Option("--pictures/--no-pictures", help="Draw a bird's-eye picture of each scan; without, faster.")
-    ] = True,
+        bool | None,
+        typer.Option(
+            "--pictures/--no-pictures",
+            help="Draw a bird's-eye picture of each scan; without, faster. Default: drawn, but not with --cluster.",
+        ),
+    ] = None,
     provider: ProviderOption = "cpu",
     precision: PrecisionOption = None,
     threads: ThreadsOption = None,
@@ -66,6 +69,7 @@ def detect(
         Path | None,
         typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
     ] = None,
+    cluster: ClusterOption = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
 
@@ -78,6 +82,8 @@ def detect(
     A recording (.mcap, .db3, .bag, a rosbag2 folder) is detected scan by scan; OUT/detections.jsonl has a line for
     each, with its time. After a kill the same command goes on where it was.
 
+    With --cluster only OUT/detections.jsonl is written, and the same command goes on where a broken run stopped.
+
     Examples:
 
     asca detect drive1/ drive2/ --out results --no-pictures
@@ -85,17 +91,17 @@ def detect(
     asca detect sweeps/ --around --axes y-forward --sensor-height auto
 
     asca detect drive.mcap --track --foxglove boxes.mcap
+
+    asca detect /mnt/archive --out /mnt/boxes --cluster local
     """
     import logging
-    import sys
 
     from rich.console import Console
-    from rich.progress import track as progress
 
     from asca_deploy import sample_scan_path
     from asca_deploy.auto import summary
-    from asca_pillars.commands import detect_tables as show
     from asca_pillars.commands.detect_files import ResultWriter
+    from asca_pillars.commands.detect_scans import detect_scans
     from asca_pillars.commands.models import open_detector
     from asca_pillars.commands.scan_input import ScanInput, scan_settings
     from asca_pillars.data.recordings.open_recording import is_recording
@@ -109,8 +115,8 @@ def detect(
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     recordings = [path for path in scans or () if is_recording(path)]
     if recordings:
-        if scans is None or len(scans) > 1:
-            raise ConfigError(f"{recordings[0]}: is a recording; give one alone")
+        if cluster is not None or len(scans or ()) > 1:
+            raise ConfigError(f"{recordings[0]}: is a recording; give one alone, without --cluster")
         from asca_pillars.commands.detect_recording import RecordingTask, detect_recording
 
         task = RecordingTask(
@@ -132,33 +138,15 @@ def detect(
         raise ConfigError(f"{options_of_recordings} need a recording (.mcap, .db3, .bag)")
     named = name_scans(scans or [sample_scan_path()])
     scan_input = ScanInput(reading, [path for path, _ in named])
+    if cluster is not None:
+        from asca_pillars.commands.detect_archive import detect_archive
+
+        if pictures:
+            raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
+        paths = [path for path, _ in named]
+        detect_archive(paths, scan_input, reading, options, out, score=score, around=around, address=cluster)
+        return
     detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
-    results: list[show.Result] = []
-    unreadable = 0
-    with ResultWriter(out, pictures=pictures) as write:
-        for path, name in progress(named, "Detecting", console=console, disable=len(named) == 1):
-            try:
-                scan = scan_input.read(path)
-                detections = detector(scan.points)
-            except (ScanError, OSError) as error:
-                if len(named) == 1:
-                    raise
-                unreadable += 1
-                print(f"asca: {error}", file=sys.stderr)
-                continue
-            results.append(show.Result(path, scan.notes, detections.labels, detections.report))
-            write(path, name, scan, detections)
-    if not results:
-        raise ScanError(f"none of the {len(named)} scans can be read")
-    console.print(show.boxes(path, detections) if len(named) == 1 else show.scans(results, detector.spec.class_names))
-    for line in (*scan_input.said, *show.notes(results), *write.remarks[:1]):
-        console.print(line, style="yellow", soft_wrap=True)
-    reports = [result.report for result in results]
-    while len(reports) < TIMED_FRAMES:
-        reports.append(detector(scan.points).report)
-    console.print(show.timing(reports[1:], detector))
-    console.print(f"Results: {out}/")
-    if unreadable:
-        raise ScanError(f"{unreadable} of {len(named)} scans could not be read; they are named above")
+    detect_scans(named, scan_input, detector, ResultWriter(out, pictures=pictures is not False), console)

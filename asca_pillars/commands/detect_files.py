@@ -33,14 +33,14 @@ class ResultWriter:
     """
 
     def __init__(self, out: Path, *, pictures: bool) -> None:
-        self._out, self._pictures = out, pictures
+        self.out, self._pictures = out, pictures
         self._stack = ExitStack()
         self._lines: IO[str] | None = None
         self.remarks: list[str] = []
         """What could not be drawn, and why; for the user."""
 
     def __enter__(self) -> "ResultWriter":
-        require_own(self._out, "asca detect", RUN_FILE)
+        require_own(self.out, "asca detect", RUN_FILE)
         return self
 
     def __exit__(
@@ -52,9 +52,9 @@ class ResultWriter:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
         if self._lines is None:
             self._lines = self._open()
-        content = _content(path, scan, detections)
+        content = scan_content(path, scan, detections)
         write_json(self._named(name, ".json"), content)
-        self._lines.write(json.dumps(content) + "\n")
+        self._lines.write(as_line(content))
         if self._pictures:
             write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=self._labels(path)))
         calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
@@ -78,15 +78,15 @@ class ResultWriter:
             return None
 
     def _open(self) -> IO[str]:
-        if not (self._out / RUN_FILE).exists():
-            with atomic_path(self._out / RUN_FILE):
+        if not (self.out / RUN_FILE).exists():
+            with atomic_path(self.out / RUN_FILE):
                 pass  # marks the folder from the start, so that a run that was killed can be given again
-        temporary = self._stack.enter_context(atomic_path(self._out / RUN_FILE))
+        temporary = self._stack.enter_context(atomic_path(self.out / RUN_FILE))
         return self._stack.enter_context(temporary.open("w", encoding="utf-8"))
 
     def _named(self, name: Path, ending: str) -> Path:
         # Not with_suffix: a name may hold dots of its own.
-        return self._out / name.with_name(name.name + ending)
+        return self.out / name.with_name(name.name + ending)
 
 
 def _write_kitti(path: Path, detections: Detections, calibration: Calibration, image: Any) -> None:
@@ -96,7 +96,13 @@ def _write_kitti(path: Path, detections: Detections, calibration: Calibration, i
         temporary.write_text(detections.to_kitti(calibration, size_wh), encoding="utf-8")
 
 
-def _content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
+def as_line(content: dict[str, Any]) -> str:
+    """A line of `detections.jsonl`, with its end."""
+    return json.dumps(content) + "\n"
+
+
+def scan_content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
+    """What is written of one scan, as plain values; `path` names it."""
     report, notes = detections.report, scan.notes
     return {
         "scan": str(path),

@@ -12,6 +12,7 @@ EXTRAS = {
     "import": ("pyarrow",),
     "recordings": ("rosbags", "mcap"),
     "view": ("rerun", "rosbags", "mcap"),
+    "cluster": ("ray",),
 }
 
 

@@ -88,6 +88,14 @@ AroundOption = Annotated[
     bool,
     typer.Option("--around", help="Look in every direction: turned passes, merged. Costs a pass for each of them."),
 ]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        help="Work on a Ray cluster: its address (HOST:PORT), auto, or local for all cores of this machine. "
+        "Needs pip install 'asca-pillars[cluster]'; docs/CLUSTER.md.",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from asca_pillars.data.scan_settings import ScanSettings, sample_points
+from asca_pillars.data.scans.reflectance import ReflectanceScale
 from asca_pillars.data.scans.scan_reader import FolderScale, Scan, folder_reflectance_scale, read_scan
 from asca_pillars.errors import ConfigError
 
@@ -55,7 +56,11 @@ class ScanInput:
         Raises:
             ScanError: as `read_scan`.
         """
-        return read_scan(path, columns=self._columns, reflectance_scale=self._scales[_folder_and_suffix(path)].scale)
+        return read_scan(path, columns=self._columns, reflectance_scale=self.scale(path))
+
+    def scale(self, path: Path) -> ReflectanceScale:
+        """The reflectance scale of one of the scans."""
+        return self._scales[_folder_and_suffix(path)].scale
 
     def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
         where = folder if len(paths) > 1 else paths[0]

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from asca_pillars.commands.extras import require
+from asca_pillars.commands.options import ClusterOption
 
 FRAMES = 100
 
@@ -35,7 +36,8 @@ def simulate(
     seed: Annotated[
         int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number of workers.")
     ] = 0,
-    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes, without --cluster.")] = 2,
+    cluster: ClusterOption = None,
     config: Annotated[
         str | None,
         typer.Option(
@@ -92,11 +94,15 @@ def simulate(
 
     asca simulate data/drives --sequences 3 --length 200
 
+    asca simulate /mnt/sim -n 1000000 --view camera --cluster 10.0.0.1:6379
+
     asca simulate data/sim --report --like data/kitti --bundle my_bundle
     """
     require("sim")
     if report or like is not None:
         require("eval")
+    if cluster is not None:
+        require("cluster")
     from rich.console import Console
 
     from asca_pillars.data.kitti import KittiSplit
@@ -124,7 +130,7 @@ def simulate(
     if frames is not None or not (there and (report or like is not None)):
         frames = frames or FRAMES
         require_own(out, "asca simulate", "simulation.json", text='"seed"')
-        write_frames(out, frames, seed, workers, settings, val_share)
+        write_frames(out, frames, seed, workers, settings, val_share, cluster=cluster)
         console.print(f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin")
     if report:
         from asca_pillars.commands.simulate_reports import report_statistics

@@ -13,6 +13,7 @@ from rich.progress import track
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path
 
+ABOUT_FILE = "simulation.json"
 Item = TypeVar("Item")
 
 
@@ -49,7 +50,7 @@ def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
     Raises:
         DatasetError: the scans there are of something else.
     """
-    path = root / "simulation.json"
+    path = root / ABOUT_FILE
     text = json.dumps(about, indent=2) + "\n"
     if not path.exists():
         if any(scans.rglob("*.bin")):

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.cluster.run_shards import run_each
 from asca_pillars.data.kitti import (
     Calibration,
     KittiObject,
@@ -21,11 +22,13 @@ from asca_pillars.data.kitti import (
 from asca_pillars.files import atomic_path
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
-from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each
+from asca_pillars.sim.parallel import ABOUT_FILE, check_wishes, claim_simulation, for_each
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import Returns, measure
 from asca_pillars.sim.world.scene import Scene, build, draw_scene
+
+_SHARD_FRAMES = 20  # of a cluster's worker: a second or two
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,8 @@ def simulate(
     config: SimulationConfig | None = None,
     val_share: float = 0.1,
     progress: bool = True,
+    *,
+    cluster: str | None = None,
 ) -> Path:
     """Write `frames` labelled frames below `out` in KITTI's layout; returns `out`.
 
@@ -110,7 +115,18 @@ def simulate(
     bytes. A run that was interrupted, or asked for fewer frames, goes on where it stopped; simulation.json in the
     folder tells what it holds.
 
+    Args:
+        out: the folder; with a cluster, one that every machine mounts at the same place.
+        frames: how many.
+        seed: of the whole data set.
+        workers: processes, without a cluster.
+        config: what to simulate.
+        val_share: 0..1.
+        progress: whether it is shown.
+        cluster: address of a Ray cluster that does the work, `local` for one on this machine; None: processes.
+
     Raises:
+        ClusterError: the cluster cannot be used, or a frame ended each process that worked on it.
         ConfigError: a number of frames or workers below 1, or a share outside 0..1.
         DatasetError: `out` holds frames of another seed or configuration.
     """
@@ -120,7 +136,20 @@ def simulate(
     split = KittiSplit(root)
     claim_simulation(root, {"seed": seed, **asdict(config)}, split.folder / "velodyne")
     todo = [index for index in range(frames) if not _is_complete(split, index)]
-    for_each(partial(_write_frame, root, seed, config), todo, workers, progress=progress)
+    job = partial(_write_frame, root.absolute(), seed, config)
+    if cluster is not None:
+        run_each(
+            job,
+            todo,
+            cluster,
+            shard_size=_SHARD_FRAMES,
+            seen=root / ABOUT_FILE,
+            folders=[split.folder / name for name in ("velodyne", "label_2", "calib")],
+            title="Simulating",
+            progress=progress,
+        )
+    else:
+        for_each(job, todo, workers, progress=progress)
     names = [frame_id(index) for index in range(frames)]
     first_val = frames - round(frames * val_share)
     write_image_set(root, "train", names[:first_val])

@@ -1,6 +1,7 @@
 """Whole frames: reproducible, readable, labelled as KITTI would."""
 
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,24 @@ def test_the_number_of_workers_does_not_change_a_byte(tmp_path: Path) -> None:
     one, two = files(tmp_path / "one"), files(tmp_path / "two")
     assert len(one) == 5 * 3 + 3  # and two lists, and what was simulated
     assert one == two
+
+
+def test_a_cluster_writes_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What its workers do is done here; tests/cluster runs Ray."""
+    handed_out = []
+
+    def run_here(job, items, address, *, shard_size, seen, folders, **rest):
+        assert seen.is_file() and {folder.name for folder in folders} == {"velodyne", "label_2", "calib"}
+        for item in reversed(items):  # in any order
+            pickle.loads(pickle.dumps(job))(item)  # noqa: S301 - our own, as Ray sends it
+            handed_out.append(item)
+
+    simulate(tmp_path / "one", 4, seed=3, config=CAMERA, progress=False)
+    monkeypatch.setattr("asca_pillars.sim.simulation.run_each", run_here)
+    simulate(tmp_path / "two", 2, seed=3, config=CAMERA, progress=False, cluster="made-up:1")
+    simulate(tmp_path / "two", 4, seed=3, config=CAMERA, progress=False, cluster="made-up:1")
+    assert handed_out == [1, 0, 3, 2], "frames that are there are left out"
+    assert files(tmp_path / "one") == files(tmp_path / "two")
 
 
 def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:

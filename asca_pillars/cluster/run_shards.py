@@ -1,0 +1,97 @@
+"""A run of shards from its start to its end: the cluster, the progress, and the folders that machines write to."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from asca_pillars.cluster.ray_pool import RayPool, connected
+from asca_pillars.cluster.schedule import Outcome, Result, work_off
+from asca_pillars.cluster.shards import Shard, cut
+from asca_pillars.errors import ClusterError
+from asca_pillars.files import recover
+
+
+def run_shards(
+    job: Callable[[Shard], Result],
+    shards: Sequence[Shard],
+    address: str,
+    *,
+    seen: Path,
+    folders: Sequence[Path],
+    title: str,
+    done: int = 0,
+    cpus: int = 1,
+    gpus: int = 0,
+    progress: bool = True,
+) -> Iterator[Outcome[Result]]:
+    """Do a job for each shard on a cluster; yields each one as it ends, as `schedule.work_off`.
+
+    Args:
+        job: as for `RayPool`, as are `seen`, `cpus` and `gpus`.
+        shards: to be done.
+        address: of the cluster; `local` for this machine alone.
+        folders: that the job writes into. What killed workers left there is removed before the run and after it.
+        title: for the progress, which counts items.
+        done: items that an earlier run has done.
+        progress: whether it is shown.
+
+    Raises:
+        ClusterError: the cluster cannot be used.
+        Exception: that of the job.
+    """
+    console = Console(markup=False)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    for folder in folders:
+        recover(folder, again=True)
+    try:
+        with connected(address) as cluster, Progress(*columns, console=console, disable=not progress) as bar:
+            console.print(cluster, highlight=False)
+            total = done + sum(len(shard.items) for shard in shards)
+            task = bar.add_task(title, total=total, completed=done)
+            for outcome in work_off(shards, RayPool(job, seen, cpus=cpus, gpus=gpus)):
+                bar.advance(task, len(outcome.shard.items))
+                yield outcome
+    finally:
+        for folder in folders:
+            recover(folder, again=True)
+
+
+def run_each(
+    job: Callable[[Any], None],
+    items: Sequence[Any],
+    address: str,
+    *,
+    shard_size: int,
+    seen: Path,
+    folders: Sequence[Path],
+    title: str,
+    progress: bool = True,
+) -> None:
+    """Do a job that returns nothing for each item on a cluster, `shard_size` of them by one worker.
+
+    Args:
+        job: called with an item on a worker, perhaps more than once. The others: as for `run_shards`.
+
+    Raises:
+        ClusterError: the cluster cannot be used; or, after all others are done, some items ended every worker.
+        Exception: that of the job.
+    """
+    if not items:
+        return
+    lost: list[Any] = []
+    shards = cut(items, shard_size)
+    for outcome in run_shards(
+        partial(_each, job), shards, address, seen=seen, folders=folders, title=title, progress=progress
+    ):
+        lost += outcome.shard.items if outcome.died else ()
+    if lost:
+        raise ClusterError(f"{title}: {', '.join(map(str, lost))} ended each process that worked on it")
+
+
+def _each(job: Callable[[Any], None], shard: Shard) -> None:
+    for item in shard.items:
+        job(item)

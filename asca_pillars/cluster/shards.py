@@ -1,0 +1,126 @@
+"""Work cut into shards, and the files in which the results of each appear at once or not at all.
+
+    run.json                         what the results depend on
+    000000256-1f3a9c04d2b7.jsonl     a line for each item of a shard, the first of which is number 256
+
+A shard's name is made of the number of its first item and of a digest of its items. A file that is there is therefore
+the result of these items and no others, also where the list of items has changed since.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from asca_pillars.errors import OutputError
+from asca_pillars.files import atomic_path, write_json
+
+RUN_SETTINGS = "run.json"
+_SUFFIX = ".jsonl"
+
+
+class Shard(NamedTuple):
+    """Successive items of a run: the number of the first one, and the items, plain values that JSON can hold."""
+
+    first: int
+    items: tuple[Any, ...]
+
+    @property
+    def name(self) -> str:
+        """Different for other items."""
+        return f"{self.first:09d}-{hashlib.sha256(json.dumps(self.items).encode()).hexdigest()[:12]}"
+
+    @property
+    def halves(self) -> tuple["Shard", "Shard"]:
+        """Two shards of these items, of which there must be two at least."""
+        middle = len(self.items) // 2
+        return Shard(self.first, self.items[:middle]), Shard(self.first + middle, self.items[middle:])
+
+
+def cut(items: Sequence[Any], size: int) -> list[Shard]:
+    """Shards of `size` items, the last one of what is left."""
+    return [Shard(first, tuple(items[first : first + size])) for first in range(0, len(items), size)]
+
+
+@dataclass(frozen=True)
+class ShardFolder:
+    """The folder of a run's shards."""
+
+    path: Path
+
+    def claim(self, settings: dict[str, Any], shard_size: int) -> int:
+        """Note what the results depend on, or make sure that the run found there is the same one.
+
+        Args:
+            settings: plain values by name.
+            shard_size: items of a shard, if the run is new.
+
+        Returns:
+            The items of a shard, as the run was begun with.
+
+        Raises:
+            OutputError: the run there has other settings, or its file is damaged.
+        """
+        path = self.path / RUN_SETTINGS
+        if not path.exists():
+            write_json(path, {"shard_size": shard_size, "settings": settings})
+            return shard_size
+        try:
+            begun = json.loads(path.read_text(encoding="utf-8"))
+            found, size = begun["settings"], int(begun["shard_size"])
+        except (ValueError, KeyError, TypeError):
+            raise OutputError(f"{path}: is damaged; choose another folder, or delete {self.path}") from None
+        for name in {**settings, **found}:
+            if found.get(name) != settings.get(name):
+                raise OutputError(
+                    f"{path}: the run there was started with {name} = {found.get(name)}, now {settings.get(name)}; "
+                    f"choose another folder, or delete {self.path}"
+                )
+        return size
+
+    def done(self) -> set[str]:
+        """Names of the shards whose results are there."""
+        # One listing: a file that was looked for and not found may stay unseen on a network mount for a minute.
+        with os.scandir(self.path) as entries:
+            return {
+                entry.name.removesuffix(_SUFFIX)
+                for entry in entries
+                if entry.name.endswith(_SUFFIX) and not entry.name.startswith(".")
+            }
+
+    def write(self, shard: Shard, lines: Iterable[str]) -> None:
+        """Write a shard's results, one line each with its end; they appear when all are written."""
+        with atomic_path(self._file(shard)) as temporary, temporary.open("w", encoding="utf-8") as file:
+            file.writelines(lines)
+
+    def join(self, shard: Shard, parts: Sequence[Shard]) -> None:
+        """Make the results of a shard from those of its parts, which are removed."""
+        with atomic_path(self._file(shard)) as temporary, temporary.open("wb") as file:
+            for part in sorted(parts):
+                with self._file(part).open("rb") as source:
+                    shutil.copyfileobj(source, file)
+        for part in parts:
+            self._file(part).unlink()
+
+    def lines(self, shards: Iterable[Shard]) -> Iterator[str]:
+        """The results of the shards, in their order.
+
+        Raises:
+            OutputError: one is not there.
+        """
+        for shard in shards:
+            try:
+                with self._file(shard).open(encoding="utf-8") as file:
+                    yield from file
+            except FileNotFoundError:
+                raise OutputError(
+                    f"{self._file(shard)}: a worker has written it, and it is not to be seen here; give a folder that "
+                    "is the same on every machine, then the same command again"
+                ) from None
+
+    def _file(self, shard: Shard) -> Path:
+        return self.path / f"{shard.name}{_SUFFIX}"

@@ -1,0 +1,102 @@
+"""Ray itself: two nodes, one of which dies; a worker that dies; and machines that are not set up alike."""
+
+import os
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from asca_pillars.cluster import ray_pool
+from asca_pillars.cluster.run_shards import run_each, run_shards
+from asca_pillars.cluster.schedule import work_off
+from asca_pillars.cluster.shards import Shard, cut
+from asca_pillars.errors import ClusterError
+
+pytest.importorskip("ray", reason="needs pip install 'asca-pillars[cluster]'")
+
+NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
+DEADLY = 5
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    from ray.cluster_utils import Cluster
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        nodes = Cluster(initialize_head=True, head_node_args=NODE)
+        nodes.add_node(**NODE)
+        yield nodes
+        nodes.shutdown()
+
+
+def sum_slowly(folder: Path, shard: Shard) -> int:
+    (folder / f"{shard.first}-{os.getpid()}").touch()
+    time.sleep(0.2)
+    if shard.items == (DEADLY,) or (DEADLY in shard.items and len(shard.items) < 3):
+        os._exit(1)
+    return sum(shard.items)
+
+
+def touch(folder: Path, item: int) -> None:
+    (folder / str(item)).touch()
+
+
+@pytest.mark.filterwarnings("default")  # of Ray
+def test_all_is_done_while_a_machine_and_workers_die(cluster: Any, tmp_path: Path) -> None:
+    seen, work = tmp_path / "run.json", tmp_path / "work"
+    seen.write_text("{}")
+    work.mkdir()
+    shards = [*cut(range(10, 40), 2), Shard(100, (DEADLY,))]
+    (node,) = cluster.worker_nodes
+    outcomes = []
+    for outcome in run_shards(
+        partial(sum_slowly, work), shards, cluster.address, seen=seen, folders=[work], title="Adding", progress=False
+    ):
+        outcomes.append(outcome)
+        if len(outcomes) == 3:
+            cluster.remove_node(node, allow_graceful=False)
+    assert sorted(outcome.shard for outcome in outcomes) == sorted(shards)
+    assert sum(outcome.result or 0 for outcome in outcomes) == sum(range(10, 40))
+    assert [outcome.shard.items for outcome in outcomes if outcome.died] == [(DEADLY,)]
+    begun = [path.name.split("-") for path in work.iterdir()]
+    assert len({process for _, process in begun}) >= 3 + 1, "both nodes, and a new worker after each death"
+    assert sum(outcome.repeats for outcome in outcomes) >= 2 + 1, "the deadly one twice, and that of the machine"
+
+
+@pytest.mark.filterwarnings("default")
+def test_machines_that_are_not_alike_are_named(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "out").mkdir()
+    with ray_pool.connected(cluster.address) as about:
+        assert about.startswith("Ray: ") and about.endswith("CPUs")
+        elsewhere = ray_pool.RayPool(partial(touch, tmp_path), tmp_path / "only here")
+        with pytest.raises(ClusterError, match=r"does not see .*only here; write to a folder that every"):
+            list(work_off([Shard(0, (1,))], elsewhere))
+        monkeypatch.setattr(ray_pool, "_version", lambda: "9.9")
+        (tmp_path / "only here").touch()
+        with pytest.raises(ClusterError, match=r"has asca-pillars \S+, the command 9\.9; install one version"):
+            list(work_off([Shard(0, (1,))], elsewhere))
+        monkeypatch.undo()
+
+
+@pytest.mark.filterwarnings("default")
+def test_each_item_is_done(cluster: Any, tmp_path: Path) -> None:
+    seen, out = tmp_path / "run.json", tmp_path / "out"
+    seen.write_text("{}")
+    out.mkdir()
+    left = out / ".1.asca-00000000"
+    left.touch()
+    job = partial(touch, out)
+    run_each(job, range(5), cluster.address, shard_size=2, seen=seen, folders=[out], title="Touching", progress=False)
+    assert {path.name for path in out.iterdir()} == set("01234"), "and what a killed writer left is gone"
+
+
+def test_no_cluster_is_one_line() -> None:
+    for address, reason in (("127.0.0.1:9", "refused"), ("nonsense", "Invalid address")):
+        named = rf"--cluster {address}: .*{reason}.*; give HOST:PORT"
+        with pytest.raises(ClusterError, match=named) as caught, ray_pool.connected(address):
+            pass
+        assert "\n" not in str(caught.value)

@@ -1,0 +1,74 @@
+"""Shards: their names, their files, and whose run they belong to."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asca_pillars.cluster.shards import Shard, ShardFolder, cut
+from asca_pillars.errors import OutputError
+
+
+@given(items=st.lists(st.integers(), max_size=40), size=st.integers(1, 12))
+def test_shards_hold_every_item_once_and_in_order(items: list[int], size: int) -> None:
+    shards = cut(items, size)
+    assert [item for shard in shards for item in shard.items] == items
+    assert all(items[shard.first : shard.first + len(shard.items)] == list(shard.items) for shard in shards)
+    assert len({shard.name for shard in shards}) == len(shards)
+    for shard in shards:
+        if len(shard.items) > 1:
+            first, second = shard.halves
+            assert first.items and second.items and first.items + second.items == shard.items
+            assert (first.first, second.first) == (shard.first, shard.first + len(first.items))
+
+
+def test_other_items_have_another_name_and_more_items_keep_the_names_before_them() -> None:
+    before, after = cut(["a", "b", "c", "d"], 2), cut(["a", "b", "c", "x", "y"], 2)
+    assert before[0].name == after[0].name and before[1].name != after[1].name
+    assert Shard(0, (("a", 255.0),)).name != Shard(0, (("a", 1.0),)).name
+
+
+def test_results_appear_when_all_are_written(tmp_path: Path) -> None:
+    folder, shard = ShardFolder(tmp_path), Shard(0, ("a", "b"))
+
+    def stop_after_one():
+        yield "a\n"
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        folder.write(shard, stop_after_one())
+    assert folder.done() == set() and not list(tmp_path.iterdir())
+    folder.write(shard, ["a\n", "b\n"])
+    (tmp_path / ".000000002-0.asca-00000000.jsonl").write_text("half of a li")  # what a killed writer leaves
+    assert folder.done() == {shard.name}
+
+
+def test_parts_become_the_shard(tmp_path: Path) -> None:
+    folder, shard = ShardFolder(tmp_path), Shard(4, ("a", "b", "c"))
+    first, second = shard.halves
+    for part in (second, first):
+        folder.write(part, [f"{item}\n" for item in part.items])
+    folder.join(shard, [second, first])
+    assert folder.done() == {shard.name}
+    assert list(folder.lines([shard])) == ["a\n", "b\n", "c\n"]
+
+
+def test_a_result_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"000000003-\w+\.jsonl: .* the same on every machine"):
+        list(ShardFolder(tmp_path).lines([Shard(3, ("a",))]))
+
+
+def test_other_settings_are_refused_and_the_size_stays(tmp_path: Path) -> None:
+    folder = ShardFolder(tmp_path / "shards")
+    assert folder.claim({"score": None, "mounting": {"axes": "x-forward"}}, 16) == 16
+    assert folder.claim({"score": None, "mounting": {"axes": "x-forward"}}, 256) == 16
+    with pytest.raises(OutputError, match=r"run\.json: .* score = None, now 0\.5; choose another folder"):
+        folder.claim({"score": 0.5, "mounting": {"axes": "x-forward"}}, 16)
+    with pytest.raises(OutputError, match="tilt = None, now 1"):
+        folder.claim({"score": None, "mounting": {"axes": "x-forward"}, "tilt": 1}, 16)
+    for text in ("{", "[]", json.dumps({"shard_size": "many", "settings": {}})):
+        (tmp_path / "shards" / "run.json").write_text(text)
+        with pytest.raises(OutputError, match="is damaged"):
+            folder.claim({}, 16)
