@@ -118,8 +118,10 @@ def simulate(
     console = Console(markup=False)
     settings = load_simulation_config(config, view)
     if sequences is not None:
-        if frames is not None or report or like is not None:
-            raise ConfigError("--sequences: leave --frames, --report and --like out; they are for single scans")
+        if frames is not None or report or like is not None or cluster is not None:
+            raise ConfigError(
+                "--sequences: leave --frames, --report, --like and --cluster out; they are for single scans"
+            )
         require_own(out, "asca simulate", "simulation.json", text='"length"')
         from asca_pillars.sim.sequences.sequence_files import simulate_sequences
 
