@@ -26,7 +26,10 @@ class SSDHead(nn.Module):
         nn.init.normal_(self.boxes.weight, std=0.001)
 
     def forward(self, features: Tensor) -> HeadMaps[Tensor]:
-        """(B, C, H, W) -> scores (B, A * scores_per_anchor, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W)."""
+        """(B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W).
+
+        With several scores per anchor there are so many times A of them, those of an anchor side by side.
+        """
         return HeadMaps(self.scores(features), self.boxes(features), self.directions(features))
 
     def at_cells(self, features: Tensor) -> HeadMaps[Tensor]:
