@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from asca_deploy.bundle import (
     BACKBONE,
     ENCODER,
     MANIFEST,
+    AnyBundle,
     Bundle,
     CanvasFormat,
     Parity,
@@ -19,7 +21,7 @@ from asca_deploy.bundle import (
     Provenance,
     RefineSection,
 )
-from asca_deploy.manifest import load_bundle, write_bundle_manifest
+from asca_deploy.manifest import load_any_bundle, write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
@@ -38,6 +40,8 @@ from asca_pillars.system import cpu_model, default_threads, git_revision, packag
 
 MIN_SCANS = 8
 LICENSE = "Apache-2.0"
+
+Described = TypeVar("Described", bound=AnyBundle)
 
 
 def export_bundle(
@@ -129,7 +133,7 @@ def draft_bundle(
     )
 
 
-def write_proven(folder: Path, draft: Bundle, prove: Callable[[Bundle], Parity]) -> Bundle:
+def write_proven(folder: Path, draft: Described, prove: Callable[[Described], Parity]) -> Described:
     """Sign the graphs in `folder`, and write their manifest with the parity that `prove` finds as the runtime opens it.
 
     Raises:
@@ -137,7 +141,9 @@ def write_proven(folder: Path, draft: Bundle, prove: Callable[[Bundle], Parity])
     """
     signed = graphs.sign(folder, draft)
     write_bundle_manifest(folder, signed)
-    bundle = dataclasses.replace(signed, parity=prove(load_bundle(folder)))
+    opened = load_any_bundle(folder)
+    assert isinstance(opened, type(draft)), "as it was written"
+    bundle = dataclasses.replace(signed, parity=prove(opened))
     write_bundle_manifest(folder, bundle)
     return bundle
 

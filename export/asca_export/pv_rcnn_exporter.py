@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, MANIFEST, PvRcnnBundle, PvRcnnSection
-from asca_deploy.manifest import load_any_bundle, write_bundle_manifest
+from asca_deploy.bundle import BACKBONE, MANIFEST, Parity, PvRcnnBundle, PvRcnnSection
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_export import graphs
-from asca_export.exporter import LICENSE, MIN_SCANS, provenance
+from asca_export.exporter import LICENSE, MIN_SCANS, provenance, write_proven
 from asca_export.pv_rcnn_forms import export_pv_rcnn_graphs
 from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
 from asca_pillars.data.expected_input import measure_expected_input
@@ -64,11 +63,9 @@ def export_pv_rcnn_bundle(
         )
         export_pv_rcnn_graphs(detector.network, draft, folder)
         gmac = graphs.multiply_accumulates(graphs.graph_path(folder, BACKBONE)) / 1e9
-        draft = graphs.sign(folder, dataclasses.replace(draft, backbone_gmac=gmac))
-        write_bundle_manifest(folder, draft)
-        opened = load_any_bundle(folder)
-        assert isinstance(opened, PvRcnnBundle), "as it was written"
-        pipeline = PvRcnnPipeline(folder, opened, threads=default_threads())
-        bundle = dataclasses.replace(draft, parity=prove_pv_rcnn_parity(detector.network, pipeline, scans))
-        write_bundle_manifest(folder, bundle)
-    return bundle
+
+        def prove(opened: PvRcnnBundle) -> Parity:
+            pipeline = PvRcnnPipeline(folder, opened, threads=default_threads())
+            return prove_pv_rcnn_parity(detector.network, pipeline, scans)
+
+        return write_proven(folder, dataclasses.replace(draft, backbone_gmac=gmac), prove)
