@@ -23,8 +23,8 @@ import numpy as np
 import typer
 
 from asca_deploy import Detections, Detector, ScanQueue, Tracker
-from asca_deploy.bundle import find_bundle
 from asca_deploy.manifest import load_bundle
+from asca_deploy.shipped import find_bundle
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.evaluation.report import markdown_table

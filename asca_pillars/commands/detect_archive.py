@@ -14,8 +14,9 @@ from typing import NamedTuple
 from rich.console import Console
 
 from asca_deploy import Detector
-from asca_deploy.bundle import MANIFEST, find_bundle
+from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_bundle
+from asca_deploy.shipped import find_bundle
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
 from asca_pillars.commands.detect_files import RUN_FILE, as_line, scan_content

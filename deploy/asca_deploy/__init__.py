@@ -1,15 +1,10 @@
 """The detector on the vehicle: ONNX Runtime and NumPy, never PyTorch."""
 
-from asca_deploy.bundle import (
-    Bundle,
-    default_bundle_path,
-    find_bundle,
-    sample_scan_path,
-    shipped_bundles,
-)
+from asca_deploy.bundle import Bundle
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
 from asca_deploy.scan_queue import ScanQueue
+from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
 from asca_deploy.tracker import Tracker
 from asca_deploy.tracks import Tracks
 from asca_pillars.geometry.detections import Detections

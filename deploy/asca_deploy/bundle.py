@@ -9,12 +9,10 @@ docs/BUNDLE.md describes the files for readers in other languages; `manifest` re
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
-from pathlib import Path
 from typing import Literal
 
 from asca_pillars.data.expected_input import ExpectedInput
-from asca_pillars.errors import BundleError, ConfigError
+from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStageSettings
@@ -274,38 +272,3 @@ class PvRcnnBundle(AnyBundle):
         """With DEFORM where keypoints are shifted."""
         shifts = (DEFORM,) if self.pv_rcnn.settings.deformed else ()
         return (*GRAPHS[self.kind], *shifts)
-
-
-def default_bundle_path() -> Path:
-    """Folder of the model that is used unless another is named: 8-bit, the faster one on every CPU."""
-    return shipped_bundles()["asca_small_sim_int8"]
-
-
-def shipped_bundles() -> dict[str, Path]:
-    """Folders of the models that come with the package, by name."""
-    folders = Path(str(resources.files("asca_deploy") / "bundles")).iterdir()
-    return {folder.name: folder for folder in sorted(folders) if (folder / MANIFEST).is_file()}
-
-
-def find_bundle(bundle: str | Path | None) -> Path:
-    """The folder meant by a path, by the name of a bundle that ships, or by None.
-
-    Raises:
-        BundleError: there is neither.
-    """
-    if bundle is None:
-        return default_bundle_path()
-    if Path(bundle).exists():
-        return Path(bundle)
-    shipped = shipped_bundles()
-    if str(bundle) not in shipped:
-        raise BundleError(
-            f"{bundle}: no such folder, and no bundle of that name ships, only {', '.join(shipped)};"
-            " make one with `asca export`"
-        )
-    return shipped[str(bundle)]
-
-
-def sample_scan_path() -> Path:
-    """The simulated scan that comes with the package, KITTI .bin."""
-    return Path(str(resources.files("asca_deploy") / "samples" / "street.bin"))

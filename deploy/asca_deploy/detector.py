@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
-from asca_deploy.bundle import AnyBundle, Bundle, PvRcnnBundle, find_bundle, sample_scan_path
+from asca_deploy.bundle import AnyBundle, Bundle, PvRcnnBundle
 from asca_deploy.manifest import load_any_bundle
 from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.refine_pipeline import RefinePipeline
+from asca_deploy.shipped import find_bundle, sample_scan_path
 from asca_deploy.stream import overlapped
 from asca_pillars.data.input_check import InputWarning, UsablePoints, check_input, usable_points
 from asca_pillars.data.mounting import Mounting

@@ -10,9 +10,10 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Bundle, Parity, RefineSection, find_bundle
+from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Bundle, Parity, RefineSection
 from asca_deploy.manifest import load_bundle
 from asca_deploy.refine_pipeline import RefinePipeline
+from asca_deploy.shipped import find_bundle
 from asca_export import graphs
 from asca_export.exporter import MIN_SCANS, draft_bundle, export_bundle, write_proven
 from asca_export.neck_output import add_neck_output

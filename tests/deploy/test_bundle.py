@@ -3,14 +3,8 @@ from pathlib import Path
 import pytest
 
 from asca_deploy import load_bundle
-from asca_deploy.bundle import (
-    CanvasFormat,
-    PillarSection,
-    default_bundle_path,
-    find_bundle,
-    sample_scan_path,
-    shipped_bundles,
-)
+from asca_deploy.bundle import CanvasFormat, PillarSection
+from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
 from asca_pillars.errors import BundleError, ConfigError
 
 

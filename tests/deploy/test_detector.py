@@ -274,6 +274,6 @@ def test_only_declared_inputs_are_fed(tiny_bundle: Path, bundle_without_counts: 
 
 
 def test_without_a_bundle_the_shipped_one_is_meant(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("asca_deploy.bundle.default_bundle_path", lambda: tmp_path / "shipped")
+    monkeypatch.setattr("asca_deploy.shipped.default_bundle_path", lambda: tmp_path / "shipped")
     with pytest.raises(BundleError, match="shipped is no model bundle"):
         Detector()

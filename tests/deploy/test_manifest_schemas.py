@@ -13,8 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.bundle import MANIFEST, shipped_bundles
+from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import graph_files, load_bundle
+from asca_deploy.shipped import shipped_bundles
 from asca_pillars.errors import BundleError
 from tests.deploy.test_manifest import NOT_THE_GRAPHS, assert_refused, edit
 

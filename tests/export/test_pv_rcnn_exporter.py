@@ -3,10 +3,7 @@
 import dataclasses
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +27,10 @@ from asca_pillars.errors import BundleError, ExportError
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
 from asca_pillars.models.pv_rcnn.voxel_batch import batch_scans
-from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.points.voxel_scan import SourceBalls, voxel_scan
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.training.loop import train
-from tests.export.test_refine_exporter import DETECT
+from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, MODEL, NETWORK, SETTINGS, SPEC, tiny_config, tiny_detector
 from tests.scenes import write_dataset
@@ -57,25 +53,7 @@ def test_train_export_detect(trained: Trained, tmp_path: Path) -> None:
     bundle = load_any_bundle(folder)
     assert isinstance(bundle, PvRcnnBundle) and set(bundle.graphs) == {*GRAPHS["pv_rcnn"], DEFORM}
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.backbone_gmac > 0
-    in_torch = ScanDetector(checkpoint.detector, SPEC.with_score_threshold(0.0))
-    in_onnx = Detector(folder, score_threshold=0.0, threads=1)
-    found = [in_onnx(scan) for scan in SCANS]
-    assert sum(map(len, found)) > 0
-    for scan, detections in zip(SCANS, found, strict=True):
-        wanted = in_torch(scan)
-        np.testing.assert_allclose(detections.boxes, wanted.boxes, atol=1e-2)
-        np.testing.assert_allclose(detections.scores, wanted.scores, atol=1e-3)
-    assert set(found[0].report.times_ms) == {"input", *in_onnx.pipeline.stages}
-    for streamed, alone in zip(in_onnx.stream(SCANS), found, strict=True):
-        np.testing.assert_array_equal(streamed.boxes, alone.boxes)
-    with ThreadPoolExecutor(3) as pool:
-        for together, alone in zip(pool.map(in_onnx, SCANS), found, strict=True):
-            np.testing.assert_array_equal(together.boxes, alone.boxes)
-    np.save(tmp_path / "scan.npy", SCANS[0])
-    command = [sys.executable, "-W", "error", "-c", DETECT, str(folder), str(tmp_path / "scan.npy")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert result.returncode == 0, result.stderr
-    assert int(result.stdout) == len(found[0])
+    assert_same_detector(checkpoint, folder, tmp_path)
 
 
 @pytest.mark.parametrize("threads", [2, 4])

@@ -2,9 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,26 +22,12 @@ from asca_export.refine_graph import fold_norms
 from asca_pillars.errors import BundleError, ExportError
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
-from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.training.loop import train
+from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS
 from tests.models.refine.test_pillar_refiner import batch, small_refiner
 from tests.models.second_stage.tiny_refine import tiny_refine_config, write_first_stage
 from tests.scenes import write_dataset
-
-DETECT = """
-import sys
-
-class NoTorch:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torch", "lightning", "onnx", "onnxscript", "asca_export"):
-            raise ImportError(f"{name} must not be imported here")
-
-sys.meta_path.insert(0, NoTorch())
-import numpy as np
-import asca_deploy
-print(len(asca_deploy.Detector(sys.argv[1], score_threshold=0.0, threads=1)(np.load(sys.argv[2]))))
-"""
 
 
 @pytest.fixture(scope="module")
@@ -79,26 +62,7 @@ def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None
     bundle = load_bundle(folder)
     assert (bundle.kind, set(bundle.graphs)) == ("pillar_refine", set(GRAPHS["pillar_refine"]))
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.refine is not None
-    checkpoint = load_checkpoint(last)
-    in_torch = ScanDetector(checkpoint.detector, checkpoint.config.model.spec.with_score_threshold(0.0))
-    in_onnx = Detector(folder, score_threshold=0.0, threads=1)
-    found = [in_onnx(scan) for scan in SCANS]
-    assert sum(map(len, found)) > 0
-    for scan, detections in zip(SCANS, found, strict=True):
-        wanted = in_torch(scan)
-        np.testing.assert_allclose(detections.boxes, wanted.boxes, atol=1e-2)
-        np.testing.assert_allclose(detections.scores, wanted.scores, atol=1e-3)
-    assert set(found[0].report.times_ms) == {"input", *in_onnx.pipeline.stages}
-    for streamed, alone in zip(in_onnx.stream(SCANS), found, strict=True):
-        np.testing.assert_array_equal(streamed.boxes, alone.boxes)
-    with ThreadPoolExecutor(3) as pool:
-        for together, alone in zip(pool.map(in_onnx, SCANS), found, strict=True):
-            np.testing.assert_array_equal(together.boxes, alone.boxes)
-    np.save(tmp_path / "scan.npy", SCANS[0])
-    command = [sys.executable, "-W", "error", "-c", DETECT, str(folder), str(tmp_path / "scan.npy")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert result.returncode == 0, result.stderr
-    assert int(result.stdout) == len(found[0])
+    assert_same_detector(load_checkpoint(last), folder, tmp_path)
 
 
 def test_scans_with_little_or_nothing(trained: tuple[Path, Path]) -> None:

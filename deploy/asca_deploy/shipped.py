@@ -1,0 +1,42 @@
+"""What comes with the package, by name: bundles and a scan; and where a bundle is that a user names."""
+
+from importlib import resources
+from pathlib import Path
+
+from asca_deploy.bundle import MANIFEST
+from asca_pillars.errors import BundleError
+
+
+def default_bundle_path() -> Path:
+    """Folder of the model that is used unless another is named: 8-bit, the faster one on every CPU."""
+    return shipped_bundles()["asca_small_sim_int8"]
+
+
+def shipped_bundles() -> dict[str, Path]:
+    """Folders of the models that come with the package, by name."""
+    folders = Path(str(resources.files("asca_deploy") / "bundles")).iterdir()
+    return {folder.name: folder for folder in sorted(folders) if (folder / MANIFEST).is_file()}
+
+
+def find_bundle(bundle: str | Path | None) -> Path:
+    """The folder meant by a path, by the name of a bundle that ships, or by None.
+
+    Raises:
+        BundleError: there is neither.
+    """
+    if bundle is None:
+        return default_bundle_path()
+    if Path(bundle).exists():
+        return Path(bundle)
+    shipped = shipped_bundles()
+    if str(bundle) not in shipped:
+        raise BundleError(
+            f"{bundle}: no such folder, and no bundle of that name ships, only {', '.join(shipped)};"
+            " make one with `asca export`"
+        )
+    return shipped[str(bundle)]
+
+
+def sample_scan_path() -> Path:
+    """The simulated scan that comes with the package, KITTI .bin."""
+    return Path(str(resources.files("asca_deploy") / "samples" / "street.bin"))
