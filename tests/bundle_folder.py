@@ -1,0 +1,17 @@
+"""A folder that an earlier export wrote, for tests of writing over it."""
+
+from pathlib import Path
+
+EXPORT = ("asca export", "bundle.json")
+"""The command and the marker that `atomic_directory` and `require_replaceable` take."""
+
+
+def old_bundle(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "a.onnx").write_text("old")
+    (folder / "bundle.json").write_text('{"file": "a.onnx"}')
+    return folder
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
