@@ -19,8 +19,11 @@ class FirstPass(NamedTuple):
     """What a first stage computes of one scan."""
 
     maps: HeadMaps[NDArray[np.float32]]
+    """On the head's map, or in rows of its active cells."""
     neck: NDArray[np.float32]
-    """(H, W, C) the head's input, on the head's map."""
+    """(H, W, C) the head's input on its map, or (M, C) at M active cells; beside these the map is zero."""
+    cells: NDArray[np.int32] | None = None
+    """(M,) flat index of the head cell of each row; None of maps."""
 
 
 class FirstStage(Protocol):
@@ -77,25 +80,18 @@ class Proposed:
     """(K, C) the neck's map at the keypoints."""
 
 
-def require_dense_map(source: object, kind: str, neck: str, *, pooled: bool) -> None:
-    """Refuse a detector whose neck has no map over the pillars' own cells for keypoints to read.
+def require_pillar_kind(source: object, kind: str) -> None:
+    """Refuse a detector of another family than the pillar detector's.
 
     Args:
         source: bundle or checkpoint, to be named to the user.
         kind: family of the detector.
-        neck: `dense` or `sparse`.
-        pooled: whether its map is another one than the pillars' own.
 
     Raises:
         ConfigError: the detector cannot be a first stage.
     """
     if kind != "pillar":
         raise ConfigError(f"{source}: model.kind {kind}; a first stage is of kind pillar")
-    if neck != "dense" or pooled:
-        raise ConfigError(
-            f"{source}: a {neck} neck on a {'pooled' if pooled else 'warped'} map; a first stage has a dense neck and "
-            "a warped map: train one so"
-        )
 
 
 def propose_on(stage: FirstStage, points: NDArray[np.float32], settings: FirstStageSettings) -> Proposed:
@@ -107,9 +103,18 @@ def proposed_from(
     found: FirstPass, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
 ) -> Proposed:
     """What the second stage sees of `found`, the first stage's answer to the finite points (N, 4) of one scan."""
-    maps, neck = found
-    proposals = propose(maps, spec, settings.proposals)
+    proposals = propose(found.maps, spec, settings.proposals, found.cells)
     near = points[near_boxes(points, proposals.boxes, settings.keypoints.margin_m)]
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
-    cells, weights = bilinear_cells(keypoints, *spec.head_centers_m())
-    return Proposed(proposals, keypoints, read_map(neck.reshape(-1, neck.shape[2]), cells, weights))
+    return Proposed(proposals, keypoints, _read_neck(found, keypoints, spec))
+
+
+def _read_neck(found: FirstPass, keypoints: NDArray[np.float32], spec: DetectorSpec) -> NDArray[np.float32]:
+    x_m, y_m = spec.head_centers_m()
+    cells, weights = bilinear_cells(keypoints, x_m, y_m)
+    rows = found.neck.reshape(-1, found.neck.shape[-1])
+    if found.cells is not None:
+        row_of_cell = np.full(len(x_m) * len(y_m), len(rows), np.int32)
+        row_of_cell[found.cells] = np.arange(len(rows))
+        rows, cells = np.concatenate([rows, np.zeros_like(rows, shape=(1, rows.shape[1]))]), row_of_cell[cells]
+    return read_map(rows, cells, weights)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +37,18 @@ class ProposalSettings:
                 raise ConfigError(f"{name} {list(values)} of the proposals must be at least 1")
 
 
-def propose(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, settings: ProposalSettings) -> Detections:
+def propose(
+    maps: HeadMaps[NDArray[np.float32]],
+    spec: DetectorSpec,
+    settings: ProposalSettings,
+    cells: NDArray[np.integer[Any]] | None = None,
+) -> Detections:
     """Proposals of one scan, best first.
 
     Args:
         maps: logits and residuals (channels, H, W) of the detector that `spec` describes; its thresholds and
             suppression give way to those of `settings`.
+        cells: (M,) flat index of the head cell of each row, if the maps are rows (M, channels).
 
     Raises:
         ValueError: not one quota for each class.
@@ -50,7 +56,7 @@ def propose(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, settings: P
     classes = tuple(replace(item, score_threshold=settings.score_threshold) for item in spec.classes)
     # Room for every candidate: the quotas choose, not a common limit.
     post = PostProcess(settings.nms_iou, settings.candidates, settings.candidates * len(classes))
-    return best_of_each_class(decode(maps, spec.anchors, classes, post), settings.quotas)
+    return best_of_each_class(decode(maps, spec.anchors, classes, post, cells), settings.quotas)
 
 
 def best_of_each_class(detections: Detections, quotas: Sequence[int]) -> Detections:

@@ -63,6 +63,7 @@ class CanvasBackbone:
         path: of the graph, for messages.
         session: that has opened it.
         bundle: the manifest.
+        neck_channels: of the graph's output NECK, if it has one.
 
     Raises:
         BundleError: the graph's inputs and outputs are not those of this bundle.
@@ -70,7 +71,7 @@ class CanvasBackbone:
 
     stage = "scatter"
 
-    def __init__(self, path: Path, session: Session, bundle: Bundle) -> None:
+    def __init__(self, path: Path, session: Session, bundle: Bundle, neck_channels: int = 0) -> None:
         self._bundle, self._pools = bundle, bundle.spec.grid.pools
         grid, section, anchors = bundle.spec.grid, bundle.pillar, bundle.spec.anchors.shape[2]
         rows, columns = grid.map_shape
@@ -79,8 +80,8 @@ class CanvasBackbone:
             name: Tensor("float32", (1, *grid.head_shape, channels * anchors))
             for name, channels in zip(HeadMaps._fields, (1, 7, 2), strict=True)
         }
-        if bundle.refine is not None:
-            outputs[NECK] = Tensor("float32", (1, *grid.head_shape, bundle.refine.bev_channels))
+        if neck_channels:
+            outputs[NECK] = Tensor("float32", (1, *grid.head_shape, neck_channels))
         self._session = check_interface(path, session, inputs, outputs)
         self._free = [self.new_canvas()]
 
@@ -102,7 +103,7 @@ class CanvasBackbone:
         return HeadAnswer(maps, None)
 
     def infer_with_neck(self, placed: Canvas) -> FirstPass:
-        """As `run`, of a bundle of kind pillar_refine: also the neck's map (H, W, C), which its second stage reads."""
+        """As `run`, and the neck's map (H, W, C), which a second stage reads; for graphs with the output NECK."""
         *maps, neck = self._session.run((*HeadMaps._fields, NECK), {"canvas": placed.image})
         self._free.append(placed)
         return FirstPass(_channels_first(maps), neck[0])

@@ -90,7 +90,7 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
         ("scatter" if first.bundle.pillar.neck == "dense" else "tables"): _placed(placed),
     }
     if isinstance(pipeline, RefinePipeline):
-        return {**stages, **_second_stage(pipeline, pipeline.backbone.infer_with_neck(placed), points)}
+        return {**stages, **_second_stage(pipeline, first.backbone.infer_with_neck(placed), points)}
     spec, answer = pipeline.spec, pipeline.backbone.run(placed)
     candidates = decode_candidates(answer.maps, spec.anchors, spec.classes, spec.post, answer.cells)
     boxes: dict[str, NDArray[Any]] = {
@@ -108,7 +108,7 @@ def _second_stage(pipeline: RefinePipeline, first: FirstPass, points: NDArray[np
     confidence, residuals = pipeline.refine(scan)
     found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec)
     return {
-        "neck+head": {**_answered(HeadAnswer(first.maps, None)), "neck": first.neck},
+        "neck+head": {**_answered(HeadAnswer(first.maps, first.cells)), "neck": first.neck},
         "propose": _detections(proposed.proposals),
         "neighbors": refine_inputs(scan),
         "refine": {"confidence": confidence, "residuals": residuals},

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.points.first_stage import FirstPass
 
 Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 
@@ -31,3 +32,6 @@ class PillarBackbone(Protocol):
 
     def run(self, placed: Any) -> HeadAnswer:
         """Run the graph; each placed scan may be given once."""
+
+    def infer_with_neck(self, placed: Any) -> FirstPass:
+        """As `run`, and the head's input; for graphs that a second stage follows."""

@@ -61,7 +61,8 @@ class PillarPipeline:
         self.bundle = bundle
         self.spec: PillarSpec = bundle.spec
         self._encoder = _open_encoder(folder, bundle)
-        self.backbone = open_backbone(folder / bundle.graphs[BACKBONE].file, bundle, provider, precision, threads)
+        path, neck = folder / bundle.graphs[BACKBONE].file, 0 if bundle.refine is None else bundle.refine.bev_channels
+        self.backbone = open_backbone(path, bundle, provider, precision, threads, neck)
         self.stages = ("pillarize", "encode", self.backbone.stage, "neck+head", "decode")
         self._anchors = self.spec.anchors
 
@@ -114,9 +115,14 @@ def _open_encoder(folder: Path, bundle: Bundle) -> Session:
 
 
 def open_backbone(
-    path: Path, bundle: Bundle, provider: providers.Provider, precision: providers.Precision, threads: int
+    path: Path,
+    bundle: Bundle,
+    provider: providers.Provider,
+    precision: providers.Precision,
+    threads: int,
+    neck_channels: int = 0,
 ) -> PillarBackbone:
-    """Open backbone.onnx of a dense or of a sparse neck.
+    """Open backbone.onnx of a dense or of a sparse neck; with `neck_channels` it has the output NECK.
 
     Raises:
         BundleError: the graph cannot be run or is not what the manifest says.
@@ -128,7 +134,8 @@ def open_backbone(
             "choose provider cpu"
         )
     session = providers.open_session(path, provider, precision, threads)
-    return (CanvasBackbone if bundle.pillar.neck == "dense" else TableBackbone)(path, session, bundle)
+    kind = CanvasBackbone if bundle.pillar.neck == "dense" else TableBackbone
+    return kind(path, session, bundle, neck_channels)
 
 
 _: type[Pipeline[PreparedPillars, HeadAnswer]] = PillarPipeline  # mypy compares them

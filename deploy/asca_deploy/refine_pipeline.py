@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import REFINE, Bundle, RefineSection
-from asca_deploy.canvas_backbone import CanvasBackbone
 from asca_deploy.graph import Session, Tensor, check_interface
 from asca_deploy.pillar_pipeline import PillarPipeline, PreparedPillars
 from asca_deploy.pipeline import Laps, Pipeline
@@ -27,7 +26,7 @@ OUTPUTS = ("confidence", "residuals")
 
 
 class PreparedScan(NamedTuple):
-    """A scan whose pillars are encoded and scattered."""
+    """A scan whose pillars are encoded and placed for the backbone."""
 
     pillars: PreparedPillars
     points: NDArray[np.float32]
@@ -62,7 +61,6 @@ class RefinePipeline:
         ProviderError: the provider does not start.
     """
 
-    stages = ("pillarize", "encode", "scatter", "neck+head", "propose", "neighbors", "refine", "decode")
     network_stages = ("encode", "neck+head", "refine")
 
     def __init__(
@@ -80,21 +78,19 @@ class RefinePipeline:
         self.spec: PillarSpec = bundle.spec
         self.section = bundle.refine
         self.first = PillarPipeline(folder, bundle, provider, precision, threads)
-        backbone = self.first.backbone
-        assert isinstance(backbone, CanvasBackbone), "`load_bundle` lets no sparse neck through"
-        self.backbone = backbone
+        self.stages = (*self.first.stages[:-1], "propose", "neighbors", "refine", "decode")
         path = folder / bundle.graphs[REFINE].file
         session = providers.open_session(path, "cpu", "float32", threads)
         inputs, outputs = refine_interface(bundle.refine, len(bundle.spec.classes))
         self._second: Session = check_interface(path, session, inputs, outputs)
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedScan:
-        """Points (N, 4) -> the first stage's pseudo-image."""
+        """Points (N, 4) -> the input of the first stage's backbone."""
         return PreparedScan(self.first.prepare(points, laps), points)
 
     def infer(self, prepared: PreparedScan, laps: Laps) -> FirstAnswer:
-        """The pseudo-image -> the first stage's head maps and its neck's map."""
-        found = self.backbone.infer_with_neck(prepared.pillars.placed)
+        """The placed pillars -> the first stage's head maps and its neck's map, or rows of both."""
+        found = self.first.backbone.infer_with_neck(prepared.pillars.placed)
         laps.append(("neck+head", perf_counter()))
         return FirstAnswer(found, prepared.points)
 

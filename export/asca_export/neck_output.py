@@ -8,7 +8,9 @@ from asca_pillars.errors import ExportError
 
 
 def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
-    """A copy of a float backbone that also returns its head's input (1, H, W, C), named NECK; the rest stays as it is.
+    """A copy of a float backbone that also returns its head's input, named NECK; the rest stays as it is.
+
+    It is (1, H, W, C) of a dense neck, (M, C) at the active head cells of a sparse one.
 
     Raises:
         ExportError: the graph has no such tensor in floating point.
@@ -18,10 +20,11 @@ def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
     joined = [node for node in model.graph.node if node.op_type == "Concat"]
     types = {value.name: value.type.tensor_type for value in onnx.shape_inference.infer_shapes(model).graph.value_info}
     kind = types.get(joined[-1].output[0]) if joined else None
-    if kind is None or kind.elem_type != TensorProto.FLOAT or len(kind.shape.dim) != 4:
+    if kind is None or kind.elem_type != TensorProto.FLOAT or not kind.shape.dim[-1].dim_value:
         raise ExportError("the backbone's graph joins no maps in floating point; give a bundle in float32")
-    shape = [size.dim_value for size in kind.shape.dim]
     model.graph.node.append(helper.make_node("Identity", [joined[-1].output[0]], [NECK]))
-    model.graph.output.append(helper.make_tensor_value_info(NECK, TensorProto.FLOAT, shape))
+    output = onnx.ValueInfoProto(name=NECK)
+    output.type.tensor_type.CopyFrom(kind)
+    model.graph.output.append(output)
     onnx.checker.check_model(model)
     return model

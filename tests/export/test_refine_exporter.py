@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,15 @@ from asca_export.exporter import export_bundle
 from asca_export.refine_exporter import export_refine_bundle
 from asca_export.refine_graph import fold_norms
 from asca_pillars.errors import BundleError, ExportError
+from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector
-from tests.export.tiny import SCANS
+from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.models.refine.test_pillar_refiner import batch, small_refiner
-from tests.models.second_stage.tiny_refine import tiny_refine_config, write_first_stage
-from tests.scenes import write_dataset
+from tests.models.second_stage.tiny_refine import opened_config, save_checkpoint, tiny_refine_config, write_first_stage
+from tests.scenes import SPEC, write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +67,24 @@ def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None
     assert_same_detector(load_checkpoint(last), folder, tmp_path)
 
 
+def test_a_sparse_neck_on_a_pooled_map_proposes(tmp_path: Path) -> None:
+    spec = replace(SPEC, grid=replace(SPEC.grid, map="pooled"))
+    save_checkpoint(tmp_path / "first.ckpt", tiny_checkpoint("channel", spec, neck="sparse"))
+    config = opened_config(tmp_path / "first.ckpt")
+    torch.manual_seed(0)
+    detector = build_model(config.model)
+    assert isinstance(detector, RefineDetector)
+    checkpoint = Checkpoint(config, detector.eval(), 0)
+    export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    runtime = Detector(tmp_path / "bundle", score_threshold=0.0, threads=1)
+    assert isinstance(runtime.pipeline, RefinePipeline)
+    assert runtime.pipeline.stages[2] == "tables" and len(runtime(SCANS[0])) > 0
+    golden = golden_stages(runtime.pipeline, SCANS[0])
+    assert len(golden["neck+head"]["cells"]) == len(golden["neck+head"]["neck"])
+    np.testing.assert_array_equal(golden["suppress"]["boxes"], runtime(SCANS[0]).boxes)
+    assert len(runtime(np.empty((0, 4), np.float32))) == 0
+
+
 def test_scans_with_little_or_nothing(trained: tuple[Path, Path]) -> None:
     detector = Detector(trained[1], score_threshold=0.0, threads=1)
     for points in (np.empty((0, 4)), np.array([[200, 0, 0, 0.5]]), np.array([[10, 0, -1, 0.5]])):
@@ -99,8 +119,8 @@ def test_the_graph_needs_no_scatter_and_no_normalization(trained: tuple[Path, Pa
         (lambda data: data["refine"]["seen"]["proposals"].update(quotas=[1, 2]), "has not one for each class"),
         (lambda data: data["graphs"].pop("refine"), "has the graphs encoder and backbone and refine, not"),
         (lambda data: data.update(kind="pillar"), "`refine` belongs to kind pillar_refine"),
-        (lambda data: data["pillar"].update(neck="sparse", active_cells="sub"), "needs a dense neck and a warped map"),
-        (lambda data: data["spec"]["grid"].update(map="pooled"), "needs a dense neck and a warped map"),
+        (lambda data: data["pillar"].update(neck="sparse", active_cells="sub"), "`pillar` is not the one that"),
+        (lambda data: data["spec"]["grid"].update(map="pooled"), "`spec` is not the one that"),
         (lambda data: data.update(precision="int8"), "`precision` of kind pillar_refine is float32"),
     ],
 )

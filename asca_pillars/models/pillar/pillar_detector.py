@@ -67,17 +67,27 @@ class PillarDetector(nn.Module):
         Raises:
             ValueError: the batch was made without the placements of `self.preparation`, which this detector needs.
         """
+        return self.read_head(self.head_input(batch), batch)
+
+    def head_input(self, batch: PillarBatch) -> Tensor:
+        """What the neck hands to the head: unitless (B, C, H, W), with a sparse neck (M, C) at active head cells."""
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
         features, cells, frame_cells = self.pool(pillar_features, batch)
         if batch.neck is not None and not features.is_cuda:
-            return self.head.at_cells(self.neck(features, batch.neck))
+            return self.neck(features, batch.neck)  # type: ignore[no-any-return]
         canvas = self.scatter(features, cells, frame_cells)  # (B, C, rows, columns)
         if batch.neck is not None:  # where a dense convolution costs less than gathering
             assert isinstance(self.neck, SparseRPNNeck)
-            return self.head.at_cells(self.neck.forward_dense(canvas, batch.neck))
-        maps: HeadMaps[Tensor] = self.head(self.neck(canvas))
+            return self.neck.forward_dense(canvas, batch.neck)
+        return self.neck(canvas)  # type: ignore[no-any-return]
+
+    def read_head(self, features: Tensor, batch: PillarBatch) -> HeadMaps[Tensor]:
+        """Head maps of what `head_input` gave for that batch, or rows of them, see `forward`."""
+        if batch.neck is not None:
+            return self.head.at_cells(features)
+        maps: HeadMaps[Tensor] = self.head(features)
         return maps
 
     def predict(self, batch: LabeledPillars) -> PillarOutputs:

@@ -12,7 +12,7 @@ from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
 from asca_pillars.pillar_config import PillarModel
-from asca_pillars.points.first_stage import FirstPass, require_dense_map
+from asca_pillars.points.first_stage import FirstPass, require_pillar_kind
 
 
 class CheckpointFirstStage:
@@ -23,16 +23,13 @@ class CheckpointFirstStage:
 
     Raises:
         TrainingError: not a checkpoint, damaged, or made by an incompatible version.
-        ConfigError: it is of another kind, its neck is sparse, or its map is pooled.
+        ConfigError: it is of another kind.
     """
 
     def __init__(self, path: str | Path) -> None:
         checkpoint = load_checkpoint(path)
         model, detector = checkpoint.config.model, checkpoint.detector
-        neck, pooled = "dense", False
-        if isinstance(model, PillarModel):
-            neck, pooled = model.network.neck, model.spec.grid.pools
-        require_dense_map(path, model.kind, neck, pooled=pooled)
+        require_pillar_kind(path, model.kind)
         assert isinstance(model, PillarModel) and isinstance(detector, PillarDetector), "it is of kind pillar"
         self._network = detector
         self.spec = model.spec
@@ -41,10 +38,13 @@ class CheckpointFirstStage:
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
         """See `FirstStage`."""
-        network, batch = self._network, batch_pillars([self.spec.pillarize(points)])
+        network, pillars = self._network, self.spec.pillarize(points)
+        batch = batch_pillars([pillars], [network.preparation.place(pillars)])
         with torch.inference_mode():
-            pillars = network.encode(batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars)
-            neck = network.neck(network.scatter(pillars, batch.cells, batch.frame_pillars))
-            maps = network.head(neck)
-        channels_last = np.ascontiguousarray(neck[0].permute(1, 2, 0).numpy())
-        return FirstPass(HeadMaps(*(part[0].float().numpy() for part in maps)), channels_last)
+            features = network.head_input(batch)
+            maps = network.read_head(features, batch)
+        if batch.neck is not None:
+            rows = HeadMaps(*(part.numpy() for part in maps))
+            return FirstPass(rows, features.numpy(), batch.neck.head_cells.int().numpy())
+        channels_last = np.ascontiguousarray(features[0].permute(1, 2, 0).numpy())
+        return FirstPass(HeadMaps(*(part[0].numpy() for part in maps)), channels_last)

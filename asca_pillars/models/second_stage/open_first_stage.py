@@ -51,7 +51,7 @@ def with_first_stage(model: RefineModel) -> RefineModel:
         raise ConfigError("model.spec is the first stage's where model.kind is pillar_refine: leave it out")
     if _shape(model.spec) != _shape(spec) and model.first_stage_identity:
         raise ConfigError(f"model.spec is not that of the first stage {model.first_stage}: train again")
-    channels = stage(np.empty((0, 4), np.float32)).neck.shape[2]
+    channels = stage(np.empty((0, 4), np.float32)).neck.shape[-1]
     if model.bev_channels not in (0, channels):
         raise ConfigError(
             f"model.bev_channels = {model.bev_channels}: the map of {model.first_stage} has {channels}; leave it out"

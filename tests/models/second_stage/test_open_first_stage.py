@@ -1,16 +1,18 @@
-"""What cannot be the first stage of two is refused, as a checkpoint and as a bundle."""
+"""What can be the first stage of two, as a checkpoint and as a bundle, and what is refused."""
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from asca_export.exporter import export_bundle
 from asca_pillars.errors import ConfigError
-from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.second_stage.open_first_stage import open_first_stage
-from asca_pillars.points.first_stage import require_dense_map
-from tests.export.tiny import SCANS, tiny_checkpoint
+from asca_pillars.points.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
+from asca_pillars.points.proposals import ProposalSettings
+from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
 from tests.models.second_stage.tiny_refine import save_checkpoint
 from tests.scenes import SPEC
 
@@ -18,21 +20,50 @@ POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pool
 
 
 @pytest.mark.parametrize(
-    ("checkpoint", "message"),
-    [
-        (tiny_checkpoint("none", neck="sparse"), "a sparse neck on a warped map; a first stage has a dense neck"),
-        (tiny_checkpoint("none", POOLED), "a dense neck on a pooled map; a first stage has a dense neck"),
-    ],
-    ids=["sparse", "pooled"],
+    ("network", "spec"),
+    [({}, SPEC), ({}, POOLED), ({"neck": "sparse"}, SPEC), ({"neck": "sparse"}, POOLED)],
+    ids=["dense-warped", "dense-pooled", "sparse-warped", "sparse-pooled"],
 )
-def test_only_a_dense_neck_on_a_warped_map(tmp_path: Path, checkpoint: Checkpoint, message: str) -> None:
+def test_checkpoint_and_bundle_say_the_same(tmp_path: Path, network: dict[str, Any], spec: Any) -> None:
+    checkpoint = tiny_checkpoint("channel", spec, **network)
     save_checkpoint(tmp_path / "first.ckpt", checkpoint)
     export_bundle(checkpoint, tmp_path / "bundle", SCANS)
-    for source in ("first.ckpt", "bundle"):
-        with pytest.raises(ConfigError, match=f"{source}: {message}"):
-            open_first_stage(str(tmp_path / source))
+    in_torch, in_onnx = (open_first_stage(str(tmp_path / source)) for source in ("first.ckpt", "bundle"))
+    assert in_torch.spec == in_onnx.spec == spec
+    assert in_torch.identity != in_onnx.identity
+    for points in (SCANS[0], np.empty((0, 4), np.float32)):
+        wanted, found = in_torch(points), in_onnx(points)
+        assert found.neck.shape[-1] == 3 * NETWORK.upsample_channels
+        np.testing.assert_allclose(found.neck, wanted.neck, atol=1e-4)
+        for one, other in zip(found.maps, wanted.maps, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-3)
+        if network:
+            np.testing.assert_array_equal(found.cells, wanted.cells)
+        else:
+            assert found.cells is None and wanted.cells is None
+
+
+def test_rows_of_active_cells_are_a_map_with_zeros_beside_them(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "first.ckpt", tiny_checkpoint("channel", neck="sparse"))
+    stage = open_first_stage(str(tmp_path / "first.ckpt"))
+    points = SCANS[0][(np.abs(SCANS[0][:, :2] - [8, 0]) < 4).all(axis=1)]
+    rows = stage(points)
+    assert rows.cells is not None
+    height, width, _, _ = SPEC.anchors.shape
+    neck = np.zeros((height * width, rows.neck.shape[1]), np.float32)
+    neck[rows.cells] = rows.neck
+    maps = [np.full((part.shape[1], height * width), -9, np.float32) for part in rows.maps]
+    for whole, part in zip(maps, rows.maps, strict=True):
+        whole[:, rows.cells] = part.T
+    whole_maps = type(rows.maps)(*(part.reshape(-1, height, width) for part in maps))
+    settings = FirstStageSettings(ProposalSettings(score_threshold=0.0))
+    wanted = proposed_from(FirstPass(whole_maps, neck.reshape(height, width, -1)), points, SPEC, settings)
+    found = proposed_from(rows, points, SPEC, settings)
+    assert len(found.proposals) and len(found.keypoints) and 0 < len(rows.cells) < height * width
+    np.testing.assert_array_equal(found.proposals.boxes, wanted.proposals.boxes)
+    np.testing.assert_array_equal(found.bev, wanted.bev)
 
 
 def test_two_stages_are_no_first_stage() -> None:
     with pytest.raises(ConfigError, match=r"a_bundle: model.kind pillar_refine; a first stage is of kind pillar"):
-        require_dense_map("a_bundle", "pillar_refine", "dense", pooled=False)
+        require_pillar_kind("a_bundle", "pillar_refine")
