@@ -102,7 +102,7 @@ def test_bench_reports_stages_and_machine(tmp_path: Path) -> None:
     result = asca("bench", "--rounds", 2, "--json", tmp_path / "report.json")
     assert result.returncode == 0, result.stderr
     report = json.loads((tmp_path / "report.json").read_text())
-    assert set(report["stages_ms"]) == {"input", "pillarize", "encode", "scatter", "neck+head", "decode"}
+    assert set(report["stages_ms"]) == {"input", "pillarize", "encode", "tables", "neck+head", "decode"}
     assert report["fps"] == pytest.approx(1000 / report["total_ms"]["p50"])
     assert report["cpu"] and report["threads"] >= 1 and report["cold_ms"] > 0
 

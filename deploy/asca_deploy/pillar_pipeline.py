@@ -131,7 +131,7 @@ def open_backbone(
     if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
         raise ProviderError(
             f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
-            "choose provider cpu"
+            "choose provider cpu, or a bundle with a dense neck such as asca_small_sim"
         )
     session = providers.open_session(path, provider, precision, threads)
     kind = CanvasBackbone if bundle.pillar.neck == "dense" else TableBackbone

@@ -23,6 +23,7 @@ ROOT = Path(__file__).parents[2]
 MODULES = ROOT / "deploy" / "asca_deploy" / "browser"
 SCRIPTS = Path(__file__).parent / "javascript"
 NODE = shutil.which("node")
+DENSE = "asca_small_sim", "asca_small_sim_int8"  # the page runs no sparse neck
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="needs node")
 
@@ -44,7 +45,8 @@ def _bytes(value: bytes) -> dict[str, str]:
 
 
 def test_stages_on_the_golden_vectors_of_the_models_that_ship(tmp_path: Path) -> None:
-    for name, folder in shipped_bundles().items():
+    for name in DENSE:
+        folder = shipped_bundles()[name]
         write_golden(tmp_path / name, folder, sample_scan_path())
         assert_same_stages(node(SCRIPTS / "golden.mjs", MODULES, tmp_path / name, folder))
 

@@ -19,10 +19,12 @@ def test_a_bundle_is_found_by_folder_and_by_shipped_name(tiny_bundle: Path) -> N
 
 
 def test_shipped_files_lie_in_the_package() -> None:
-    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_small_sim_int8")
+    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_small_sparse_sim_int8")
     assert [(name, load_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
         ("asca_small_sim", "asca_small_sim"),
         ("asca_small_sim_int8", "asca_small_sim_int8"),
+        ("asca_small_sparse_sim", "asca_small_sparse_sim"),
+        ("asca_small_sparse_sim_int8", "asca_small_sparse_sim_int8"),
     ]
     assert sample_scan_path().parts[-3:] == ("asca_deploy", "samples", "street.bin")
 

@@ -108,7 +108,8 @@ def test_a_turned_scan_gives_turned_boxes() -> None:
 def test_a_car_on_a_seam_is_found_once() -> None:
     """The sample turned so that each of its clearest cars stands between two passes, and a little to either side."""
     points = read_scan(sample_scan_path()).points
-    detector = Detector(view="around")
+    # Below the model's threshold: it is unsure of cars that stand slantwise, but never sees one in both passes.
+    detector = Detector(view="around", score_threshold=0.3)
     found = detector(points)
     cars = found[(found.labels == 0) & (found.distances_m < 25)][:3]
     assert len(cars) == 3 and cars.scores.min() > 0.8
