@@ -73,7 +73,7 @@ class RefineModel(Strict):
     """
 
     kind: Literal["pillar_refine"] = "pillar_refine"
-    first_stage: str = "asca_small_sim"
+    first_stage: str = "asca_small_sparse_sim"
     first_stage_identity: str = ""
     bev_channels: int = 0
     spec: PillarSpec = field(default_factory=PillarSpec)
