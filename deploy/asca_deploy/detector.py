@@ -26,7 +26,7 @@ from asca_pillars.data.input_check import InputWarning, UsablePoints, check_inpu
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry import overlap
+from asca_pillars.geometry import decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.frame_report import FrameReport, ScanCounts, summed
@@ -96,7 +96,7 @@ class Detector:
         view: View = "ahead",
     ) -> None:
         start = perf_counter()
-        load_kernels(overlap.KERNELS)  # here rather than in the first scan
+        load_kernels(decode.KERNELS)  # here rather than in the first scan
         self.folder = find_bundle(bundle)
         self.threads = check_threads(threads)
         check_onnxruntime()
