@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import REFINE, Bundle, RefineSection
-from asca_deploy.canvas_backbone import CanvasBackbone
 from asca_deploy.graph import Session, Tensor, check_interface
-from asca_deploy.pillar_pipeline import PillarPipeline, PreparedPillars
+from asca_deploy.pillar_pipeline import CanvasBackbone, PillarPipeline, PreparedPillars
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.errors import BundleError
 from asca_pillars.geometry.detections import Detections

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK
-from asca_deploy.canvas_backbone import Canvas
 from asca_deploy.manifest import load_bundle
-from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
 from asca_deploy.shipped import find_bundle
 from asca_export.neck_output import add_neck_output
 from asca_pillars.geometry.decode import HeadMaps
