@@ -13,18 +13,15 @@ from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
-from asca_deploy.bundle import AnyBundle, Bundle, PvRcnnBundle
+from asca_deploy.bundle import AnyBundle
 from asca_deploy.manifest import load_any_bundle
+from asca_deploy.open_pipeline import open_pipeline
 from asca_deploy.ort_session import check_onnxruntime
-from asca_deploy.pillar_pipeline import PillarPipeline
-from asca_deploy.pipeline import Laps, Pipeline
-from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
-from asca_deploy.refine_pipeline import RefinePipeline
-from asca_deploy.shipped import find_bundle, sample_scan_path
+from asca_deploy.pipeline import Laps
+from asca_deploy.shipped import find_bundle
 from asca_deploy.stream import overlapped
 from asca_pillars.data.input_check import InputWarning, UsablePoints, check_input, usable_points
 from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry import decode
 from asca_pillars.geometry.detections import Detections
@@ -104,7 +101,9 @@ class Detector:
         self.bundle: AnyBundle = load_any_bundle(self.folder)
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
-        self.pipeline, self.provider, self.precision, self.candidates = self._choose(provider, precision)
+        self.pipeline, self.provider, self.precision, self.candidates = open_pipeline(
+            self.folder, self.bundle, provider, precision, self.threads
+        )
         self.pipeline.spec = self.spec
         if self.candidates:
             _log.info(auto.summary(self.runs_on, self.candidates))
@@ -239,28 +238,3 @@ class Detector:
         )
         source = weakref.ref(frame.source) if isinstance(frame.source, np.ndarray) else None
         return replace(detections, _report=report, _source=source, _ranges=self._ranges, _level=self._level)
-
-    def _choose(
-        self, provider: providers.Provider | Literal["auto"], precision: providers.Precision | None
-    ) -> auto.Choice[Pipeline[Any, Any]]:
-        bundle = self.bundle
-
-        def open_pipeline(name: providers.Provider, digits: providers.Precision) -> Pipeline[Any, Any]:
-            if isinstance(bundle, PvRcnnBundle):
-                return PvRcnnPipeline(self.folder, bundle, name, digits, self.threads)
-            assert isinstance(bundle, Bundle), "there are no other kinds"
-            family = PillarPipeline if bundle.kind == "pillar" else RefinePipeline
-            return family(self.folder, bundle, name, digits, self.threads)
-
-        if provider != providers.AUTO:
-            digits = precision or "float32"
-            return auto.Choice(open_pipeline(provider, digits), provider, digits, ())
-        points = read_scan(sample_scan_path()).points
-
-        def detect(pipeline: Pipeline[Any, Any]) -> Detections:
-            laps: Laps = []
-            return pipeline.finish(pipeline.infer(pipeline.prepare(points, laps), laps), laps)
-
-        return auto.choose(
-            providers.available(), open_pipeline, detect, self.bundle.spec, precision, weights=self.bundle.precision
-        )
