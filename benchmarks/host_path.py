@@ -18,7 +18,8 @@ import typer
 from numpy.typing import NDArray
 
 from asca_deploy import Bundle, default_bundle_path, load_bundle, sample_scan_path
-from asca_pillars.data.input_check import check_input, usable_points
+from asca_deploy.detector import usable_points
+from asca_pillars.data.input_check import check_input
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps, rotated_nms

@@ -1,9 +1,9 @@
-"""Which points of a scan can be used, and how far it is from those of the training, with the option that mends it.
+"""How far a scan is from those of the training, with the option that mends it.
 
 A wrong reflectance scale, sensor height or axis ruins detection without any error; here it becomes a sentence.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.data.frame_check import doubt_frame, ground_z_m
 from asca_pillars.data.mounting import Mounting
-from asca_pillars.errors import ScanError
-from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.frame_report import ScanCounts
 
 OUTSIDE_SHARE = 0.95
@@ -22,7 +20,6 @@ _FRAME_STEP = 2  # of the sample; angles and ranges take longer
 TOLERANCE_M = 0.5
 """A ground further than this from where a detector expects it is another sensor height, not another road."""
 
-_GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
 _SCALES = (100.0, 255.0, 65535.0)
 
 
@@ -31,62 +28,6 @@ class InputWarning(NamedTuple):
 
     about: str
     text: str
-
-
-class UsablePoints(NamedTuple):
-    """The points that a pipeline takes, and what was done to get them."""
-
-    points: NDArray[np.float32]
-    """(N, 4), finite, reflectance within 0..1."""
-    unclipped: NDArray[np.float32]
-    """(N, 4), the same with the reflectance as it came."""
-    non_finite: int
-    clipped: int
-
-    def moved(self, change: FrameChange) -> "UsablePoints":
-        """The same (N, 4) points in another frame."""
-        points = change.points(self.points)
-        if self.unclipped is self.points:
-            return self._replace(points=points, unclipped=points)
-        return self._replace(points=points, unclipped=np.column_stack([points[:, :3], self.unclipped[:, 3]]))
-
-
-def usable_points(points: NDArray[Any]) -> UsablePoints:
-    """The finite points of (N, 4) as contiguous float32, reflectance within 0..1.
-
-    Args:
-        points: (N, 4) x, y, z in metres and reflectance, of any real type.
-
-    Raises:
-        ScanError: `points` has another shape or does not hold real numbers.
-    """
-    if isinstance(points, np.ma.MaskedArray):
-        raise ScanError(
-            "the points are a masked array; give those that are not masked: points[~points.mask.any(1)].data"
-        )
-    try:
-        array = np.asarray(points)
-    except (TypeError, ValueError, OverflowError):
-        raise ScanError(f"the points are not an array of numbers; {_GIVE}") from None
-    if array.dtype.kind not in "iuf":
-        raise ScanError(f"the points are not an array of numbers, but of type {str(array.dtype)[:40]}; {_GIVE}")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is counted
-        scan = np.ascontiguousarray(array, np.float32)
-    if scan.ndim != 2 or scan.shape[1] != 4:
-        columns = scan.shape[1] if scan.ndim == 2 else 0
-        advice = "; append a column of reflectances 0..1" if columns == 3 else ""
-        advice = "; give the first four columns: points[:, :4]" if columns > 4 else advice
-        raise ScanError(f"the points have shape {array.shape}, not (N, 4): x, y, z, reflectance{advice}")
-    finite, non_finite = np.isfinite(scan), 0
-    if not finite.all():
-        usable = finite.all(axis=1)
-        scan, non_finite = scan[usable], int(len(scan) - usable.sum())
-    reflectance = scan[:, 3].copy()  # in one piece, which NumPy searches several times faster
-    if not len(scan) or (reflectance.min() >= 0 and reflectance.max() <= 1):
-        return UsablePoints(scan, scan, non_finite, 0)
-    clipped = scan.copy()
-    np.clip(reflectance, 0, 1, out=clipped[:, 3])
-    return UsablePoints(clipped, scan, non_finite, int((clipped[:, 3] != reflectance).sum()))
 
 
 def check_input(

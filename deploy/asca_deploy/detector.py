@@ -20,9 +20,9 @@ from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pipeline import Laps
 from asca_deploy.shipped import find_bundle
 from asca_deploy.stream import overlapped
-from asca_pillars.data.input_check import InputWarning, UsablePoints, check_input, usable_points
+from asca_pillars.data.input_check import InputWarning, check_input
 from asca_pillars.data.mounting import Mounting
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.geometry import decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
@@ -35,6 +35,18 @@ _log = logging.getLogger("asca_deploy")
 
 View: TypeAlias = Literal["ahead", "around"]
 _WAITING = "waiting"  # beside the names of stages
+_GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
+
+
+class UsablePoints(NamedTuple):
+    """The points that a pipeline takes, and what was done to get them."""
+
+    points: NDArray[np.float32]
+    """(N, 4), finite, reflectance within 0..1."""
+    unclipped: NDArray[np.float32]
+    """(N, 4), the same with the reflectance as it came."""
+    non_finite: int
+    clipped: int
 
 
 class _Frame(NamedTuple):
@@ -183,13 +195,11 @@ class Detector:
     def _open(self, points: NDArray[Any]) -> _Frame:
         """The usable points in the model's frame."""
         start = perf_counter()
-        usable = usable_points(points)
+        usable = usable_points(points, self._to_model)
         warnings = []
         if usable.clipped:
             text = f"{usable.clipped} reflectances lie outside 0..1 and were set to the nearer end"
             warnings.append(InputWarning("clipped", text))
-        if not self._to_model.is_identity:
-            usable = usable.moved(self._to_model)
         turns = self._turns if self.passes == 1 else about_ground(self._turns, usable.points)
         return _Frame(start, [("input", perf_counter())], usable, turns, [], warnings, points)
 
@@ -238,3 +248,44 @@ class Detector:
         )
         source = weakref.ref(frame.source) if isinstance(frame.source, np.ndarray) else None
         return replace(detections, _report=report, _source=source, _ranges=self._ranges, _level=self._level)
+
+
+def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> UsablePoints:
+    """The finite points of (N, 4) as contiguous float32, reflectance within 0..1.
+
+    Args:
+        points: (N, 4) x, y, z in metres and reflectance, of any real type.
+        to_model: into the model's frame; None if they are in it.
+
+    Raises:
+        ScanError: `points` has another shape or does not hold real numbers.
+    """
+    if isinstance(points, np.ma.MaskedArray):
+        raise ScanError(
+            "the points are a masked array; give those that are not masked: points[~points.mask.any(1)].data"
+        )
+    try:
+        array = np.asarray(points)
+    except (TypeError, ValueError, OverflowError):
+        raise ScanError(f"the points are not an array of numbers; {_GIVE}") from None
+    if array.dtype.kind not in "iuf":
+        raise ScanError(f"the points are not an array of numbers, but of type {str(array.dtype)[:40]}; {_GIVE}")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is counted
+        scan = np.ascontiguousarray(array, np.float32)
+    if scan.ndim != 2 or scan.shape[1] != 4:
+        columns = scan.shape[1] if scan.ndim == 2 else 0
+        advice = "; append a column of reflectances 0..1" if columns == 3 else ""
+        advice = "; give the first four columns: points[:, :4]" if columns > 4 else advice
+        raise ScanError(f"the points have shape {array.shape}, not (N, 4): x, y, z, reflectance{advice}")
+    finite, non_finite = np.isfinite(scan), 0
+    if not finite.all():
+        usable = finite.all(axis=1)
+        scan, non_finite = scan[usable], int(len(scan) - usable.sum())
+    if to_model is not None and not to_model.is_identity:
+        scan = to_model.points(scan)
+    reflectance = scan[:, 3].copy()  # in one piece, which NumPy searches several times faster
+    if not len(scan) or (reflectance.min() >= 0 and reflectance.max() <= 1):
+        return UsablePoints(scan, scan, non_finite, 0)
+    clipped = scan.copy()
+    np.clip(reflectance, 0, 1, out=clipped[:, 3])
+    return UsablePoints(clipped, scan, non_finite, int((clipped[:, 3] != reflectance).sum()))
