@@ -1,7 +1,6 @@
 """The scale of stored reflectances. Sensors and exporters write 0..1, 0..255 or others, and no format says which."""
 
 import math
-from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -93,14 +92,6 @@ def ambiguity(values: NDArray[np.generic], scale: float) -> str | None:
         "no reflectance is much above 100 and they were taken as 0..255; if they are 0..100, state that scale "
         "(--reflectance-scale 100)"
     )
-
-
-def common_scale(samples: Sequence[tuple[NDArray[np.generic], np.dtype[np.generic] | None]]) -> float:
-    """One scale for the scans of a folder: the largest that any of a sample of them is stored in.
-
-    Each sample is a scan's reflectances (N,), and the type that its file declares for them.
-    """
-    return max((decide_scale(values, dtype)[0] for values, dtype in samples), default=1.0)
 
 
 def _many_above(values: NDArray[np.generic], limit: float) -> bool:

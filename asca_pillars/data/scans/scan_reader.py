@@ -1,7 +1,6 @@
 """Scan files of any common format to points (N, 4) float32: x, y, z in metres, reflectance in 0..1."""
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -20,8 +19,6 @@ from asca_pillars.data.scans.reflectance import (
     ReflectanceScale,
     ambiguity,
     checked_scale,
-    common_scale,
-    decide_scale,
     unit_reflectance,
 )
 from asca_pillars.errors import ScanError
@@ -70,62 +67,14 @@ def read_scan(path: str | Path, *, columns: int | None = None, reflectance_scale
         path: the file.
         columns: float32 values per point of a `.bin`; None: four (KITTI) or five (nuScenes), by the values.
         reflectance_scale: the stored value that is a reflectance of 1; auto: by the field's type and the values
-            (`reflectance.decide_scale`). For a folder of scans decide it once: `folder_reflectance_scale`.
+            (`reflectance.decide_scale`). For a folder of scans decide it once: `stored_scans.folder_reflectance_scale`.
 
     Raises:
         ScanError: the file is missing, damaged, too large or of an unknown format.
     """
     reflectance_scale = checked_scale(reflectance_scale)
-    stored = _read_stored(Path(path), columns)
+    stored = read_stored(Path(path), columns)
     return finite_scan(stored, reflectance_scale)
-
-
-class FolderScale(NamedTuple):
-    """What the reflectances of scans that belong together are divided by, and why that may be wrong, if it may."""
-
-    scale: ReflectanceScale
-    doubt: str | None
-
-
-def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = None, sample: int = 16) -> FolderScale:
-    """One reflectance scale for scans that belong together, from `sample` of them, evenly spaced.
-
-    A dark scan among brighter ones is then not read on another scale. Scans that cannot be read have no say; where
-    none has reflectances, the scale is auto.
-    """
-    chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
-    stored = []
-    for path in chosen:
-        with suppress(ScanError):
-            one = _read_stored(path, columns)
-            stored.append(one)
-    return common_reflectance_scale(stored)
-
-
-def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
-    """One reflectance scale for scans that belong together; auto where none of them has reflectances."""
-    samples = [(one.reflectance, one.dtype) for one in stored if one.reflectance is not None]
-    if not samples:
-        return FolderScale("auto", None)
-    scale = common_scale(samples)
-    by_values = any(decide_scale(*one)[1] == "values" for one in samples)
-    doubts = [ambiguity(values, scale) for values, _ in samples] if by_values else [None]
-    return FolderScale(scale, doubts[0] if all(doubts) else None)
-
-
-def stored_points(path: Path, *, columns: int | None = 4) -> NDArray[np.float32]:
-    """The numbers of a scan as they are stored, (N, 4): of any reflectance scale, perhaps not finite.
-
-    Args:
-        path: the file.
-        columns: float32 values per point of a `.bin`, as in `read_scan`.
-
-    Raises:
-        ScanError: as `read_scan`.
-    """
-    stored = _read_stored(path, columns)
-    reflectance = np.zeros(len(stored.xyz)) if stored.reflectance is None else stored.reflectance
-    return np.column_stack([stored.xyz, reflectance.astype(np.float32)]).astype(np.float32, copy=False)
 
 
 def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
@@ -145,7 +94,12 @@ def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
         points.astype("<f4").tofile(temporary)
 
 
-def _read_stored(path: Path, columns: int | None) -> StoredPoints:
+def read_stored(path: Path, columns: int | None) -> StoredPoints:
+    """What a file holds, reflectances of any scale; `columns` as in `read_scan`.
+
+    Raises:
+        ScanError: as `read_scan`.
+    """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise ScanError(f"{path}: unknown suffix '{path.suffix}'; scans are {', '.join(SCAN_SUFFIXES)}")

@@ -11,7 +11,8 @@ import pytest
 from asca_pillars.data.scans import raw_floats
 from asca_pillars.data.scans.arrays import points_from_array
 from asca_pillars.data.scans.ply import MAX_LISTS
-from asca_pillars.data.scans.scan_reader import folder_reflectance_scale, read_scan
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.data.scans.stored_scans import folder_reflectance_scale
 from asca_pillars.errors import ScanError
 from tests.data.scans.test_scan_reader import POINTS, literal_lzf, npy, pcd, ply, read
 
