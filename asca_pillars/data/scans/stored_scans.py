@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.scans.records import StoredPoints
-from asca_pillars.data.scans.reflectance import ReflectanceScale, ambiguity, decide_scale
-from asca_pillars.data.scans.scan_reader import read_stored
+from asca_pillars.data.scans.scan_reader import ReflectanceScale, ambiguity, decide_scale, read_stored
 from asca_pillars.errors import ScanError
 
 
