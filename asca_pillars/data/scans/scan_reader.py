@@ -128,10 +128,10 @@ def finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
     points[:, :3] = stored.xyz
     notes = ScanNotes(remarks=stored.remarks)
     if stored.reflectance is not None:
-        scaled = unit_reflectance(stored.reflectance, stored.dtype, scale)
-        points[:, 3] = scaled.values
-        doubt = ambiguity(stored.reflectance, scaled.scale) if scaled.decided_by == "values" else None
-        notes = ScanNotes(0, scaled.clipped, scaled.scale, (*stored.remarks, *([doubt] if doubt else [])))
+        number, by_values = (float(scale), False) if scale != "auto" else decide_scale(stored.reflectance, stored.dtype)
+        points[:, 3], clipped = unit_reflectance(stored.reflectance, number)
+        doubt = ambiguity(stored.reflectance, number) if by_values else None
+        notes = ScanNotes(0, clipped, number, (*stored.remarks, *([doubt] if doubt else [])))
     finite = np.isfinite(points).all(axis=1)
     dropped = len(points) - int(finite.sum())
     return Scan(points[finite] if dropped else points, replace(notes, dropped_points=dropped))
@@ -199,18 +199,6 @@ def _whole_and_small(values: NDArray[np.float32]) -> bool:
         return bool(((values >= 0) & (values < _MAX_RING) & (values == np.floor(values))).all())
 
 
-class Scaled(NamedTuple):
-    """Reflectances (N,) float32 in 0..1, NaN where they were not finite, and what was done to them.
-
-    `scale` is what was divided by; `decided_by` says how it was known; `clipped` values lay outside 0..1 after it.
-    """
-
-    values: NDArray[np.float32]
-    scale: float
-    decided_by: Literal["stated", "field type", "values"]
-    clipped: int
-
-
 def checked_scale(scale: ReflectanceScale) -> ReflectanceScale:
     """The scale itself.
 
@@ -228,43 +216,34 @@ def checked_scale(scale: ReflectanceScale) -> ReflectanceScale:
     return number
 
 
-def unit_reflectance(
-    values: NDArray[np.generic], dtype: np.dtype[np.generic] | None = None, scale: ReflectanceScale = "auto"
-) -> Scaled:
-    """Bring stored reflectances (N,) to 0..1.
-
-    Args:
-        values: as stored.
-        dtype: the type that the file declares for them; None: that of `values`.
-        scale: the value that is a reflectance of 1; auto: `decide_scale`.
-    """
-    decided_by: Literal["stated", "field type", "values"] = "stated"
-    if scale == "auto":
-        scale, decided_by = decide_scale(values, dtype)
+def unit_reflectance(values: NDArray[np.generic], scale: float) -> tuple[NDArray[np.float32], int]:
+    """Stored reflectances (N,) over `scale`, within 0..1, NaN where they were not finite; how many lay outside it."""
     with np.errstate(over="ignore", invalid="ignore"):
         reflectance = values.astype(np.float32)
         finite = np.isfinite(reflectance)
         reflectance = np.where(finite, reflectance / np.float32(scale), np.float32(np.nan))
         inside = np.clip(reflectance, 0, 1)
-    return Scaled(inside, float(scale), decided_by, int((inside[finite] != reflectance[finite]).sum()))
+    return inside, int((inside[finite] != reflectance[finite]).sum())
 
 
-def decide_scale(
-    values: NDArray[np.generic], dtype: np.dtype[np.generic] | None = None
-) -> tuple[float, Literal["field type", "values"]]:
-    """The scale that reflectances (N,) are stored in: 1, 255 or 65535.
+def decide_scale(values: NDArray[np.generic], dtype: np.dtype[np.generic] | None = None) -> tuple[float, bool]:
+    """The scale that reflectances (N,) are stored in: 1, 255 or 65535; and whether their values decided it.
 
     Bytes are 0..255. Other numbers are taken as 0..1 (integers: as 0..255) unless more than one in a thousand, and
     more than a single one, are too large for it; so one speck does not darken a scan.
+
+    Args:
+        values: as stored.
+        dtype: the type that the file declares for them; None: that of `values`.
     """
     kind = values.dtype if dtype is None else dtype
     if kind.kind in "iu" and kind.itemsize == 1:
-        return 255.0, "field type"
+        return 255.0, False
     if _many_above(values, 255):
-        return 65535.0, "values"
+        return 65535.0, True
     if kind.kind in "iu":
-        return 255.0, "field type"
-    return (255.0 if _many_above(values, _SLACK) else 1.0), "values"
+        return 255.0, False
+    return (255.0 if _many_above(values, _SLACK) else 1.0), True
 
 
 def ambiguity(values: NDArray[np.generic], scale: float) -> str | None:

@@ -44,8 +44,8 @@ def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
         return FolderScale("auto", None)
     decided = [decide_scale(*one) for one in samples]
     scale = max(scale for scale, _ in decided)
-    by_values = any(by == "values" for _, by in decided)
-    doubts = [ambiguity(values, scale) for values, _ in samples] if by_values else [None]
+    guessed = any(by_values for _, by_values in decided)
+    doubts = [ambiguity(values, scale) for values, _ in samples] if guessed else [None]
     return FolderScale(scale, doubts[0] if all(doubts) else None)
 
 
