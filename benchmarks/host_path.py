@@ -18,11 +18,11 @@ import typer
 from numpy.typing import NDArray
 
 from asca_deploy import Bundle, default_bundle_path, load_bundle, sample_scan_path
-from asca_pillars.data.input_check import check_input, usable_points
+from asca_deploy.detector import usable_points
+from asca_pillars.data.input_check import check_input
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.geometry.overlap import rotated_nms
+from asca_pillars.geometry.decode import HeadMaps, rotated_nms
 from asca_pillars.system import cpu_model
 
 CAMERA_VIEW = 0.84, 0.25  # |y| / x and |z| / x: about what KITTI's camera 2 sees
@@ -106,7 +106,7 @@ def measure_ms(stage: Callable[[], Any]) -> float:
 @contextmanager
 def in_numpy() -> Iterator[None]:
     """As without numba."""
-    modules = ("pillars.pillarize", "geometry.overlap")
+    modules = ("pillars.pillarize", "geometry.decode")
     first, second = (patch(f"asca_pillars.{name}.load_kernels", lambda _: None) for name in modules)
     with first, second:
         yield

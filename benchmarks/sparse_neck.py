@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from asca_deploy import sample_scan_path
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.canvas_backbone import Canvas
 from asca_deploy.ort_session import OrtSession
+from asca_deploy.pillar_pipeline import Canvas
 from asca_deploy.table_backbone import FEATURES
 from asca_export import graphs, qdq
 from asca_export.fast_forms import FastBackbone

@@ -26,8 +26,7 @@ from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.commands.scan_input import ScanInput
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scan_settings import ScanSettings
-from asca_pillars.data.scans.reflectance import ReflectanceScale
-from asca_pillars.data.scans.scan_reader import Scan, read_scan
+from asca_pillars.data.scans.scan_reader import ReflectanceScale, Scan, read_scan
 from asca_pillars.errors import BundleError, ClusterError, ConfigError, ScanError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Literal
 
 from asca_pillars.data.scan_settings import ScanSettings, sample_points
-from asca_pillars.data.scans.reflectance import ReflectanceScale
-from asca_pillars.data.scans.scan_reader import FolderScale, Scan, folder_reflectance_scale, read_scan
+from asca_pillars.data.scans.scan_reader import ReflectanceScale, Scan, read_scan
+from asca_pillars.data.scans.stored_scans import FolderScale, folder_reflectance_scale
 from asca_pillars.errors import ConfigError
 
 

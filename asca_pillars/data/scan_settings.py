@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.ground_height import HeightEstimate, measured_mounting
 from asca_pillars.data.mounting import Mounting, read_pose
-from asca_pillars.data.scans.reflectance import ReflectanceScale
+from asca_pillars.data.scans.scan_reader import ReflectanceScale
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.schema import Strict
 

@@ -1,8 +1,8 @@
 """What training and the vehicle must compute identically, in NumPy alone.
 
-Where numba is installed it runs the loops of `pillarize` and `rotated_nms` (`compiled`), with the same results.
+Where numba is installed it runs the loops of `rotated_nms` (`nms_kernels`), with the same results.
 
-In the order of the data: `grid` -> `pillarize` -> (the network) -> `anchors` -> `decode` -> `detections`.
-`boxes` draws the conventions, `overlap` holds IoU and NMS, and `spec` ties one detector's numbers together.
-Import from the modules themselves: `pillarize` and `decode` are modules as well as functions.
+In the order of the data: (the network) -> `anchors` -> `decode` with NMS -> `detections`. `boxes` draws the
+conventions, `overlap` holds IoU, and `detector_spec` ties one detector's numbers together. Import from the modules
+themselves: `decode` is a module as well as a function.
 """

@@ -1,4 +1,4 @@
-"""How `kernels_pillars` and `kernels_overlap` are compiled by numba.
+"""How numba compiles the loops of the `*_kernels.py` files.
 
 The compiled functions take memory made by NumPy and have their signatures written out: that takes a quarter off the
 time to compile, and all of it is spent when they are imported, once per machine (numba's cache keeps the result).

@@ -11,7 +11,14 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.overlap import rotated_nms
+from asca_pillars.geometry.kernels import load_kernels
+from asca_pillars.geometry.overlap import bev_iou
+
+KERNELS = "asca_pillars.geometry.nms_kernels"
+
+# Candidates that suppression looks at together: enough to keep NumPy busy, few enough that the pairs inside a
+# block, some of them needless, stay cheap.
+_NMS_BLOCK = 64
 
 
 @dataclass(frozen=True)
@@ -145,6 +152,41 @@ def suppress(candidates: Candidates, classes: tuple[ClassSpec, ...], post: PostP
         tuple(spec.name for spec in classes),
         non_finite=non_finite,
     )
+
+
+def rotated_nms(
+    boxes: NDArray[np.floating[Any]], scores: NDArray[np.floating[Any]], iou_threshold: float, limit: int | None = None
+) -> NDArray[np.int64]:
+    """Greedy suppression by `bev_iou`: indices of the kept boxes, by descending score; of the first `limit` of them.
+
+    A box is dropped if a kept, better one overlaps it by more than `iou_threshold`. Of equal scores the
+    earlier goes first.
+
+    Args:
+        boxes: (N, 7), LiDAR frame; N may be 0.
+        scores: (N,), any monotonic measure.
+    """
+    order = np.argsort(-scores, kind="stable")
+    kernels = load_kernels(KERNELS)
+    nms = _nms if kernels is None else kernels.nms
+    return order[nms(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)]
+
+
+def _nms(boxes: NDArray[np.float64], iou_threshold: float, limit: int) -> NDArray[np.int64]:
+    """`rotated_nms` of boxes that come best first."""
+    waiting = np.arange(len(boxes))
+    kept = [waiting[:0]]
+    while len(waiting) and sum(map(len, kept)) < limit:
+        block, waiting = waiting[:_NMS_BLOCK], waiting[_NMS_BLOCK:]
+        clashes = bev_iou(boxes[block], boxes[block]) > iou_threshold
+        alive = np.ones(len(block), bool)
+        for index, row in enumerate(clashes):
+            if alive[index]:
+                alive[index + 1 :] &= ~row[index + 1 :]
+        kept.append(block[alive])
+        clashes = bev_iou(boxes[block[alive]], boxes[waiting]) > iou_threshold
+        waiting = waiting[~clashes.any(axis=0)]
+    return np.concatenate(kept)[:limit]
 
 
 def _candidates(

@@ -16,7 +16,7 @@ def load_kernels(module: str) -> ModuleType | None:
     imports numba and takes a few tenths of a second; the very first one on a machine compiles, some seconds.
 
     Args:
-        module: that holds them, such as `asca_pillars.geometry.overlap_kernels`.
+        module: that holds them, such as `asca_pillars.geometry.nms_kernels`.
     """
     try:
         return importlib.import_module(module)

@@ -1,4 +1,4 @@
-"""How much boxes overlap, seen from above and in 3D, and non-maximum suppression by it.
+"""How much boxes overlap, seen from above and in 3D.
 
 Exact for rotated boxes and computed in float64. Only pairs whose circumscribed circles meet are computed.
 """
@@ -9,17 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.kernels import load_kernels
-
-KERNELS = "asca_pillars.geometry.overlap_kernels"
 
 _Boxes = NDArray[np.floating[Any]]
 _Doubles = NDArray[np.float64]
 _Point = tuple[_Doubles, _Doubles]  # x and y of K points, each (K,)
-
-# Candidates that suppression looks at together: enough to keep NumPy busy, few enough that the pairs inside a
-# block, some of them needless, stay cheap.
-_NMS_BLOCK = 64
 
 
 def bev_intersection(a: _Boxes, b: _Boxes) -> _Doubles:
@@ -98,43 +91,6 @@ def aligned_bev_iou(a: _Boxes, b: _Boxes) -> NDArray[np.float32]:
     bx, by, bl, bw = _aligned(b)
     shared = _shared_length(ax, al, bx, bl) * _shared_length(ay, aw, by, bw)
     return _over_union(shared, al * aw, bl * bw)
-
-
-def rotated_nms(
-    boxes: _Boxes, scores: NDArray[np.floating[Any]], iou_threshold: float, limit: int | None = None
-) -> NDArray[np.int64]:
-    """Greedy suppression by `bev_iou`: indices of the kept boxes, by descending score; of the first `limit` of them.
-
-    A box is dropped if a kept, better one overlaps it by more than `iou_threshold`. Of equal scores the
-    earlier goes first.
-
-    Args:
-        boxes: (N, 7), LiDAR frame; N may be 0.
-        scores: (N,), any monotonic measure.
-    """
-    order = np.argsort(-scores, kind="stable")
-    kernels = load_kernels(KERNELS)
-    suppress = _suppress if kernels is None else kernels.suppress
-    return order[
-        suppress(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)
-    ]
-
-
-def _suppress(boxes: _Doubles, iou_threshold: float, limit: int) -> NDArray[np.int64]:
-    """`rotated_nms` of boxes that come best first."""
-    waiting = np.arange(len(boxes))
-    kept = [waiting[:0]]
-    while len(waiting) and sum(map(len, kept)) < limit:
-        block, waiting = waiting[:_NMS_BLOCK], waiting[_NMS_BLOCK:]
-        clashes = bev_iou(boxes[block], boxes[block]) > iou_threshold
-        alive = np.ones(len(block), bool)
-        for index, row in enumerate(clashes):
-            if alive[index]:
-                alive[index + 1 :] &= ~row[index + 1 :]
-        kept.append(block[alive])
-        clashes = bev_iou(boxes[block[alive]], boxes[waiting]) > iou_threshold
-        waiting = waiting[~clashes.any(axis=0)]
-    return np.concatenate(kept)[:limit]
 
 
 def _near_pairs(a: _Doubles, b: _Doubles) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

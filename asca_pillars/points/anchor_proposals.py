@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.boxes import decode_boxes
-from asca_pillars.geometry.decode import HeadMaps, sigmoid
+from asca_pillars.geometry.decode import HeadMaps, rotated_nms, sigmoid
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.geometry.overlap import rotated_nms
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.decode import PostProcess, sigmoid
+from asca_pillars.geometry.decode import PostProcess, rotated_nms, sigmoid
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.geometry.overlap import rotated_nms
 from asca_pillars.points.refinement import decode_refinement
 
 

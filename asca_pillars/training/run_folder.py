@@ -7,8 +7,9 @@ import yaml
 from rich.progress import track
 
 from asca_pillars.config import Config, load_config
-from asca_pillars.data.expected_input import ExpectedInput, measure_expected_input
+from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.data.frames import read_frame
+from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path

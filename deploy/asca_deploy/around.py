@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.ground_height import fit_ground_plane
+from asca_pillars.geometry.decode import rotated_nms
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.overlap import rotated_nms
 from asca_pillars.geometry.ranges import Ranges
 
 CAMERA_FIELD_RAD = math.pi / 4

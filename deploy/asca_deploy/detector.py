@@ -13,20 +13,17 @@ from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
-from asca_deploy.bundle import AnyBundle, Bundle, PvRcnnBundle
+from asca_deploy.bundle import AnyBundle
 from asca_deploy.manifest import load_any_bundle
+from asca_deploy.open_pipeline import open_pipeline
 from asca_deploy.ort_session import check_onnxruntime
-from asca_deploy.pillar_pipeline import PillarPipeline
-from asca_deploy.pipeline import Laps, Pipeline
-from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
-from asca_deploy.refine_pipeline import RefinePipeline
-from asca_deploy.shipped import find_bundle, sample_scan_path
+from asca_deploy.pipeline import Laps
+from asca_deploy.shipped import find_bundle
 from asca_deploy.stream import overlapped
-from asca_pillars.data.input_check import InputWarning, UsablePoints, check_input, usable_points
+from asca_pillars.data.input_check import InputWarning, check_input
 from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry import overlap
+from asca_pillars.errors import ConfigError, ScanError
+from asca_pillars.geometry import decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.frame_report import FrameReport, ScanCounts, summed
@@ -38,6 +35,18 @@ _log = logging.getLogger("asca_deploy")
 
 View: TypeAlias = Literal["ahead", "around"]
 _WAITING = "waiting"  # beside the names of stages
+_GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
+
+
+class UsablePoints(NamedTuple):
+    """The points that a pipeline takes, and what was done to get them."""
+
+    points: NDArray[np.float32]
+    """(N, 4), finite, reflectance within 0..1."""
+    unclipped: NDArray[np.float32]
+    """(N, 4), the same with the reflectance as it came."""
+    non_finite: int
+    clipped: int
 
 
 class _Frame(NamedTuple):
@@ -96,7 +105,7 @@ class Detector:
         view: View = "ahead",
     ) -> None:
         start = perf_counter()
-        load_kernels(overlap.KERNELS)  # here rather than in the first scan
+        load_kernels(decode.KERNELS)  # here rather than in the first scan
         self.folder = find_bundle(bundle)
         self.threads = check_threads(threads)
         check_onnxruntime()
@@ -104,7 +113,9 @@ class Detector:
         self.bundle: AnyBundle = load_any_bundle(self.folder)
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
-        self.pipeline, self.provider, self.precision, self.candidates = self._choose(provider, precision)
+        self.pipeline, self.provider, self.precision, self.candidates = open_pipeline(
+            self.folder, self.bundle, provider, precision, self.threads
+        )
         self.pipeline.spec = self.spec
         if self.candidates:
             _log.info(auto.summary(self.runs_on, self.candidates))
@@ -184,13 +195,11 @@ class Detector:
     def _open(self, points: NDArray[Any]) -> _Frame:
         """The usable points in the model's frame."""
         start = perf_counter()
-        usable = usable_points(points)
+        usable = usable_points(points, self._to_model)
         warnings = []
         if usable.clipped:
             text = f"{usable.clipped} reflectances lie outside 0..1 and were set to the nearer end"
             warnings.append(InputWarning("clipped", text))
-        if not self._to_model.is_identity:
-            usable = usable.moved(self._to_model)
         turns = self._turns if self.passes == 1 else about_ground(self._turns, usable.points)
         return _Frame(start, [("input", perf_counter())], usable, turns, [], warnings, points)
 
@@ -240,27 +249,43 @@ class Detector:
         source = weakref.ref(frame.source) if isinstance(frame.source, np.ndarray) else None
         return replace(detections, _report=report, _source=source, _ranges=self._ranges, _level=self._level)
 
-    def _choose(
-        self, provider: providers.Provider | Literal["auto"], precision: providers.Precision | None
-    ) -> auto.Choice[Pipeline[Any, Any]]:
-        bundle = self.bundle
 
-        def open_pipeline(name: providers.Provider, digits: providers.Precision) -> Pipeline[Any, Any]:
-            if isinstance(bundle, PvRcnnBundle):
-                return PvRcnnPipeline(self.folder, bundle, name, digits, self.threads)
-            assert isinstance(bundle, Bundle), "there are no other kinds"
-            family = PillarPipeline if bundle.kind == "pillar" else RefinePipeline
-            return family(self.folder, bundle, name, digits, self.threads)
+def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> UsablePoints:
+    """The finite points of (N, 4) as contiguous float32, reflectance within 0..1.
 
-        if provider != providers.AUTO:
-            digits = precision or "float32"
-            return auto.Choice(open_pipeline(provider, digits), provider, digits, ())
-        points = read_scan(sample_scan_path()).points
+    Args:
+        points: (N, 4) x, y, z in metres and reflectance, of any real type.
+        to_model: into the model's frame; None if they are in it.
 
-        def detect(pipeline: Pipeline[Any, Any]) -> Detections:
-            laps: Laps = []
-            return pipeline.finish(pipeline.infer(pipeline.prepare(points, laps), laps), laps)
-
-        return auto.choose(
-            providers.available(), open_pipeline, detect, self.bundle.spec, precision, weights=self.bundle.precision
+    Raises:
+        ScanError: `points` has another shape or does not hold real numbers.
+    """
+    if isinstance(points, np.ma.MaskedArray):
+        raise ScanError(
+            "the points are a masked array; give those that are not masked: points[~points.mask.any(1)].data"
         )
+    try:
+        array = np.asarray(points)
+    except (TypeError, ValueError, OverflowError):
+        raise ScanError(f"the points are not an array of numbers; {_GIVE}") from None
+    if array.dtype.kind not in "iuf":
+        raise ScanError(f"the points are not an array of numbers, but of type {str(array.dtype)[:40]}; {_GIVE}")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is counted
+        scan = np.ascontiguousarray(array, np.float32)
+    if scan.ndim != 2 or scan.shape[1] != 4:
+        columns = scan.shape[1] if scan.ndim == 2 else 0
+        advice = "; append a column of reflectances 0..1" if columns == 3 else ""
+        advice = "; give the first four columns: points[:, :4]" if columns > 4 else advice
+        raise ScanError(f"the points have shape {array.shape}, not (N, 4): x, y, z, reflectance{advice}")
+    finite, non_finite = np.isfinite(scan), 0
+    if not finite.all():
+        usable = finite.all(axis=1)
+        scan, non_finite = scan[usable], int(len(scan) - usable.sum())
+    if to_model is not None and not to_model.is_identity:
+        scan = to_model.points(scan)
+    reflectance = scan[:, 3].copy()  # in one piece, which NumPy searches several times faster
+    if not len(scan) or (reflectance.min() >= 0 and reflectance.max() <= 1):
+        return UsablePoints(scan, scan, non_finite, 0)
+    clipped = scan.copy()
+    np.clip(reflectance, 0, 1, out=clipped[:, 3])
+    return UsablePoints(clipped, scan, non_finite, int((clipped[:, 3] != reflectance).sum()))

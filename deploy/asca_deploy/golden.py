@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Bundle
-from asca_deploy.canvas_backbone import Canvas
 from asca_deploy.detector import Detector
 from asca_deploy.pillar_backbone import HeadAnswer
-from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
 from asca_deploy.refine_pipeline import RefinePipeline, refine_inputs
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import BundleError

@@ -30,7 +30,7 @@ from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
 from asca_pillars.config import pillar_spec
-from asca_pillars.data.expected_input import measure_expected_input
+from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint

@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
-from asca_deploy.canvas_backbone import Canvas
-from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.decode import HeadMaps

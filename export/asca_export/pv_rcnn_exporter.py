@@ -13,7 +13,7 @@ from asca_export import graphs
 from asca_export.exporter import LICENSE, MIN_SCANS, provenance, write_proven
 from asca_export.pv_rcnn_forms import export_pv_rcnn_graphs
 from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
-from asca_pillars.data.expected_input import measure_expected_input
+from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
 from asca_pillars.models.checkpoint import Checkpoint

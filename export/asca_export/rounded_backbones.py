@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.canvas_backbone import Canvas
+from asca_deploy.pillar_pipeline import Canvas
 from asca_export import graphs, qdq
 from asca_export.fast_forms import CanvasSteps, FastBackbone
 from asca_export.quantize import STEPS, input_moments, layer_names, round_weights, scale_to_steps

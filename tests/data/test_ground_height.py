@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_pillars.data.frame_check import ground_z_m
 from asca_pillars.data.ground_height import estimate_height, measured_mounting
+from asca_pillars.data.input_check import ground_z_m
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ScanError
 

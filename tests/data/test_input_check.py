@@ -5,8 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import sample_scan_path
-from asca_pillars.data.expected_input import ExpectedInput, measure_expected_input
+from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.data.input_check import InputWarning, check_input
+from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.pillars.grid import PillarGrid

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
-from asca_deploy.canvas_backbone import CanvasBackbone
-from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.pillar_pipeline import CanvasBackbone, PillarPipeline
 from asca_deploy.stream import overlapped
 from asca_pillars.errors import ScanError
 from tests.deploy.conftest import make_scan

@@ -20,8 +20,9 @@ from asca_export import graphs, reissue
 from asca_export.exporter import export_bundle
 from asca_export.fast_forms import FastBackbone
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
-from asca_pillars.data.expected_input import ExpectedInput, measure_expected_input
+from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps

@@ -12,8 +12,7 @@ import pytest
 from onnx import numpy_helper
 
 from asca_deploy import Bundle, Detector, load_bundle
-from asca_deploy.canvas_backbone import CanvasBackbone
-from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.pillar_pipeline import CanvasBackbone, PillarPipeline
 from asca_export import int8
 from asca_export.exporter import export_bundle
 from asca_pillars.config import pillar_spec

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from asca_pillars.geometry import compiling as kernels
-from asca_pillars.geometry import overlap
+from asca_pillars.geometry import decode, overlap
+from asca_pillars.geometry.decode import rotated_nms
 from asca_pillars.geometry.kernels import load_kernels
-from asca_pillars.geometry.overlap import rotated_nms
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillarize import PillarLimits, Pillars, pillarize
 
@@ -32,7 +32,7 @@ LIMITS = (PillarLimits(10**9, 10**9), PillarLimits(20, 3), PillarLimits(10**9, 2
 DRAWN = 57, 4111435180, 2859312739, 1432910283
 
 WITH_KERNELS = (
-    *("geometry.overlap", "pillars.pillarize", "points.columns", "points.ball_query"),
+    *("geometry.decode", "pillars.pillarize", "points.columns", "points.ball_query"),
     *("tables.cell_map", "tables.voxels"),
 )
 
@@ -41,7 +41,7 @@ def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
     """The function's result where numba is not installed."""
     with (
         patch("asca_pillars.pillars.pillarize.load_kernels", lambda _: None),
-        patch("asca_pillars.geometry.overlap.load_kernels", lambda _: None),
+        patch("asca_pillars.geometry.decode.load_kernels", lambda _: None),
     ):
         return function(*arguments)
 
@@ -204,9 +204,7 @@ def test_the_compiled_forms_exist(place: str) -> None:
 
 
 def test_nothing_is_compiled_at_use() -> None:
-    module = load_kernels(overlap.KERNELS)
+    module = load_kernels(decode.KERNELS)
     assert module is not None
     with pytest.raises(TypeError, match="No matching definition"):
-        module._suppress(
-            np.zeros((1, 7), np.float32), 0.5, 1, np.empty((1, 3)), np.empty((1, 5)), np.empty(1, np.int64)
-        )
+        module._nms(np.zeros((1, 7), np.float32), 0.5, 1, np.empty((1, 3)), np.empty((1, 5)), np.empty(1, np.int64))

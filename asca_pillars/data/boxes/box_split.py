@@ -29,8 +29,8 @@ from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scan_settings import ScanSettings, sample_points
 from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, find_scans
-from asca_pillars.data.scans.reflectance import ReflectanceScale
-from asca_pillars.data.scans.scan_reader import folder_reflectance_scale, read_scan, stored_points
+from asca_pillars.data.scans.scan_reader import ReflectanceScale, read_scan
+from asca_pillars.data.scans.stored_scans import folder_reflectance_scale, stored_points
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.settings import read_settings

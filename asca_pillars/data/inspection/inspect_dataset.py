@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from asca_pillars.config import DataConfig
-from asca_pillars.data.frame_check import FrameDoubt
+from asca_pillars.data.input_check import FrameDoubt
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError, ScanError

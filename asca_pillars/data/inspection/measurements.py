@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import DataConfig
-from asca_pillars.data.frame_check import FrameDoubt, doubt_frame, ground_z_m
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
+from asca_pillars.data.input_check import FrameDoubt, doubt_frame, ground_z_m
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes

@@ -20,7 +20,8 @@ from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibrati
 from asca_pillars.data.kitti.kitti_labels import KittiObject, boxes_from_objects, objects_3d, read_labels
 from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scans.scan_reader import read_scan, stored_points
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.data.scans.stored_scans import stored_points
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from asca_pillars.data.recordings.messages import decoded, reason
 from asca_pillars.data.recordings.recording import Message
-from asca_pillars.data.scans.raw_floats import MAX_POINTS
-from asca_pillars.data.scans.records import Field, StoredPoints, assemble_points, wanted_fields
+from asca_pillars.data.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, wanted_fields
 from asca_pillars.errors import ScanError
 
 # sensor_msgs/PointField: datatype 1 to 8.

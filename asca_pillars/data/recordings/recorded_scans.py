@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from asca_pillars.data.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.data.recordings.recording import Recording, Topic
-from asca_pillars.data.scans.reflectance import ReflectanceScale
-from asca_pillars.data.scans.scan_reader import FolderScale, Scan, common_reflectance_scale, finite_scan
+from asca_pillars.data.scans.scan_reader import ReflectanceScale, Scan, finite_scan
+from asca_pillars.data.scans.stored_scans import FolderScale, common_reflectance_scale
 from asca_pillars.errors import ScanError
 
 

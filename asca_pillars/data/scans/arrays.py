@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.scans.raw_floats import MAX_POINTS
-from asca_pillars.data.scans.records import AGAIN, StoredPoints
+from asca_pillars.data.scans.records import AGAIN, MAX_POINTS, StoredPoints
 from asca_pillars.errors import ScanError
 
 _MANY_COLUMNS = 8

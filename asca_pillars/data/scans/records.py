@@ -12,6 +12,9 @@ from asca_pillars.errors import ScanError
 
 AGAIN = "the file is damaged or incomplete: copy or export it again"
 MAX_HEADER_BYTES = 65_536
+MAX_POINTS = 50_000_000
+"""Points that a file may hold; ten times what the densest sensors give in a second."""
+
 _REFLECTANCE = ("intensity", "reflectance", "reflectivity", "i")
 _DIGITS = re.compile(r"[0-9]{1,18}")
 

@@ -22,7 +22,8 @@ from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dataset
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
-from asca_pillars.data.scans.scan_reader import read_scan, stored_points
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.data.scans.stored_scans import stored_points
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.pillar_config import PillarModel

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from asca_pillars.data.scans import raw_floats
+from asca_pillars.data.scans import scan_reader
 from asca_pillars.data.scans.arrays import points_from_array
 from asca_pillars.data.scans.ply import MAX_LISTS
-from asca_pillars.data.scans.scan_reader import folder_reflectance_scale, read_scan
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.data.scans.stored_scans import folder_reflectance_scale
 from asca_pillars.errors import ScanError
 from tests.data.scans.test_scan_reader import POINTS, literal_lzf, npy, pcd, ply, read
 
@@ -72,7 +73,7 @@ def test_files_with_too_many_points_are_refused_before_they_are_read(tmp_path, m
         file.truncate(40 * 10**9)
     with pytest.raises(ScanError, match=r"a\.bin: 40000000000 bytes"):
         read_scan(tmp_path / "a.bin")
-    monkeypatch.setattr(raw_floats, "MAX_POINTS", 3)
+    monkeypatch.setattr(scan_reader, "MAX_POINTS", 3)
     with pytest.raises(ScanError, match="more than 3 points"):
         read(tmp_path, "b.bin", POINTS.tobytes())
 

@@ -3,7 +3,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.canvas_backbone import Canvas
+from asca_deploy.pillar_pipeline import Canvas
 from asca_pillars.pillars.grid import PillarGrid
 
 # 8 + 16 + 32 columns by 16 rows, off center.

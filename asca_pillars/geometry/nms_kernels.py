@@ -1,4 +1,4 @@
-"""The loop of `rotated_nms`, compiled; what it computes is said in `overlap`, in NumPy.
+"""The loop of `rotated_nms`, compiled; what it computes is said in `decode` and `overlap`, in NumPy.
 
 Here the cosine of the turn between two boxes is a sum of products of theirs, so overlaps differ in their last digits:
 the same boxes stay unless an overlap is within 1e-12 or so of the threshold.
@@ -16,10 +16,10 @@ _Doubles = NDArray[np.float64]
 _Integers = NDArray[np.int64]
 
 
-def suppress(boxes: _Doubles, iou_threshold: float, limit: int) -> _Integers:
-    """`overlap._suppress`, box by box: boxes (N, 7), best first -> indices (K,) of those kept."""
+def nms(boxes: _Doubles, iou_threshold: float, limit: int) -> _Integers:
+    """`decode._nms`, box by box: boxes (N, 7), best first -> indices (K,) of those kept."""
     kept = np.empty(len(boxes), np.int64)
-    count = _suppress(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
+    count = _nms(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
     return kept[:count]
 
 
@@ -69,7 +69,7 @@ def _shared_area(x: float, y: float, cos: float, sin: float, al: float, aw: floa
     *(given(types.float64, 2), types.float64, types.int64),
     *(written(types.float64, 2), written(types.float64, 2), written(types.int64)),
 )
-def _suppress(
+def _nms(
     boxes: _Doubles, iou_threshold: float, limit: int, circles: _Doubles, shapes: _Doubles, kept: _Integers
 ) -> int:
     """`circles`: x, y and radius of the kept boxes; `shapes`: half length, half width, area, cosine and sine."""

@@ -1,0 +1,53 @@
+"""Which pipeline runs a bundle, by its family, and on which provider."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from asca_deploy import auto, providers
+from asca_deploy.bundle import AnyBundle, Bundle, PvRcnnBundle
+from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
+from asca_deploy.refine_pipeline import RefinePipeline
+from asca_deploy.shipped import sample_scan_path
+from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.geometry.detections import Detections
+
+
+def open_pipeline(
+    folder: Path,
+    bundle: AnyBundle,
+    provider: providers.Provider | Literal["auto"],
+    precision: providers.Precision | None,
+    threads: int,
+) -> auto.Choice[Pipeline[Any, Any]]:
+    """The pipeline of a bundle's family, on the provider of that name or, with auto, on the fastest that agrees.
+
+    Args:
+        folder: of the bundle.
+        bundle: its manifest, verified by `load_any_bundle`.
+        provider, threads: of the slowest network.
+        precision: None for float32, with auto for any.
+
+    Raises:
+        BundleError: a graph cannot be run or is not what the manifest says.
+        ProviderError: the provider does not start or cannot run the graph; with auto, none can be taken.
+    """
+
+    def open_on(name: providers.Provider, digits: providers.Precision) -> Pipeline[Any, Any]:
+        if isinstance(bundle, PvRcnnBundle):
+            return PvRcnnPipeline(folder, bundle, name, digits, threads)
+        assert isinstance(bundle, Bundle), "there are no other kinds"
+        family = PillarPipeline if bundle.kind == "pillar" else RefinePipeline
+        return family(folder, bundle, name, digits, threads)
+
+    if provider != providers.AUTO:
+        digits = precision or "float32"
+        return auto.Choice(open_on(provider, digits), provider, digits, ())
+    points = read_scan(sample_scan_path()).points
+
+    def detect(pipeline: Pipeline[Any, Any]) -> Detections:
+        laps: Laps = []
+        return pipeline.finish(pipeline.infer(pipeline.prepare(points, laps), laps), laps)
+
+    return auto.choose(providers.available(), open_on, detect, bundle.spec, precision, weights=bundle.precision)
