@@ -1,6 +1,6 @@
 """The files of this project that a scan passes through from its file to the boxes.
 
-    python -m benchmarks.call_path [SCAN]
+    python -m benchmarks.call_path [SCAN] [--bundle BUNDLE]
 
 A file counts if at least one of its functions is called; the detector is open and has seen a scan before. Loops that
 numba compiles stand in files of their own (`*_kernels.py`), as a second form of a function of the file that calls them.
@@ -22,9 +22,12 @@ from asca_pillars.data.scans.scan_reader import read_scan
 ROOTS = [Path(package.__file__).parent for package in (asca_pillars, asca_deploy) if package.__file__]
 
 
-def main(scan: Annotated[Path | None, typer.Argument(help="A scan. Default: the sample.")] = None) -> None:
+def main(
+    scan: Annotated[Path | None, typer.Argument(help="A scan. Default: the sample.")] = None,
+    bundle: Annotated[str | None, typer.Option(help="Folder, or one that ships. Default: the one that ships.")] = None,
+) -> None:
     """Print each file with its functions and how often they were called."""
-    calls = called_functions(Detector(), sample_scan_path() if scan is None else scan)
+    calls = called_functions(Detector(bundle), sample_scan_path() if scan is None else scan)
     files = sorted({name for name, _ in calls})
     for name in files:
         functions = [f"{function} {count}" for (file, function), count in calls.items() if file == name]
