@@ -25,6 +25,7 @@ from rich.table import Table
 from asca_pillars.data.kitti import in_image
 from asca_pillars.sim.annotation import label_camera_view
 from asca_pillars.sim.casting.raycast import cast
+from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.lidar import draw_firings
 from asca_pillars.sim.sensor.returns import measure
 from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
@@ -66,13 +67,13 @@ def _stages(config: SimulationConfig, frames: int, seed: int) -> dict[str, list[
     for index in range(frames + WARM_UP):
         marks = [time.process_time()]
         camera_only = config.field_of_view == "camera"
-        scene = draw_scene(config.scene, np.random.default_rng([seed, index, 0]))
+        scene = draw_scene(config.scene, draws_of(seed, index, 0))
         marks.append(time.process_time())
         reach = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0) if camera_only else np.pi
         bodies = build(scene, config.scene, (seed, index), reach)
         marks.append(time.process_time())
-        firings = draw_firings(config.lidar, np.random.default_rng([seed, index, 2]), camera_only)
-        noise = np.random.default_rng([seed, index, 3])
+        firings = draw_firings(config.lidar, draws_of(seed, index, 2), camera_only)
+        noise = draws_of(seed, index, 3)
         hits = cast(bodies, len(scene.targets), scene.ground, firings, int(noise.integers(1 << 62)))
         marks.append(time.process_time())
         returns = measure(hits, firings, noise)

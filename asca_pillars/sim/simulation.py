@@ -1,7 +1,7 @@
 """Writing simulated frames in KITTI's layout."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -23,7 +23,9 @@ from asca_pillars.files import atomic_path
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
 from asca_pillars.sim.parallel import ABOUT_FILE, check_wishes, claim_simulation, for_each
+from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.scene_config import SceneConfig
+from asca_pillars.sim.sensor.image_border import outside_image
 from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import Returns, measure
 from asca_pillars.sim.world.scene import Scene, build, draw_scene
@@ -61,9 +63,9 @@ def simulate_frame(seed: int, index: int, config: SimulationConfig | None = None
     """Frame `index` of the data set `seed`: the same for every call, whatever other frames are made."""
     config = config or SimulationConfig()
     camera_only, around = config.field_of_view == "camera", config.field_of_view == "around"
-    scene = draw_scene(config.scene, np.random.default_rng([seed, index, 0]))
-    firings = draw_firings(config.lidar, np.random.default_rng([seed, index, 2]), camera_only, around)
-    hits, returns = take_scan(scene, config, firings, (seed, index), np.random.default_rng([seed, index, 3]))
+    scene = draw_scene(config.scene, draws_of(seed, index, 0))
+    firings = draw_firings(config.lidar, draws_of(seed, index, 2), camera_only, around)
+    hits, returns = take_scan(scene, config, firings, (seed, index), draws_of(seed, index, 3))
     seen = np.ones(len(returns.points), bool) if around else in_image(returns.points, scene.calibration)
     label = label_all_around if around else label_camera_view
     objects = label(scene.targets, hits, returns.owner[seen], scene.calibration, config.scene)
@@ -90,6 +92,8 @@ def take_scan(
         numbers: of the bodies.
     """
     camera_only = config.field_of_view == "camera"
+    if camera_only:
+        firings = replace(firings, outside=outside_image(firings, scene.calibration))
     half_angle = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0)
     bodies = build(scene, config.scene, seed, half_angle if camera_only else np.pi, numbers)
     key = int(noise.integers(1 << 62))

@@ -82,9 +82,17 @@ def in_image(
 
     KITTI labels only what the camera sees, so training points are cropped to this view.
     """
-    pixels, _ = calib.project(points_lidar)
-    inside = (pixels >= 0) & (pixels < np.asarray(image_size_wh))
-    return inside[..., 0] & inside[..., 1]
+    # Coordinates by rows: NumPy handles three long ones several times faster than many short ones.
+    xyz = np.moveaxis(points_lidar[..., :3], -1, 0).reshape(3, -1).astype(np.float64)
+    rect_from_lidar = calib.rect_from_lidar_matrix
+    rect = rect_from_lidar[:3, :3] @ xyz + rect_from_lidar[:3, 3:]
+    u, v, depth_m = calib.p2[:, :3] @ rect + calib.p2[:, 3:]
+    before = depth_m >= NEAR_PLANE_M
+    divisor = np.where(before, depth_m, 1.0)
+    u, v = u / divisor, v / divisor
+    width, height = image_size_wh
+    inside = before & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    return inside.reshape(points_lidar.shape[:-1])
 
 
 def project_edges(boxes: NDArray[np.floating], calib: Calibration) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from asca_pillars.sim.bodies.bicycles import bicycle
-from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, limbs
+from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, limbs, rotated
 from asca_pillars.sim.bodies.vehicles import wheels
 
 
@@ -67,7 +67,7 @@ def _leaning(body: Primitives, angle_rad: float) -> Primitives:
     roll = np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
     return replace(
         body,
-        triangles=body.triangles @ roll.T,
+        triangles=rotated(body.triangles, roll),
         centers=body.centers @ roll.T,
-        unit_from_world=body.unit_from_world @ roll.T,
+        unit_from_world=rotated(body.unit_from_world, roll),
     )

@@ -17,7 +17,8 @@ BACKGROUND = -1  # owner of everything that is no labelled object
 _CUBE_FACES = np.array(
     [[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7]]  # sides, top; the bottom is never seen
 )
-_QUAD = np.array([[0, 1, 2], [0, 2, 3]])
+_QUAD = np.array([0, 1, 2, 0, 2, 3])  # corners of its two triangles
+_CUBE = _CUBE_FACES[:, _QUAD].ravel()
 
 
 @dataclass(frozen=True)
@@ -71,12 +72,18 @@ class Primitives:
         rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         shift = np.array([x_m, y_m, z_m])
         return Primitives(
-            self.triangles @ rotation.T + shift,
+            rotated(self.triangles, rotation) + shift,
             self.triangle_surface,
             self.centers @ rotation.T + shift,
-            self.unit_from_world @ rotation.T,
+            rotated(self.unit_from_world, rotation),
             self.ellipsoid_surface,
         )
+
+
+def rotated(vectors: Floats, rotation: Floats) -> Floats:
+    """Vectors (..., 3) turned by a rotation (3,3)."""
+    # One product: NumPy would multiply a stack of matrices one after another.
+    return (vectors.reshape(-1, 3) @ rotation.T).reshape(vectors.shape)
 
 
 def _only_triangles(triangles: Floats, surface: Floats) -> Primitives:
@@ -91,7 +98,7 @@ def quads(corners: npt.ArrayLike, surface: Surface | Floats) -> Primitives:
     corners = np.asarray(corners, float).reshape(-1, 4, 3)
     table = surface.row if isinstance(surface, Surface) else surface
     table = np.broadcast_to(table, (len(corners), 3)) if table.ndim == 1 else table.reshape(-1, 3)
-    return _only_triangles(corners[:, _QUAD].reshape(-1, 3, 3), np.repeat(table, 2, axis=0))
+    return _only_triangles(corners.take(_QUAD, axis=1).reshape(-1, 3, 3), np.repeat(table, 2, axis=0))
 
 
 def cuboids(rows: npt.ArrayLike) -> Primitives:
@@ -105,13 +112,12 @@ def cuboids(rows: npt.ArrayLike) -> Primitives:
     sign = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
     local = sign[None] * half[:, None]  # (N,4,2)
     cos, sin = np.cos(rows[:, 6, None]), np.sin(rows[:, 6, None])
-    x = rows[:, 0, None] + local[..., 0] * cos - local[..., 1] * sin
-    y = rows[:, 1, None] + local[..., 0] * sin + local[..., 1] * cos
-    bottom = np.stack([x, y, np.broadcast_to(rows[:, 2, None], x.shape)], axis=-1)
-    top = bottom + np.array([0.0, 0.0, 1.0]) * rows[:, 5, None, None]
-    corners = np.concatenate([bottom, top], axis=1)  # (N,8,3)
-    faces = corners[:, _CUBE_FACES].reshape(-1, 4, 3)
-    return _only_triangles(faces[:, _QUAD].reshape(-1, 3, 3), np.repeat(rows[:, 7:10], 10, axis=0))
+    corners = np.empty((len(rows), 8, 3))
+    corners[:, :4, 0] = rows[:, 0, None] + local[..., 0] * cos - local[..., 1] * sin
+    corners[:, :4, 1] = rows[:, 1, None] + local[..., 0] * sin + local[..., 1] * cos
+    corners[:, 4:, :2] = corners[:, :4, :2]
+    corners[:, :4, 2], corners[:, 4:, 2] = rows[:, 2, None], (rows[:, 2] + rows[:, 5])[:, None]
+    return _only_triangles(corners.take(_CUBE, axis=1).reshape(-1, 3, 3), np.repeat(rows[:, 7:10], 10, axis=0))
 
 
 def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
@@ -138,7 +144,7 @@ def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
     corners = np.stack([foot, np.roll(foot, -1, 1), np.roll(top, -1, 1), top], axis=2).reshape(-1, 4, 3)
     surface = np.zeros((len(rows), 3))
     surface[:, 0], surface[:, 1] = rows[:, 6], 0.3
-    return _only_triangles(corners[:, _QUAD].reshape(-1, 3, 3), np.repeat(surface, 2 * sides, axis=0))
+    return _only_triangles(corners.take(_QUAD, axis=1).reshape(-1, 3, 3), np.repeat(surface, 2 * sides, axis=0))
 
 
 def ellipsoids(
@@ -163,14 +169,23 @@ def limbs(
     start, end = np.asarray(start, float), np.asarray(end, float)
     radii = np.asarray(radii, float)
     along = end - start
-    length = np.linalg.norm(along, axis=1, keepdims=True)
+    length = _lengths(along)
     along = along / length
     sideways = np.asarray(side) - along * (along @ np.asarray(side))[:, None]
     # A limb that points sideways itself needs another second axis.
-    flat = np.linalg.norm(sideways, axis=1) < 0.2
-    sideways[flat] = np.cross(along[flat], (0.0, 0.0, 1.0)) + 1e-9
-    sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
-    axes = np.stack([along, sideways, np.cross(along, sideways)], axis=1)
+    flat = _lengths(sideways)[:, 0] < 0.2
+    if flat.any():
+        sideways[flat] = np.cross(along[flat], (0.0, 0.0, 1.0)) + 1e-9
+    sideways /= _lengths(sideways)
+    axes = np.empty((len(along), 3, 3))
+    axes[:, 0], axes[:, 1] = along, sideways
+    (ax, ay, az), (sx, sy, sz) = along.T, sideways.T
+    axes[:, 2, 0], axes[:, 2, 1], axes[:, 2, 2] = ay * sz - az * sy, az * sx - ax * sz, ax * sy - ay * sx
     # Joints overlap, so that a body has no gaps where its ellipsoids taper.
     half = length[:, 0] / 2 + 0.5 * radii.mean(axis=1)
     return ellipsoids((start + end) / 2, np.column_stack([half, radii]), surface, axes)
+
+
+def _lengths(vectors: Floats) -> Floats:
+    """(N,1) of vectors (N,3)."""
+    return np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))

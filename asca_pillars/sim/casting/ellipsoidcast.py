@@ -6,8 +6,18 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.sim.casting.rays import NearestHits, Rays
-from asca_pillars.sim.casting.windows import PLAIN, WHOLE_TURN, Window, columns_of, keep, ray_chance, window_of
+from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
+from asca_pillars.sim.casting.windows import (
+    NO_WINDOW,
+    PLAIN,
+    WHOLE_TURN,
+    Window,
+    columns_of,
+    keep,
+    ray_chance,
+    rings_of,
+    window_of,
+)
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -53,7 +63,7 @@ def extent_of(m: Floats, ux: float, uy: float) -> Extent:
 
 
 @numba.njit(**PLAIN)
-def ellipsoid_window(center: Floats, m: Floats, distance: float, rays: Rays) -> Window:
+def ellipsoid_window(center: Floats, m: Floats, distance: float, limits: RayLimits) -> Window:
     """The window of an ellipsoid |m p| = 1, m (3,3), around a center (3,) that is `distance` metres away.
 
     It is empty for one beside the wedge of columns that are cast.
@@ -61,27 +71,28 @@ def ellipsoid_window(center: Floats, m: Floats, distance: float, rays: Rays) -> 
     cx, cy, cz = center[0], center[1], center[2]
     ux, uy = cx / max(distance, 1e-9), cy / max(distance, 1e-9)
     extent = extent_of(m, ux, uy)
-    if rays.wedge_slope > 0.0:
-        reach = extent.flat * np.sqrt(1.0 + rays.wedge_slope**2)
-        if abs(cy) - rays.wedge_slope * cx > reach:
-            return Window(0, 0, 0.0, 0.0)
-    if distance <= extent.flat + _NEAR_AXIS_M:
-        low, width = -np.pi, WHOLE_TURN
-    else:
-        # Half the width seen from the axis: the extent across the line of sight, nearer than the center at most by
-        # the extent along it.
-        half_angle = np.arctan(extent.across / (distance - extent.flat))
-        low, width = np.arctan2(cy, cx) - half_angle, 2 * half_angle
+    if limits.wedge_slope > 0.0:
+        reach = extent.flat * np.sqrt(1.0 + limits.wedge_slope**2)
+        if abs(cy) - limits.wedge_slope * cx > reach:
+            return NO_WINDOW
     near, far = max(distance - extent.flat, 0.0), distance + extent.flat
-    return window_of(cz - extent.up, cz + extent.up, near, far, low, width, rays)
+    first, last = rings_of(cz - extent.up, cz + extent.up, near, far, limits)
+    if first >= last:
+        return NO_WINDOW
+    if distance <= extent.flat + _NEAR_AXIS_M:
+        return window_of(first, last, -np.pi, WHOLE_TURN, limits)
+    # Half the width seen from the axis: the extent across the line of sight, nearer than the center at most by the
+    # extent along it.
+    half_angle = np.arctan(extent.across / (distance - extent.flat))
+    return window_of(first, last, np.arctan2(cy, cx) - half_angle, 2 * half_angle, limits)
 
 
 @numba.njit(**PLAIN)
-def leaves_of(density_per_m: float, distance: float, rays: Rays) -> Leaves:
+def leaves_of(density_per_m: float, distance: float, slope: Floats, columns_per_turn: int) -> Leaves:
     """Leaves grow in tufts, so that crowns have depth and not only noise."""
     away = max(distance, 2.0)
-    columns = int(TUFT_M / (away * 2.0 * np.pi / len(rays.cast)))
-    rings = int(TUFT_M / (away * abs(rays.slope[0] - rays.slope[-1]) / len(rays.slope)))
+    columns = int(TUFT_M / (away * 2.0 * np.pi / columns_per_turn))
+    rings = int(TUFT_M / (away * abs(slope[0] - slope[-1]) / len(slope)))
     return Leaves(density_per_m, max(rings, 1), max(columns, 1))
 
 
@@ -122,16 +133,16 @@ def cast_ellipsoids(
     # Taken out of their tuples once: numba counts references at every access.
     slopes, stretch, origins, phase_counts = rays.slope, rays.stretch, rays.origin_z_m, rays.phase_counts
     cos_phase, sin_phase, cos_azimuth, sin_azimuth = rays.cos_phase, rays.sin_phase, rays.cos_azimuth, rays.sin_azimuth
-    first_column, is_cast, counted = rays.first_column, rays.cast, rays.counted
+    first_column, number, counted = rays.first_column, rays.number, rays.counted
     rho, stamp, alone = nearest.rho_m, nearest.stamp, nearest.alone
-    columns = len(is_cast)
+    columns, limits, per_turn = len(number), rays.limits, rays.columns_per_turn
     for e in range(len(centers)):
         center, m = centers[e], unit_from_world[e]
         distance = np.hypot(center[0], center[1])
-        window = ellipsoid_window(center, m, distance, rays)
+        window = ellipsoid_window(center, m, distance, limits)
         if window.first_ring >= window.last_ring:
             continue
-        leaves = leaves_of(surface[e, 2], distance, rays)
+        leaves = leaves_of(surface[e, 2], distance, slopes, per_turn)
         cloud = leaves.density_per_m > 0.0
         who, salt = owners[e], salts[e]
         for k in range(window.first_ring, window.last_ring):
@@ -146,8 +157,6 @@ def cast_ellipsoids(
             outside = p0 * p0 + p1 * p1 + p2 * p2 - 1.0
             for column in range(first, last):
                 j = column if column < columns else column - columns
-                if not is_cast[j]:
-                    continue
                 dx = cos_azimuth[j] * cos - sin_azimuth[j] * sin
                 dy = sin_azimuth[j] * cos + cos_azimuth[j] * sin
                 q0 = m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz
@@ -162,7 +171,7 @@ def cast_ellipsoids(
                 if leave <= 0.0 or (reach <= 0.0 and not cloud) or (who < 0 and reach >= rho[k, j]):
                     continue
                 if cloud:
-                    depth = -np.log(leaf_chance(leaves, k, j, salt, key)) / (leaves.density_per_m * stretch[k])
+                    depth = -np.log(leaf_chance(leaves, k, number[j], salt, key)) / (leaves.density_per_m * stretch[k])
                     reach = max(reach, 0.0) + depth
                     if reach >= leave:
                         continue
@@ -172,7 +181,7 @@ def cast_ellipsoids(
                 if reach >= rho[k, j]:
                     continue
                 if cloud:  # leaves face anywhere
-                    cosine = 0.35 + 0.65 * ray_chance(key, k, j, salt + _FACING_SALT)
+                    cosine = 0.35 + 0.65 * ray_chance(key, k, number[j], salt + _FACING_SALT)
                 else:
                     x, y, z = p0 + reach * q0, p1 + reach * q1, p2 + reach * q2
                     cosine = solid_cosine(m, x, y, z, dx, dy, dz, stretch[k])

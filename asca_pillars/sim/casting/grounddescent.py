@@ -17,9 +17,10 @@ from asca_pillars.sim.casting.groundcast import (
     highest_within,
 )
 from asca_pillars.sim.casting.rays import NearestHits, Rays
-from asca_pillars.sim.casting.windows import ray_chance
+from asca_pillars.sim.casting.windows import PLAIN, ray_chance
 
 Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 
 GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
 CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
@@ -52,13 +53,13 @@ class GroundRay(NamedTuple):
     dy: float
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(inline="always", **PLAIN)
 def gap_at(ray: GroundRay, reach: float, street: Street, relief: Floats, z_m: float) -> float:
     """Height in metres of a ray above the ground, relief (R, R), at a horizontal distance."""
     return ray.up + ray.slope * reach - ground_height(reach * ray.dx, reach * ray.dy, street, relief, z_m)
 
 
-@numba.njit(cache=True)
+@numba.njit(**PLAIN)
 def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: float) -> float:
     """How many metres a ray of this height and slope stays above everything, in whatever direction.
 
@@ -75,7 +76,7 @@ def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: f
     return start
 
 
-@numba.njit(cache=True)
+@numba.njit(inline="always", **PLAIN)
 def descend(
     ray: GroundRay,
     start: float,
@@ -116,7 +117,7 @@ def descend(
     return Descent(near, above, reach, gap, clear)
 
 
-@numba.njit(cache=True)
+@numba.njit(inline="always", **PLAIN)
 def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: float) -> tuple[float, float]:
     """Distance at which a ray meets the ground, relief (R, R), between above it and below, and the gap left, metres.
 
@@ -138,7 +139,7 @@ def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: f
     return reach, left
 
 
-@numba.njit(cache=True)
+@numba.njit(inline="always", **PLAIN)
 def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relief: Floats, z_m: float) -> float:
     """Cosine of the angle at which a ray meets the ground, relief (R, R), of this height in metres there."""
     x, y, step = reach * ray.dx, reach * ray.dy, 0.05
@@ -149,7 +150,25 @@ def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relie
     return facing / (np.sqrt(1.0 + gx * gx + gy * gy) * np.sqrt(1.0 + ray.slope**2))
 
 
-@numba.njit(cache=True)
+@numba.njit(**PLAIN)
+def are_needed(outside: Bools, owner: npt.NDArray[np.int32], k: int, first: int, last: int) -> bool:
+    """Whether it matters what ground columns [first, last) of ring k meet.
+
+    It does for an object, which the ground may hide, and beside a ray that is asked for, which may lean over an edge;
+    outside and owner (K, C) are as in `Rays` and `NearestHits`.
+    """
+    rings, columns = outside.shape
+    for j in range(first, last):
+        if owner[k, j] >= 0:
+            return True
+    for row in range(max(k - 1, 0), min(k + 2, rings)):
+        for j in range(first - 1, last + 1):
+            if not outside[row, (j + columns) % columns]:
+                return True
+    return False
+
+
+@numba.njit(**PLAIN)
 def cast_ground(
     street: Street, relief: Floats, materials: Floats, z_m: float, rays: Rays, nearest: NearestHits, key: int
 ) -> None:
@@ -159,23 +178,28 @@ def cast_ground(
     """
     # Taken out of their tuples once: numba counts references at every access.
     slopes, origins, cos_phase, sin_phase = rays.slope, rays.origin_z_m, rays.cos_phase, rays.sin_phase
-    cos_azimuth, sin_azimuth, is_cast = rays.cos_azimuth, rays.sin_azimuth, rays.cast
+    cos_azimuth, sin_azimuth, number = rays.cos_azimuth, rays.sin_azimuth, rays.number
     rho, cosine, reflectance, owner = nearest.rho_m, nearest.cosine, nearest.reflectance, nearest.owner
+    outside, columns = rays.outside, len(number)
     highest = highest_within(relief, street.along_m)
     rough = street.rough_m
-    columns = len(is_cast)
-    group = max(int(GROUP_DEG / 360.0 * columns), 1)
+    group = max(int(GROUP_DEG / 360.0 * rays.columns_per_turn), 1)
     for k in range(len(slopes)):
         up, slope, cos, sin = origins[k], slopes[k], cos_phase[k], sin_phase[k]
         start = first_distance(up, slope, highest, street.rise_m, z_m)
         # What a neighbor met holds for this ray, too. Neighbors come in small groups, so that a ray does not depend on
         # whether those far from it are cast.
         clear, expected = start, 0.0
+        last, needed = 0, False
         for j in range(columns):
-            if not is_cast[j]:
-                continue
-            if j % group == 0 or not is_cast[j - 1]:
+            if j == last:
                 clear, expected = start, 0.0
+                last += 1
+                while last < columns and number[last] % group and number[last] == number[last - 1] + 1:
+                    last += 1
+                needed = are_needed(outside, owner, k, j, last)
+            if not needed:
+                continue
             x, y = cos_azimuth[j], sin_azimuth[j]
             ray = GroundRay(up, slope, x * cos - y * sin, y * cos + x * sin)
             limit = min(rho[k, j], REACH_M)
@@ -191,7 +215,7 @@ def cast_ground(
             material = ground_material(reach * ray.dx, reach * ray.dy, street)
             if material == VERGE:
                 # Blades of grass end the ray before the soil does, and stand up to it.
-                reach -= rough * ray_chance(key, k, j, GRASS_SALT) ** 2 / max(0.12, abs(slope))
+                reach -= rough * ray_chance(key, k, number[j], GRASS_SALT) ** 2 / max(0.12, abs(slope))
                 facing = max(facing, 0.08)
                 if reach < START_M:
                     continue

@@ -17,6 +17,16 @@ NOTHING = -3  # owner of a firing that met nothing
 _BEYOND_RAD = 0.02  # columns are cast a little beyond the wedge: ring phases turn them by up to one firing
 
 
+class RayLimits(NamedTuple):
+    """What tells which rays can meet a body. It is small: numba copies whole tuples from function to function."""
+
+    slope: Floats  # (K,) tan(elevation), falling
+    lowest_origin_m: float
+    highest_origin_m: float
+    counts: int  # of the encoder, per revolution
+    wedge_slope: float  # what is cast lies within |y| <= wedge_slope * x; 0 for all around
+
+
 class Rays(NamedTuple):
     """The firings of K rings and C columns; ray (k, c) leaves (0, 0, origin_z_m[k]) towards column azimuth + phase."""
 
@@ -29,11 +39,11 @@ class Rays(NamedTuple):
     cos_azimuth: Floats  # (C,)
     sin_azimuth: Floats  # (C,)
     first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
-    cast: Bools  # (C,) columns that are cast at all
+    number: npt.NDArray[np.int64]  # (C,) of each column within the whole revolution
+    columns_per_turn: int
+    outside: Bools  # (K,C) rays of which it is asked only whether they meet an object
     counted: Bools  # (C,) columns that count for `NearestHits.alone`
-    lowest_origin_m: float
-    highest_origin_m: float
-    wedge_slope: float  # what is cast lies within |y| <= wedge_slope * x; 0 for all around
+    limits: RayLimits
 
 
 class NearestHits(NamedTuple):
@@ -50,7 +60,7 @@ class NearestHits(NamedTuple):
 def rays_of(firings: Firings) -> Rays:
     """The rays of a scan's firings."""
     counts = len(firings.first_column) - 1
-    cast_rad = np.abs(np.arctan2(np.sin(firings.azimuth_rad), np.cos(firings.azimuth_rad)))[firings.cast]
+    cast_rad = np.abs(np.arctan2(np.sin(firings.azimuth_rad), np.cos(firings.azimuth_rad)))
     half_rad = float(cast_rad.max(initial=0.0)) + _BEYOND_RAD
     return Rays(
         slope=firings.slope,
@@ -62,11 +72,17 @@ def rays_of(firings: Firings) -> Rays:
         cos_azimuth=np.cos(firings.azimuth_rad),
         sin_azimuth=np.sin(firings.azimuth_rad),
         first_column=firings.first_column,
-        cast=firings.cast,
+        number=firings.number,
+        columns_per_turn=firings.columns_per_turn,
+        outside=firings.outside,
         counted=firings.counted,
-        lowest_origin_m=float(firings.origin_z_m.min()),
-        highest_origin_m=float(firings.origin_z_m.max()),
-        wedge_slope=float(np.tan(half_rad)) if half_rad < 1.5 else 0.0,
+        limits=RayLimits(
+            slope=firings.slope,
+            lowest_origin_m=float(firings.origin_z_m.min()),
+            highest_origin_m=float(firings.origin_z_m.max()),
+            counts=counts,
+            wedge_slope=float(np.tan(half_rad)) if half_rad < 1.5 else 0.0,
+        ),
     )
 
 

@@ -6,8 +6,18 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.sim.casting.rays import NearestHits, Rays
-from asca_pillars.sim.casting.windows import PLAIN, WHOLE_TURN, Window, columns_of, keep, ray_chance, window_of
+from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
+from asca_pillars.sim.casting.windows import (
+    NO_WINDOW,
+    PLAIN,
+    WHOLE_TURN,
+    Window,
+    columns_of,
+    keep,
+    ray_chance,
+    rings_of,
+    window_of,
+)
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -40,13 +50,14 @@ def edge_of(ax: float, ay: float, az: float, bx: float, by: float, bz: float) ->
 
 @numba.njit(**PLAIN)
 def nearest_on_edge(ax: float, ay: float, bx: float, by: float) -> float:
-    """Horizontal distance from the sensor's axis to the segment a b."""
+    """Square of the horizontal distance from the sensor's axis to the segment a b."""
     dx, dy = bx - ax, by - ay
     length = dx * dx + dy * dy
     share = 0.0
     if length > 1e-12:
         share = min(max(-(ax * dx + ay * dy) / length, 0.0), 1.0)
-    return np.hypot(ax + share * dx, ay + share * dy)
+    x, y = ax + share * dx, ay + share * dy
+    return x * x + y * y
 
 
 @numba.njit(inline="always", **PLAIN)
@@ -56,27 +67,31 @@ def wrap(angle: float) -> float:
 
 
 @numba.njit(**PLAIN)
-def triangle_window(corner: Floats, rays: Rays) -> Window:
+def triangle_window(corner: Floats, limits: RayLimits) -> Window:
     """The window of a triangle (3,3), metres; empty for one beside the wedge of columns that are cast."""
     ax, ay, bx, by, cx, cy = corner[0, 0], corner[0, 1], corner[1, 0], corner[1, 1], corner[2, 0], corner[2, 1]
-    if rays.wedge_slope > 0.0:
-        wedge = rays.wedge_slope
+    if limits.wedge_slope > 0.0:
+        wedge = limits.wedge_slope
         left = ay > wedge * ax and by > wedge * bx and cy > wedge * cx
         right = ay < -wedge * ax and by < -wedge * bx and cy < -wedge * cx
         if left or right:
-            return Window(0, 0, 0.0, 0.0)
+            return NO_WINDOW
+    ab, bc, ca = ax * by - ay * bx, bx * cy - by * cx, cx * ay - cy * ax
+    encloses_axis = (ab > 0 and bc > 0 and ca > 0) or (ab < 0 and bc < 0 and ca < 0)
+    nearest = min(nearest_on_edge(ax, ay, bx, by), nearest_on_edge(bx, by, cx, cy), nearest_on_edge(cx, cy, ax, ay))
+    near = 0.0 if encloses_axis else np.sqrt(nearest)
+    far = np.sqrt(max(ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy))
+    z_low, z_high = min(corner[0, 2], corner[1, 2], corner[2, 2]), max(corner[0, 2], corner[1, 2], corner[2, 2])
+    first, last = rings_of(z_low, z_high, near, far, limits)
+    if first >= last:  # most of them: there is no need to ask for azimuths
+        return NO_WINDOW
+    if encloses_axis:
+        return window_of(first, last, -np.pi, WHOLE_TURN, limits)
     azimuth = np.arctan2(ay, ax)
     to_b = wrap(np.arctan2(by, bx) - azimuth)
     to_c = wrap(np.arctan2(cy, cx) - azimuth)
-    if abs(to_b - to_c) > np.pi:  # the triangle encloses the sensor's axis
-        low, width, near = -np.pi, WHOLE_TURN, 0.0
-    else:
-        low = azimuth + min(0.0, to_b, to_c)
-        width = max(0.0, to_b, to_c) - min(0.0, to_b, to_c)
-        near = min(nearest_on_edge(ax, ay, bx, by), nearest_on_edge(bx, by, cx, cy), nearest_on_edge(cx, cy, ax, ay))
-    far = np.sqrt(max(ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy))
-    z_low, z_high = min(corner[0, 2], corner[1, 2], corner[2, 2]), max(corner[0, 2], corner[1, 2], corner[2, 2])
-    return window_of(z_low, z_high, near, far, low, width, rays)
+    to_first, to_last = min(0.0, to_b, to_c), max(0.0, to_b, to_c)
+    return window_of(first, last, azimuth + to_first, to_last - to_first, limits)
 
 
 @numba.njit(**PLAIN)
@@ -113,12 +128,12 @@ def cast_triangles(
     # Taken out of their tuples once: numba counts references at every access.
     slopes, stretch, origins, phase_counts = rays.slope, rays.stretch, rays.origin_z_m, rays.phase_counts
     cos_phase, sin_phase, cos_azimuth, sin_azimuth = rays.cos_phase, rays.sin_phase, rays.cos_azimuth, rays.sin_azimuth
-    first_column, is_cast, counted = rays.first_column, rays.cast, rays.counted
+    first_column, number, counted = rays.first_column, rays.number, rays.counted
     rho, stamp, alone = nearest.rho_m, nearest.stamp, nearest.alone
-    columns = len(is_cast)
+    columns, limits = len(number), rays.limits
     for t in range(len(triangles)):
         corner = triangles[t]
-        window = triangle_window(corner, rays)
+        window = triangle_window(corner, limits)
         if window.first_ring >= window.last_ring:
             continue
         plane = plane_of(corner)
@@ -143,7 +158,7 @@ def cast_triangles(
                 j = column if column < columns else column - columns
                 x, y = cos_azimuth[j], sin_azimuth[j]
                 facing = mx * x + my * y + m1
-                if not is_cast[j] or facing == 0.0:
+                if facing == 0.0:
                     continue
                 if not passes(fx * x + fy * y + f1, gx * x + gy * y + g1, hx * x + hy * y + h1):
                     continue
@@ -152,7 +167,7 @@ def cast_triangles(
                 counts = who >= 0 and counted[j] and stamp[k, j] != who
                 if reach <= 0.0 or (hidden and not counts):
                     continue
-                if transparency > 0.0 and ray_chance(key, k, j, salt) < transparency:
+                if transparency > 0.0 and ray_chance(key, k, number[j], salt) < transparency:
                     continue
                 if counts:
                     stamp[k, j] = who

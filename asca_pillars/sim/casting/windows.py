@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.sim.casting.rays import NearestHits, Rays
+from asca_pillars.sim.casting.rays import NearestHits, RayLimits
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -28,6 +28,9 @@ class Window(NamedTuple):
     last_ring: int
     low_counts: float
     width_counts: float
+
+
+NO_WINDOW = Window(0, 0, 0.0, 0.0)
 
 
 @numba.njit(inline="always", **PLAIN)
@@ -60,20 +63,25 @@ def ring_below(slope: Floats, limit: float) -> int:
 
 
 @numba.njit(**PLAIN)
-def window_of(z_low: float, z_high: float, near: float, far: float, low: float, width: float, rays: Rays) -> Window:
-    """The window of what lies between two heights, two horizontal distances, and azimuths [low, low + width]."""
-    above = z_high - rays.lowest_origin_m
-    below = z_low - rays.highest_origin_m
+def rings_of(z_low: float, z_high: float, near: float, far: float, limits: RayLimits) -> tuple[int, int]:
+    """The rings [first, last) that can meet what lies between two heights and two horizontal distances."""
+    above = z_high - limits.lowest_origin_m
+    below = z_low - limits.highest_origin_m
     near = max(near, 1e-6)
     steepest = above / near if above > 0 else above / far
     shallowest = below / far if below > 0 else below / near
-    first = ring_below(rays.slope, steepest)
-    last = max(ring_below(rays.slope, np.nextafter(shallowest, -np.inf)), first)
-    counts = len(rays.first_column) - 1
+    first = ring_below(limits.slope, steepest)
+    return first, max(ring_below(limits.slope, np.nextafter(shallowest, -np.inf)), first)
+
+
+@numba.njit(**PLAIN)
+def window_of(first_ring: int, last_ring: int, low: float, width: float, limits: RayLimits) -> Window:
+    """The window of these rings and of azimuths [low, low + width]."""
+    counts = limits.counts
     per_rad = counts / (2.0 * np.pi)
     low_counts = low * per_rad
     low_counts -= counts * np.floor(low_counts / counts)
-    return Window(first, last, low_counts, width * per_rad)
+    return Window(first_ring, last_ring, low_counts, width * per_rad)
 
 
 @numba.njit(inline="always", **PLAIN)

@@ -31,7 +31,7 @@ class Met(NamedTuple):
     cosine: npt.NDArray[np.float32]
     reflectance: npt.NDArray[np.float32]
     owner: npt.NDArray[np.int32]
-    hidden: npt.NDArray[np.bool_]  # firings that the ego vehicle blocks
+    hidden: npt.NDArray[np.bool_]  # firings that report nothing: the ego vehicle blocks them, or nobody asks
 
 
 class Lasers(NamedTuple):
@@ -49,6 +49,7 @@ class Lasers(NamedTuple):
     near_fade: Floats
     cos_azimuth: Floats
     sin_azimuth: Floats
+    number: npt.NDArray[np.int64]
 
 
 class Receiver(NamedTuple):
@@ -68,6 +69,7 @@ class Receiver(NamedTuple):
     sigma_share: float
     split_share: float
     split_lost_share: float
+    columns_per_turn: int
 
 
 class Echo(NamedTuple):
@@ -92,15 +94,16 @@ def echo_of(
     reflectance: npt.NDArray[np.float32],
     stretch: Floats,
     slopes: Floats,
+    number: npt.NDArray[np.int64],
     receiver: Receiver,
 ) -> Echo:
     """The echo of firing (k, j), which may lean over an edge to a neighboring firing's surface.
 
-    rho in metres, cosine and reflectance are (K, C), as in `Met`; stretch and slopes (K,), as in `Lasers`.
+    rho in metres, cosine and reflectance are (K, C), as in `Met`; stretch, slopes (K,) and number (C,) as in `Lasers`.
     `lean` in 0..1 says to which neighbor and how far, `fate` in 0..1 what becomes of two echoes: none, one between
     both, or the stronger of them.
     """
-    columns = rho.shape[1]
+    columns, turn = rho.shape[1], receiver.columns_per_turn
     slant = rho[k, j] * stretch[k]
     sideways, updown = receiver.split_share, receiver.split_share * UPDOWN_SPLIT
     aside, step = min(lean, 1.0 - lean), -1 if lean < 0.5 else 1
@@ -108,8 +111,10 @@ def echo_of(
     row = k if across else min(max(k + step, 0), len(slopes) - 1)
     column = (j + step + columns) % columns if across else j
     other = rho[row, column] * stretch[row]
+    if across and number[column] != (number[j] + step + turn) % turn:
+        other = np.inf  # where the part of the revolution that is fired ends
     apart = abs(other - slant)
-    spacing = 2 * np.pi / columns if across else abs(slopes[row] - slopes[k])
+    spacing = 2 * np.pi / turn if across else abs(slopes[row] - slopes[k])
     own = Echo(slant, cosine[k, j], reflectance[k, j], 1.0, k, j)
     if aside >= sideways + updown or not apart > EDGE_M + 1.5 * slant * spacing / max(own.cosine, 0.02):
         return own
@@ -141,7 +146,8 @@ def report_firings(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
     """Points (N, 4) in the LiDAR frame, the indices of their owners (N,) and of their rings (N,), ring by ring."""
     rho, cosine, reflectance, owners, hidden = met.rho_m, met.cosine, met.reflectance, met.owner, met.hidden
-    slopes, stretch, origins, cos_phase, sin_phase, biases, gains, sigmas, faints, near_fades, cosines, sines = lasers
+    slopes, stretch, origins, cos_phase, sin_phase, biases, gains, sigmas, faints, near_fades = lasers[:10]
+    cosines, sines, number = lasers[10:]
     rings, columns = rho.shape
     most = np.isfinite(rho).sum()
     points, owner = np.empty((most, 4), np.float32), np.empty(most, np.int32)
@@ -151,10 +157,10 @@ def report_firings(
         for j in range(columns):
             if not rho[k, j] < np.inf or hidden[k, j]:
                 continue
-            bits, more = ray_bits(key, k, j, _NOISE_SALT), ray_bits(key, k, j, _FATE_SALT)
+            bits, more = ray_bits(key, k, number[j], _NOISE_SALT), ray_bits(key, k, number[j], _FATE_SALT)
             luck, faint = _uniform(bits, 3), _uniform(more, 0)
             echo = echo_of(
-                k, j, _uniform(more, 1), _uniform(more, 2), rho, cosine, reflectance, stretch, slopes, receiver
+                k, j, _uniform(more, 1), _uniform(more, 2), rho, cosine, reflectance, stretch, slopes, number, receiver
             )
             # Rough surfaces keep answering at grazing incidence: the root of the cosine, not the cosine.
             power = echo.reflectance * np.sqrt(echo.cosine) / echo.slant_m**2 * echo.share * _FADED[_level(bits, 1)]

@@ -105,9 +105,10 @@ class Lidar:
 
 @dataclass(frozen=True)
 class Firings:
-    """Every firing of one revolution, and the random state of the sensor for this scan.
+    """The firings of one revolution, or of its part before the camera, and the state of the sensor for this scan.
 
-    Firing (k, c) points at `azimuth_rad[c] + phase_rad[k]` with slope `slope[k]`.
+    Firing (k, c) points at `azimuth_rad[c] + phase_rad[k]` with slope `slope[k]`. All chance of it belongs to its ring
+    and to the number that its column has in the whole revolution.
     """
 
     slope: npt.NDArray[np.float64]  # (K,) tan(elevation)
@@ -119,10 +120,12 @@ class Firings:
     faint: npt.NDArray[np.float64]  # (K,)
     near_fade: npt.NDArray[np.float64]  # (K,)
     azimuth_rad: npt.NDArray[np.float64]  # (C,) of each column, without the phase
+    number: npt.NDArray[np.int64]  # (C,) of each column among those of the whole revolution
+    columns_per_turn: int
     first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
-    cast: npt.NDArray[np.bool_]  # (C,) columns that are fired at all
     counted: npt.NDArray[np.bool_]  # (C,) columns whose firings tell how much of an object is hidden
     hidden: npt.NDArray[np.bool_]  # (K,C) firings that the ego vehicle blocks
+    outside: npt.NDArray[np.bool_]  # (K,C) firings whose returns are not asked for
     range_sigma_m: float
     loss_share: float
     zero_power: float
@@ -154,6 +157,8 @@ def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool, coun
     count_rad = 2 * np.pi / lidar.azimuth_counts
     azimuth = columns * count_rad
     in_camera = np.minimum(azimuth, 2 * np.pi - azimuth) <= np.deg2rad(lidar.camera_half_angle_deg)
+    number = np.flatnonzero(in_camera) if camera_only else np.arange(len(columns))
+    azimuth, in_camera = azimuth[number], in_camera[number]
     first_block = np.arange(rings) < per_block
     gain = np.asarray(lidar.ring_gain or np.ones(rings))
     weak = np.maximum(1.0 - gain, 0.0)
@@ -167,10 +172,12 @@ def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool, coun
         faint=np.where(first_block, *lidar.faint_reflectance),
         near_fade=np.where(first_block, lidar.near_fade, 0.0),
         azimuth_rad=azimuth,
-        first_column=np.searchsorted(columns, np.arange(lidar.azimuth_counts + 1)),
-        cast=in_camera if camera_only else np.ones(len(columns), bool),
-        counted=np.ones(len(columns), bool) if count_all_around else in_camera,
+        number=number,
+        columns_per_turn=len(columns),
+        first_column=np.searchsorted(columns[number], np.arange(lidar.azimuth_counts + 1)),
+        counted=np.ones(len(number), bool) if count_all_around else in_camera,
         hidden=_hidden(lidar, azimuth),
+        outside=np.zeros((rings, len(number)), bool),
         range_sigma_m=float(rng.uniform(*lidar.range_sigma_m)),
         loss_share=float(rng.uniform(*lidar.loss_share)),
         zero_power=float(np.exp(rng.uniform(*np.log(lidar.zero_power)))),

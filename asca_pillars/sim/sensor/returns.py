@@ -35,6 +35,7 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
         near_fade=firings.near_fade,
         cos_azimuth=np.cos(firings.azimuth_rad),
         sin_azimuth=np.sin(firings.azimuth_rad),
+        number=firings.number,
     )
     receiver = Receiver(
         lost_power=firings.lost_power,
@@ -51,12 +52,13 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
         sigma_share=float(lidar.reflectance_sigma_share),
         split_share=float(lidar.beam_split_share),
         split_lost_share=float(lidar.split_lost_share),
+        columns_per_turn=firings.columns_per_turn,
     )
     met = Met(
         rho_m=np.ascontiguousarray(hits.rho_m, np.float64),
         cosine=np.ascontiguousarray(hits.cosine, np.float32),
         reflectance=np.ascontiguousarray(hits.reflectance, np.float32),
         owner=np.ascontiguousarray(hits.owner, np.int32),
-        hidden=firings.hidden,
+        hidden=firings.hidden | firings.outside,
     )
     return Returns(*report_firings(met, lasers, receiver, int(rng.integers(1 << 62))))

@@ -25,6 +25,7 @@ from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.files import atomic_path, write_json
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
 from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each
+from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
 from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
 from asca_pillars.sim.simulation import SimulationConfig, take_scan
@@ -66,7 +67,7 @@ def simulate_sequence_frame(plan: SequencePlan, sequence: int, index: int) -> Se
     config = plan.config
     world, firings = _world(plan, sequence)
     moment = world.at(index / RATE_HZ)
-    noise = np.random.default_rng([plan.seed, sequence, _NOISE, index])
+    noise = draws_of(plan.seed, sequence, _NOISE, index)
     bodies = (plan.seed, sequence, _BODIES)
     hits, returns = take_scan(moment.scene, config, firings, bodies, noise, moment.track_ids)
     points, owner = returns.points, returns.owner
@@ -142,7 +143,7 @@ def simulate_sequences(
 @lru_cache(maxsize=1)
 def _world(plan: SequencePlan, sequence: int) -> tuple[MovingScene, Firings]:
     """Of one sequence after the other: a process draws a street once, not for each of its scans."""
-    scene, ways, sensor = (np.random.default_rng([plan.seed, sequence, stream]) for stream in (_SCENE, _WAYS, _SENSOR))
+    scene, ways, sensor = (draws_of(plan.seed, sequence, stream) for stream in (_SCENE, _WAYS, _SENSOR))
     firings = draw_firings(plan.config.lidar, sensor, plan.config.field_of_view == "camera", True)
     return draw_moving_scene(plan.config.scene, scene, ways, plan.duration_s), firings
 

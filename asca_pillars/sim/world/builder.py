@@ -41,7 +41,11 @@ class Stretch:
 
 @dataclass
 class Builder:
-    """Bodies so far; heights are above the local ground until `primitives` sets them on it."""
+    """Bodies so far.
+
+    Until `primitives` sets them on the ground all at once, rows are in road coordinates, with heights above the local
+    ground, and end with 1 beside the crossing road, 0 beside the main one.
+    """
 
     rng: np.random.Generator
     config: SceneConfig
@@ -50,7 +54,7 @@ class Builder:
     kind: str
     _kept_clear: Floats = field(init=False)  # footprints of the car and of the objects
     _bodies: list[Primitives] = field(default_factory=list)
-    _boxes: list[tuple[float, ...]] = field(default_factory=list)  # as for `cuboids`
+    _boxes: list[tuple[float, ...]] = field(default_factory=list)  # as for `cuboids`, yaw against the road
     _posts: list[tuple[float, ...]] = field(default_factory=list)  # as for `prisms`
     _blobs: list[Floats] = field(default_factory=list)  # rows of x y z, radii, yaw, reflectance, density
 
@@ -94,8 +98,7 @@ class Builder:
         yaw: float = 0.0,
     ) -> None:
         """A box of `size` (along, across, up) whose bottom is z above the ground."""
-        x, y, heading = self.to_lidar(along, across, cross)
-        self._boxes.append((x, y, z, *size, heading + yaw, *material))
+        self._boxes.append((along, across, z, *size, yaw, *material, cross))
 
     def post(
         self,
@@ -114,15 +117,14 @@ class Builder:
 
         It leans by `lean` metres per metre of height along x and y.
         """
-        x, y, _ = self.to_lidar(along, across, cross)
-        self._posts.append((x, y, z, height, radius, taper * radius, reflectance, *lean))
+        self._posts.append((along, across, z, height, radius, taper * radius, reflectance, *lean, cross))
 
     def ball(
         self, along: float, across: float, z: float, radii: tuple[float, float, float], reflectance: float
     ) -> None:
         """A solid ellipsoid around z above the ground."""
-        x, y, yaw = self.to_lidar(along, across)
-        self._blobs.append(np.array([[x, y, z, *radii, yaw, reflectance, 0.0]]))
+        _, _, yaw = self.to_lidar(along, across)
+        self._blobs.append(np.array([[along, across, z, *radii, yaw, reflectance, 0.0, 0.0]]))
 
     def clouds(
         self,
@@ -140,31 +142,36 @@ class Builder:
 
         Each is turned at random or, for hedges, along the road.
         """
-        rows = np.empty((len(along), 9))
-        rows[:, :2] = self.ground.places(along, across, cross)
-        rows[:, 2], rows[:, 3:6] = z, radii
+        rows = np.empty((len(along), 10))
+        rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3:6] = along, across, z, radii
         if turned:
             rows[:, 6] = self.rng.uniform(0.0, np.pi, len(along))
         else:
             rows[:, 6] = self.to_lidar(float(along[0]), float(across[0]), cross)[2]
-        rows[:, 7], rows[:, 8] = reflectance, density_per_m
+        rows[:, 7], rows[:, 8], rows[:, 9] = reflectance, density_per_m, cross
         self._blobs.append(rows)
 
     def primitives(self) -> Primitives:
         """All bodies, set on the ground."""
         parts = list(self._bodies)
         if self._boxes:
-            parts.append(cuboids(self._grounded(np.array(self._boxes))))
+            rows = np.array(self._boxes)
+            rows[:, 6] += self.ground.headings(rows[:, 0], rows[:, -1] > 0)
+            parts.append(cuboids(self._grounded(self._placed(rows))))
         if self._posts:
-            parts.append(prisms(self._grounded(np.array(self._posts)), sides=6))
+            parts.append(prisms(self._grounded(self._placed(np.array(self._posts))), sides=6))
         if self._blobs:
-            rows = np.concatenate(self._blobs)
+            rows = self._placed(np.concatenate(self._blobs))
             rows = self._grounded(rows[~_intrudes(rows, self._kept_clear)])
             cos, sin, zero = np.cos(rows[:, 6]), np.sin(rows[:, 6]), np.zeros(len(rows))
             axes = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1.0]]).transpose(2, 0, 1)
             surface = np.column_stack([rows[:, 7], zero + 0.3, rows[:, 8]])
             parts.append(ellipsoids(rows[:, :3], rows[:, 3:6], surface, axes))
         return Primitives.join(parts)
+
+    def _placed(self, rows: Floats) -> Floats:
+        rows[:, :2] = self.ground.places(rows[:, 0], rows[:, 1], rows[:, -1] > 0)
+        return rows[:, :-1]
 
     def _grounded(self, rows: Floats) -> Floats:
         rows[:, 2] += self.ground.heights(rows[:, :2])

@@ -3,6 +3,7 @@
 A detector must not take them for one. Nothing here has the shape of a labelled class.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
 
 import numpy as np
@@ -55,7 +56,7 @@ def scatter(builder: Builder) -> None:
     rng, ground = builder.rng, builder.ground
     pavement = ground.pavement_m
     things, weights = zip(*SHARES.items(), strict=True)
-    upto = np.cumsum(weights) / sum(weights)
+    upto = (np.cumsum(weights) / sum(weights)).tolist()
     number = rng.uniform(*builder.config.clutter)
     for _ in range(rng.poisson(1.6 * number)):  # 160 m of street
         along = float(rng.uniform(-80, 80))
@@ -67,7 +68,7 @@ def scatter(builder: Builder) -> None:
         elif rng.random() < 0.07:  # between parked cars, as planted build-outs of the kerb are
             beside = -rng.uniform(0.3, 1.8)
         if not builder.near_junction(along, along):
-            things[int(np.searchsorted(upto, rng.random()))](builder, along, float(side * (edge + beside)))
+            things[bisect_left(upto, rng.random())](builder, along, float(side * (edge + beside)))
     for _ in range(rng.poisson(builder.config.far_clutter)):
         along = float(rng.choice([-1.0, 1.0]) * rng.uniform(28.0, 75.0))
         across = float(rng.choice([-1.0, 1.0]) * (ground.half_width_m + rng.uniform(0.0, 30.0)))

@@ -15,7 +15,13 @@ from asca_pillars.sim.casting import groundcast
 from asca_pillars.sim.casting.groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M, Street
 
 Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 LEVEL_WITHIN_M, SLOPE_LASTS_M = 28.0, 40.0
+# The lattice of the relief, and the share of the hills there: roads are laid out level where one drives, hills begin
+# some way off, with their crests or troughs at the car.
+_AXIS_M = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
+_X_M, _Y_M = np.meshgrid(_AXIS_M, _AXIS_M, indexing="ij")
+_BEGUN = 1.0 - np.exp(-(_X_M**2 + _Y_M**2) / LEVEL_WITHIN_M**2)
 
 
 @dataclass(frozen=True)
@@ -92,15 +98,24 @@ class Ground:
         x, y, _ = self.to_lidar(u, along_m * cos + across_m * sin)
         return x, y, float(street.yaw_rad + street.cross_tilt_rad + math.pi / 2 + yaw_rad)
 
-    def places(self, along_m: Floats, across_m: Floats, cross: bool = False) -> Floats:
-        """Places (N,) beside the main or the crossing road -> (N,2) x and y in the LiDAR frame."""
-        u, v = along_m, across_m
-        if cross:
-            cos, sin = self.street.cos_tilt, self.street.sin_tilt
-            u, v = self.street.cross_u_m + across_m * cos - along_m * sin, along_m * cos + across_m * sin
-        cos, sin = self.street.cos_yaw, self.street.sin_yaw
-        v = v + self.street.offset_m + 0.5 * self.street.bend_per_m * u * u
-        return np.stack([u * cos - v * sin, u * sin + v * cos], axis=-1)
+    def places(self, along_m: Floats, across_m: Floats, cross: Bools) -> Floats:
+        """`to_lidar` or, where `cross` (N,), `cross_to_lidar` of many: (N,) and (N,) -> (N,2) x and y."""
+        street, u, v = self.street, along_m.copy(), across_m.copy()
+        cos, sin = street.cos_tilt, street.sin_tilt
+        u[cross] = street.cross_u_m + across_m[cross] * cos - along_m[cross] * sin
+        v[cross] = along_m[cross] * cos + across_m[cross] * sin
+        cos, sin = street.cos_yaw, street.sin_yaw
+        v = v + street.offset_m + 0.5 * street.bend_per_m * u * u
+        result = np.empty((len(u), 2))
+        result[:, 0], result[:, 1] = u * cos - v * sin, u * sin + v * cos
+        return result
+
+    def headings(self, along_m: Floats, cross: Bools) -> Floats:
+        """The road's heading (N,) in the LiDAR frame there."""
+        street = self.street
+        # NumPy's arc tangent differs from that of `to_lidar` in the last bit.
+        turns = np.array([math.atan(slope) for slope in (street.bend_per_m * along_m).tolist()])
+        return np.where(cross, street.yaw_rad + street.cross_tilt_rad + math.pi / 2, street.yaw_rad + turns)
 
     def heights(self, xy: npt.ArrayLike) -> Floats:
         """Height (N,) of the ground at (N,2) in the LiDAR frame, metres."""
@@ -140,13 +155,10 @@ def draw_relief(
     They are a plane of `slope` (x, y) that levels out far away, long waves that are level under the car, and bumps of
     standard deviation `bump_m` beyond the pavements of `street`.
     """
-    axis = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
-    x, y = np.meshgrid(axis, axis, indexing="ij")
+    x, y, begun = _X_M, _Y_M, _BEGUN
     # A slope lasts as far as one sees the street; KITTI's far ground lies as high, on average, as that near the car.
-    lasting = SLOPE_LASTS_M * np.tanh(axis / SLOPE_LASTS_M)
+    lasting = SLOPE_LASTS_M * np.tanh(_AXIS_M / SLOPE_LASTS_M)
     height: Any = slope[0] * lasting[:, None] + slope[1] * lasting[None, :]
-    # Roads are laid out level where one drives: hills begin some way off, with their crests or troughs at the car.
-    begun = 1.0 - np.exp(-(x**2 + y**2) / LEVEL_WITHIN_M**2)
     for wavelength in (160.0, 90.0, 45.0):
         angle = rng.uniform(0, 2 * np.pi)
         size = amplitude_m * wavelength / 120.0 * rng.normal(0.0, 0.6)
@@ -157,5 +169,5 @@ def draw_relief(
         # A lattice point shapes the cells around it: none of these may reach a carriageway.
         share = np.clip((outside - street.pavement_m - 1.5 * RELIEF_STEP_M) / 4.0, 0.0, 1.0)
         height = height + share * rng.normal(0.0, bump_m, x.shape)
-    near = len(axis) // 2
+    near = len(_AXIS_M) // 2
     return np.asarray(height - height[near, near])

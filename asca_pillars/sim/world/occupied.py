@@ -26,11 +26,12 @@ class Occupied:
 
         Two footprints may overlap by the lesser `overlap_m` of theirs.
         """
-        row = np.array([x, y, length + 2 * margin_m, width + 2 * margin_m, yaw, overlap_m])
-        if not _is_free(row, self.rows, self.count) or self.count == len(self.rows):
+        # Plain floats, so that one compiled version answers every caller.
+        sides = float(length + 2 * margin_m), float(width + 2 * margin_m)
+        wish = (float(x), float(y), *sides, float(yaw), float(overlap_m))
+        if self.count == len(self.rows) or not _is_free(wish, self.rows, self.count):
             return False
-        row[2:4] = length, width
-        self.rows[self.count] = row
+        self.rows[self.count] = x, y, length, width, yaw, overlap_m
         self.count += 1
         return True
 
@@ -43,21 +44,23 @@ class Occupied:
 
 
 @numba.njit(cache=True)
-def _is_free(row: Floats, rows: Floats, count: int) -> bool:
+def _is_free(row: tuple[float, float, float, float, float, float], rows: Floats, count: int) -> bool:
     """Whether a footprint overlaps none of the first `count` (separating axes of two rectangles)."""
+    own = (row[2], row[3], row[4])
     for i in range(count):
+        taken = (rows[i, 2], rows[i, 3], rows[i, 4])
         dx, dy = rows[i, 0] - row[0], rows[i, 1] - row[1]
-        if max(abs(dx), abs(dy)) > (row[2] + row[3] + rows[i, 2] + rows[i, 3]) / 2:
+        if max(abs(dx), abs(dy)) > (own[0] + own[1] + taken[0] + taken[1]) / 2:
             continue  # farther than half the diagonals reach
         apart = False
         overlap = min(row[5], rows[i, 5])
-        for one, other in ((row, rows[i]), (rows[i], row)):
-            cos, sin = np.cos(one[4]), np.sin(one[4])
-            c, s = abs(np.cos(other[4] - one[4])), abs(np.sin(other[4] - one[4]))
+        for one, other in ((own, taken), (taken, own)):
+            cos, sin = np.cos(one[2]), np.sin(one[2])
+            c, s = abs(np.cos(other[2] - one[2])), abs(np.sin(other[2] - one[2]))
             along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)
             if (
-                along > (one[2] + other[2] * c + other[3] * s) / 2 - overlap
-                or across > (one[3] + other[2] * s + other[3] * c) / 2 - overlap
+                along > (one[0] + other[0] * c + other[1] * s) / 2 - overlap
+                or across > (one[1] + other[0] * s + other[1] * c) / 2 - overlap
             ):
                 apart = True
         if not apart:

@@ -10,6 +10,7 @@ from asca_pillars.data.kitti import Calibration
 from asca_pillars.sim.bodies import bicycles, cycles, heavy, people, styles, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
+from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.builder import Builder
 from asca_pillars.sim.world.clutter import scatter
@@ -176,7 +177,7 @@ def build(
         if abs(np.arctan2(target.box[1], target.box[0])) > within_rad + reach:
             continue
         number = index if numbers is None else numbers[index]
-        body = body_of(target, config, np.random.default_rng([*seed, 1, number]))
+        body = body_of(target, config, draws_of(*seed, 1, number))
         first = 10_000_000 + number * 10_000
         parts.append(body)
         owners.append(np.full(len(body.triangles), index))

@@ -1,5 +1,7 @@
 """The ray caster against Embree, and against arithmetic."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -186,6 +188,22 @@ def test_skipping_columns_leaves_the_others_as_they_are() -> None:
         Primitives.join([opaque_street(2), ellipsoids([(9, 1, 0)], [(2, 2, 2)], np.array([[0.3, 0, 0.4]]))])
     )
     whole, part = (cast(street_, 0, None, firings, seed=9) for firings in (every, ahead))
-    np.testing.assert_array_equal(part.rho_m[:, ahead.cast], whole.rho_m[:, ahead.cast])
-    assert np.isinf(part.rho_m[:, ~ahead.cast]).all()
-    assert ahead.cast.mean() == pytest.approx(86 / 360, abs=0.01)
+    np.testing.assert_array_equal(part.rho_m, whole.rho_m[:, ahead.number])
+    np.testing.assert_array_equal(ahead.azimuth_rad, every.azimuth_rad[ahead.number])
+    assert len(ahead.number) / every.columns_per_turn == pytest.approx(86 / 360, abs=0.01)
+
+
+def test_ground_beyond_the_image_is_left_out_unless_it_hides_an_object_or_has_a_neighbor_in_the_image() -> None:
+    firings = draw_firings(Lidar(), np.random.default_rng(1), camera_only=True)
+    ground = Ground(make_street(half_width_m=200.0), np.zeros((49, 49)), np.full(8, 0.4), -1.73)
+    outside = np.zeros(firings.hidden.shape, bool)
+    outside[40:] = True
+    # A board in the ground: the lower half of it is hidden.
+    board = quads([[(6, 2, -3), (6, -2, -3), (6, -2, -0.5), (6, 2, -0.5)]], Surface(0.5))
+    whole, part = (
+        cast(bodies(board, owner=0), 1, ground, replace(firings, outside=mask), seed=0)
+        for mask in (np.zeros_like(outside), outside)
+    )
+    np.testing.assert_array_equal(part.rho_m[:41], whole.rho_m[:41])
+    assert 0 < part.visible[0] == whole.visible[0] < 0.9 * part.alone[0]
+    assert np.isinf(part.rho_m[41:]).sum() > 0.5 * part.rho_m[41:].size and np.isfinite(whole.rho_m[41:]).all()

@@ -230,6 +230,18 @@ def test_road_coordinates_and_back() -> None:
         np.testing.assert_allclose(ground.to_road(x, y), (u, v), atol=1e-9)
 
 
+def test_many_places_at_once_are_those_one_by_one() -> None:
+    ground = flat(yaw_rad=0.3, bend_per_m=0.004, offset_m=1.4, cross_u_m=12.0, cross_half_m=3.0, cross_tilt_rad=-0.2)
+    rng = np.random.default_rng(1)
+    (along, across), cross = rng.uniform(-60.0, 60.0, (2, 40)), rng.random(40) < 0.5
+    one_by_one = [
+        (ground.cross_to_lidar if beside else ground.to_lidar)(float(u), float(v))
+        for u, v, beside in zip(along, across, cross, strict=True)
+    ]
+    at_once = np.column_stack([ground.places(along, across, cross), ground.headings(along, cross)])
+    np.testing.assert_array_equal(at_once, one_by_one)
+
+
 def test_a_street_has_no_misspelt_number() -> None:
     with pytest.raises(TypeError, match="curb_m"):
         make_street(curb_m=0.1)
