@@ -47,7 +47,7 @@ class TableBackbone:
         for number in range(LEVELS):
             inputs |= {f"{kind}_{number}": Tensor("int32", (None, 9)) for kind in ("strided", "first", "same")}
             inputs[f"places_{number}"] = Tensor("int32", (None,))
-        self._channels = [bundle.spec.anchors.shape[2] * channels for channels in (1, 7, 2)]
+        self._channels = [bundle.spec.anchors.shape[2] * channels for channels in (bundle.spec.scores_per_anchor, 7, 2)]
         outputs = zip(HeadMaps._fields, self._channels, strict=True)
         self._session = check_interface(
             path, session, inputs, {name: Tensor("float32", (None, channels)) for name, channels in outputs}
