@@ -14,12 +14,12 @@ _NAMED = 5  # of the names that do not fit
 
 
 def as_it_is(array: Tensor) -> Tensor:
-    """No conversion, any shape."""
+    """Unitless weights (out, in, ...) as they are, and arrays of any other shape."""
     return array
 
 
 def without_singletons(array: Tensor) -> Tensor:
-    """A 1x1 convolution's weight (out, in, 1, ...) as a linear layer's (out, in)."""
+    """A 1x1 convolution's unitless weight (out, in, 1, ...) as a linear layer's (out, in)."""
     return array.flatten(1) if array.shape[2:].numel() == 1 else array
 
 
@@ -42,7 +42,7 @@ def convert_state(
     """Our state dict from theirs; every array of theirs is used, or named in the error.
 
     Args:
-        state: theirs, by name.
+        state: theirs by name: unitless weights (out, in, ...) and the (C,) values of normalizations.
         links: what becomes what.
         wanted: our state dict, for names and shapes.
         blamed: the file, for messages.

@@ -14,7 +14,8 @@ def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as
 
     Args:
         block_convs: convolutions of each block after its first.
-        first: conversion of the very first convolution, whose input channels may stand in another order.
+        first: conversion of the very first convolution's unitless weight (out, in, 3, 3), whose input channels may
+            stand in another order.
     """
     for block, convs in enumerate(block_convs):
         there, here = f"backbone_2d.blocks.{block}", f"neck.blocks.{block}"

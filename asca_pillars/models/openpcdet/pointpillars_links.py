@@ -20,7 +20,7 @@ _Z_CENTER = len(FEATURES)  # the one feature that ours does not have
 
 
 def pointpillars_links(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Links for `build_pillar_detector(model)`; `state` is theirs, by name."""
+    """Links for `build_pillar_detector(model)`; `state` has their unitless weights (out, in, ...) by name."""
     low_m, high_m = model.spec.grid.z_range_m
 
     def of_height(_: Tensor) -> Tensor:

@@ -21,7 +21,13 @@ _JOINED = ("points", *LEVEL_SOURCES)  # after the map
 
 
 def pv_rcnn_links(model: PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Links for `build_pv_rcnn(model)` without what later papers add; state dicts by name: theirs, ours."""
+    """Links for `build_pv_rcnn(model)` without what later papers add.
+
+    Args:
+        model: ours.
+        state: their unitless weights (out, in, ...) by name.
+        wanted: ours, likewise.
+    """
     yield from _voxel_links(state, wanted)
     yield from map_links(model.network.block_convs, _channels_of(_map_order(model)))
     yield from _keypoint_links(model)

@@ -13,7 +13,7 @@ _LAYOUTS = (
 
 
 def dense_order(pairs: Sequence[tuple[Tensor, Tensor]]) -> Callable[[Tensor], Tensor]:
-    """The conversion of a network's sparse weights to (out, in, z, y, x): the layout that fits all of them.
+    """The conversion of a network's unitless sparse weights to (out, in, z, y, x): the layout that fits all of them.
 
     Layers with as many inputs as outputs fit two of the layouts; all layers of a file have the same.
 
