@@ -14,6 +14,7 @@ from asca_pillars.commands.doctor import doctor
 from asca_pillars.commands.eval import evaluate
 from asca_pillars.commands.export import export
 from asca_pillars.commands.import_dataset import import_dataset
+from asca_pillars.commands.import_weights import import_weights
 from asca_pillars.commands.inspect import inspect
 from asca_pillars.commands.prepare import prepare
 from asca_pillars.commands.simulate import simulate
@@ -35,6 +36,7 @@ app.command()(prepare)
 app.command()(train)
 app.command("eval")(evaluate)
 app.command()(export)
+app.command("import-weights")(import_weights)
 app.command()(ablate)
 app.command()(doctor)
 

@@ -22,6 +22,8 @@ class NetworkConfig(Strict):
         block_channels: output channels of Block1..3 (Table 1).
         block_convs: stride-1 convolutions that follow each block's strided one (Table 1: 3).
         upsample_channels: output channels of each DeBlock (Table 1: 128).
+        empty_slots: whether the rows of zeros with which OpenPCDet fills a pillar up to `limits.max_points` are part of
+            its maximum; imported weights alone need it.
         neck: `dense` computes everywhere, `sparse` at active cells alone; the weights fit both.
         active_cells: which cells are active in a sparse neck, see `tables.neck_tables`.
     """
@@ -31,12 +33,15 @@ class NetworkConfig(Strict):
     block_channels: tuple[int, int, int] = (64, 128, 256)
     block_convs: tuple[int, int, int] = (3, 3, 3)
     upsample_channels: int = 128
+    empty_slots: bool = False
     neck: Literal["dense", "sparse"] = "dense"
     active_cells: MaskRule = "fine"
 
     def __post_init__(self) -> None:
         require_bounds("model.network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
         require_bounds("model.network", self, ("block_convs",), low=0)
+        if self.empty_slots and self.cpa == "point":
+            raise ConfigError("model.network.empty_slots does not go with cpa point; choose another of them")
         if self.neck == "sparse" and self.active_cells == "fine" and not self.block_convs[0]:
             raise ConfigError(
                 "model.network.active_cells = fine grows in the first block's stride-1 convolutions, of which "

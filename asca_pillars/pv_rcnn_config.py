@@ -23,9 +23,12 @@ class PvRcnnNetwork(Strict):
         block_convs: 3x3 convolutions that follow each block's first one.
         upsample_channels: output channels of each block after upsampling.
         source_widths: output channels of the MLP of each of `settings.sources`.
+        scale_widths: channels of each of `settings.scale_radii_m`, where there are any.
+        scale_channels: of a keypoint's feature from all of them.
         keypoint_channels: of a keypoint's fused feature.
         weighting_channels: of the hidden layers that weigh keypoints.
         grid_widths: output channels of the MLP on the keypoints around a grid point.
+        vector_channels: of each cell of a cube, where `settings.vector_cells` is not 0 (VectorPool).
         hidden: channels of the fully connected layers of the second stage.
         dropout: share of their values that training drops.
         gate: `keypoint`: a gate on the raw points' features of each keypoint (Deformable PV-RCNN's context fusion).
@@ -38,9 +41,12 @@ class PvRcnnNetwork(Strict):
     block_convs: tuple[int, int] = (5, 5)
     upsample_channels: int = 256
     source_widths: tuple[tuple[int, ...], ...] = ((16, 16), (16, 16), (32, 32), (64, 64), (64, 64))
+    scale_widths: tuple[int, ...] = (32, 64, 128)
+    scale_channels: int = 64
     keypoint_channels: int = 128
     weighting_channels: int = 256
     grid_widths: tuple[int, ...] = (64, 64)
+    vector_channels: int = 32
     hidden: int = 256
     dropout: float = 0.3
     gate: Gate = "none"
@@ -48,7 +54,7 @@ class PvRcnnNetwork(Strict):
 
     def __post_init__(self) -> None:
         single = {name: (getattr(self, name),) for name in _CHANNELS}
-        several = {name: getattr(self, name) for name in ("voxel_channels", "block_channels", "grid_widths")}
+        several = {name: getattr(self, name) for name in _SEVERAL}
         sources = {f"source_widths.{number}": widths for number, widths in enumerate(self.source_widths)}
         for name, widths in (single | several | sources).items():
             if min(widths, default=0) < 1:
@@ -59,7 +65,11 @@ class PvRcnnNetwork(Strict):
             raise ConfigError(f"model.network.dropout = {self.dropout:g}: must be at least 0 and less than 1")
 
 
-_CHANNELS = ("upsample_channels", "keypoint_channels", "weighting_channels", "hidden")
+_CHANNELS = (
+    *("upsample_channels", "keypoint_channels", "weighting_channels"),
+    *("vector_channels", "scale_channels", "hidden"),
+)
+_SEVERAL = ("voxel_channels", "block_channels", "scale_widths", "grid_widths")
 
 
 def _many_proposals() -> AnchorProposals:
@@ -96,6 +106,12 @@ class PvRcnnModel(Strict):
             raise ConfigError(
                 f"model.network.source_widths has {len(self.network.source_widths)} entries: give one for each of "
                 f"model.settings.sources {', '.join(each.source for each in self.settings.sources)}"
+            )
+        scales, widths = self.settings.scale_radii_m, self.network.scale_widths
+        if scales and len(widths) != len(scales):
+            raise ConfigError(
+                f"model.network.scale_widths has {len(widths)} entries: give one for each of the {len(scales)} radii "
+                "of model.settings.scale_radii_m"
             )
         if self.network.gate != "none" and "points" not in {each.source for each in self.settings.sources}:
             raise ConfigError(

@@ -19,6 +19,7 @@ from asca_deploy import sample_scan_path
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.points.ball_query import ball_query, three_nearest
+from asca_pillars.points.cube_neighbors import nearest_in_cubes
 from asca_pillars.points.farthest_points import farthest_points, near_boxes
 from asca_pillars.points.roi_grid import roi_grid_points
 from asca_pillars.system import cpu_model
@@ -27,6 +28,7 @@ from benchmarks.host_path import CAMERA_VIEW
 RANGE_M = np.array([[0, 70.4], [-40, 40], [-3, 1]], np.float32)
 BOXES, GRID = 50, 6
 SAMPLES = 16
+CUBE_CELLS = 3  # along each axis
 
 
 def main(
@@ -69,6 +71,8 @@ def steps(points: NDArray[np.float32]) -> dict[str, Callable[[], Any]]:
         f"grids of {BOXES} boxes": lambda: roi_grid_points(boxes, GRID),
         f"balls of {len(grid)} grid points, 0.8 m": balls(keypoints, grid, 0.8),
         f"balls of {len(grid)} grid points, 1.6 m": balls(keypoints, grid, 1.6),
+        f"cubes of {len(grid)} grid points, 0.8 m": lambda: nearest_in_cubes(keypoints, grid, 0.8, CUBE_CELLS),
+        f"cubes of {len(grid)} grid points, 1.6 m": lambda: nearest_in_cubes(keypoints, grid, 1.6, CUBE_CELLS),
     }
 
 

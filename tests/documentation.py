@@ -22,6 +22,7 @@ from asca_pillars.schema import to_dict
 from benchmarks.made_recordings import point_cloud2
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.recordings.cloud_recordings import stamps, store, write_mcap
+from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -108,6 +109,7 @@ def write_files(root: Path) -> None:
         checkpoint.parent.mkdir(parents=True)
         content = {"hyper_parameters": {"config": to_dict(CONFIG)}, "state_dict": weights, "global_step": 7}
         torch.save(content, checkpoint)
+    write_foreign(root / "pointpillar.pth", PointPillars(64, (64, 128, 256), (3, 5, 5), 128, 3).state_dict())
 
 
 def _rows(frame: Any) -> str:

@@ -81,7 +81,7 @@ def test_files_that_are_not_text(tmp_path: Path) -> None:
     path = tmp_path / "model.yaml"
     path.write_bytes(b"name: caf\xe9\n")
     assert refusal(path).startswith(f"{path}: not valid YAML: ")
-    assert "cannot be read (No such file or directory); these ship: ablation_small, asca_" in refusal(
+    assert "cannot be read (No such file or directory); these ship: ablation_small, ablation_two_stage, " in refusal(
         tmp_path / "missing.yaml"
     )
     assert "cannot be read (Is a directory)" in refusal(tmp_path)

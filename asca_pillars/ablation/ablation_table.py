@@ -6,28 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from asca_pillars.ablation.variants import VARIANTS, Run, Variant
+from asca_pillars.ablation.variants import Family, Run
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES
 from asca_pillars.evaluation.report import markdown_table
 
-TABLES = {
-    "Components (the rows of the paper's Table 5)": (
-        *("baseline", "gt_aug", "rs_aug", "asp_k3", "cpa_channel", "asp_k3_cpa_channel"),
-        "asp_k3_cpa_channel_rs_aug",
-    ),
-    "Zones of the adaptive-scale pillars (K)": ("baseline", "asp_k2", "asp_k3", "asp_k4"),
-    "Readings of the correlative point attention": (
-        *("asp_k3", "asp_k3_cpa_paper", "asp_k3_cpa_channel", "asp_k3_cpa_point"),
-    ),
-    "Map and neck": (
-        *("cpa_channel", "asp_k3_cpa_channel", "asp_k3_pooled_cpa_channel"),
-        *("cpa_channel_sub", "cpa_channel_fine", "asp_k3_cpa_channel_fine", "asp_k3_pooled_cpa_channel_fine"),
-    ),
-    "Matching of pedestrians and cyclists": (
-        *("cpa_channel", "cpa_channel_lower_ious", "cpa_channel_fine", "cpa_channel_fine_lower_ious"),
-    ),
-}
-COMPONENTS = ("ASP", "CPA", "Aug", "neck", "persons' IoU")
 BANDS_M = ((0.0, 40.0), (40.0, 80.0))
 
 
@@ -41,18 +23,23 @@ class Speed:
     parameters: int
 
 
-def tables(results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
+def tables(family: Family, results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
     """Markdown of every table whose variants have results.
 
     Args:
+        family: of the variants.
         results: what `asca eval --json` wrote, one per seed, by name of the variant.
         speeds: of the variants that were exported.
     """
     parts = []
-    for title, names in TABLES.items():
+    for title, names in family.tables.items():
         there = [name for name in names if results.get(name)]
         if there:
-            parts += [f"### {title}\n", _summary(there, results, speeds), _by_difficulty(there, results)]
+            parts += [
+                f"### {title}\n",
+                _summary(family, there, results, speeds),
+                _by_difficulty(family, there, results),
+            ]
     return "\n".join(parts)
 
 
@@ -65,9 +52,14 @@ def read_results(runs: Iterable[Run]) -> dict[str, list[dict[str, Any]]]:
     return results
 
 
-def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
+def _summary(
+    family: Family,
+    names: Sequence[str],
+    results: Mapping[str, Sequence[dict[str, Any]]],
+    speeds: Mapping[str, Speed],
+) -> str:
     bands = [f"{low:g}-{high:g} m" for low, high in BANDS_M]
-    header = [*COMPONENTS, *CLASS_NAMES, "mean", *bands, "parameters", "FPS", "time / baseline"]
+    header = [*family.components, *CLASS_NAMES, "mean", *bands, "parameters", "FPS", "time / baseline"]
     rows = []
     for name in names:
         runs, speed = results[name], speeds.get(name)
@@ -79,27 +71,17 @@ def _summary(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]
         else:
             low, high = speed.ratio_quartiles
             cells += [f"{speed.parameters:,}", f"{speed.fps:.1f}", f"{speed.ratio:.2f} ({low:.2f}-{high:.2f})"]
-        rows.append([*_components(VARIANTS[name]), *cells])
-    return markdown_table(header, rows, left=len(COMPONENTS))
+        rows.append([*family.variants[name].components, *cells])
+    return markdown_table(header, rows, left=len(family.components))
 
 
-def _by_difficulty(names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
-    header = [*COMPONENTS, *(f"{c} {d}" for c in CLASS_NAMES for d in DIFFICULTIES)]
+def _by_difficulty(family: Family, names: Sequence[str], results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
+    header = [*family.components, *(f"{c} {d}" for c in CLASS_NAMES for d in DIFFICULTIES)]
     rows = []
     for name in names:
         cells = [_spread([_ap(run, c, d) for run in results[name]]) for c in CLASS_NAMES for d in DIFFICULTIES]
-        rows.append([*_components(VARIANTS[name]), *cells])
-    return markdown_table(header, rows, left=len(COMPONENTS))
-
-
-def _components(variant: Variant) -> tuple[str, ...]:
-    zones = f"K={variant.zones}" if variant.zones > 1 else "-"
-    if variant.map != "warped":
-        zones += f" {variant.map}"
-    cpa = "-" if variant.cpa == "none" else variant.cpa
-    neck = "-" if variant.neck == "dense" else variant.active_cells
-    matching = "-" if variant.person_ious is None else " / ".join(f"{iou:g}" for iou in variant.person_ious)
-    return zones, cpa, {"none": "-", "gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}[variant.insert], neck, matching
+        rows.append([*family.variants[name].components, *cells])
+    return markdown_table(header, rows, left=len(family.components))
 
 
 def _ap(result: dict[str, Any], class_name: str, difficulty: str) -> float:

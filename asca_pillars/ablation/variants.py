@@ -9,10 +9,11 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
 from rich.progress import track
 
@@ -23,9 +24,40 @@ from asca_pillars.schema import to_dict
 from asca_pillars.system import default_threads
 
 
+class Row(Protocol):
+    """A variant: what it changes in the base configuration."""
+
+    @property
+    def name(self) -> str:
+        """Of the variant."""
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """For `asca train -s`."""
+
+    @property
+    def insert(self) -> str:
+        """How objects are inserted, see `augment.insert.method`."""
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Cells of the table's first columns."""
+
+
+class Family(NamedTuple):
+    """The ablation of one family of detectors."""
+
+    variants: Mapping[str, Row]
+    """By name, the baseline first."""
+    tables: Mapping[str, tuple[str, ...]]
+    """Names of the rows of each table, by its title."""
+    components: tuple[str, ...]
+    """Heads of the columns that say what a row has."""
+
+
 @dataclass(frozen=True)
 class Variant:
-    """One row: what it changes in the base configuration."""
+    """One row of the pillar detectors' ablation."""
 
     name: str
     zones: int = 1
@@ -51,6 +83,17 @@ class Variant:
             f"model.network.cpa={self.cpa}",
             f"augment.insert.method={self.insert}",
         )
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Cells of the table's first columns, see `PILLARS`."""
+        zones = f"K={self.zones}" if self.zones > 1 else "-"
+        if self.map != "warped":
+            zones += f" {self.map}"
+        cpa = "-" if self.cpa == "none" else self.cpa
+        neck = "-" if self.neck == "dense" else self.active_cells
+        matching = "-" if self.person_ious is None else " / ".join(f"{iou:g}" for iou in self.person_ious)
+        return zones, cpa, {"none": "-", "gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}[self.insert], neck, matching
 
     @property
     def _matching(self) -> tuple[str, ...]:
@@ -88,12 +131,34 @@ VARIANTS = {
     )
 }
 
+PILLARS = Family(
+    variants=VARIANTS,
+    tables={
+        "Components (the rows of the paper's Table 5)": (
+            *("baseline", "gt_aug", "rs_aug", "asp_k3", "cpa_channel", "asp_k3_cpa_channel"),
+            "asp_k3_cpa_channel_rs_aug",
+        ),
+        "Zones of the adaptive-scale pillars (K)": ("baseline", "asp_k2", "asp_k3", "asp_k4"),
+        "Readings of the correlative point attention": (
+            *("asp_k3", "asp_k3_cpa_paper", "asp_k3_cpa_channel", "asp_k3_cpa_point"),
+        ),
+        "Map and neck": (
+            *("cpa_channel", "asp_k3_cpa_channel", "asp_k3_pooled_cpa_channel"),
+            *("cpa_channel_sub", "cpa_channel_fine", "asp_k3_cpa_channel_fine", "asp_k3_pooled_cpa_channel_fine"),
+        ),
+        "Matching of pedestrians and cyclists": (
+            *("cpa_channel", "cpa_channel_lower_ious", "cpa_channel_fine", "cpa_channel_fine_lower_ious"),
+        ),
+    },
+    components=("ASP", "CPA", "Aug", "neck", "persons' IoU"),
+)
+
 
 @dataclass(frozen=True)
 class Run:
     """One training: a variant with a seed, in a folder of its own."""
 
-    variant: Variant
+    variant: Row
     seed: int
     folder: Path
 
@@ -113,7 +178,7 @@ class Run:
         return self.folder / "evaluation" / "report.json"
 
 
-def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Variant]) -> list[Run]:
+def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Row]) -> list[Run]:
     """Every run, all variants of the first seed before those of the next."""
     return [Run(variant, seed, Path(out) / variant.name / f"seed{seed}") for seed in seeds for variant in variants]
 

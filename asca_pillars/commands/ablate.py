@@ -10,7 +10,13 @@ from asca_pillars.commands.options import OverridesOption
 
 
 def ablate(
-    config: Annotated[str, typer.Argument(help="Base: a YAML, or the name of one that ships, such as ablation_small.")],
+    config: Annotated[
+        str,
+        typer.Argument(
+            help="Base: a YAML, or the name of one that ships: ablation_small for the rows of pillar detectors, "
+            "ablation_two_stage for those of PV-RCNN."
+        ),
+    ],
     *,
     data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with ImageSets/{train,val}.txt.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the runs; finished ones there are kept.")],
@@ -21,10 +27,15 @@ def ablate(
 ) -> None:
     """Train and compare: with and without ASP, CPA, GT-Aug and RS-Aug, other K, the readings of CPA; write one table.
 
-    Table 5 of the paper, on equal terms and with the spread over the seeds, on whatever data you have. Goes on where it
-    stopped when the same command is given again.
+    Table 5 of the paper, on equal terms and with the spread over the seeds, on whatever data you have. On a base of
+    kind pv_rcnn the rows are what later papers add to it: deformation, gate, VectorPool, dual attention, MSAA, VA loss,
+    and other numbers of keypoints. Goes on where it stopped when the same command is given again.
 
-    Example: asca ablate ablation_small --data data/ablation --out runs/ablation --seeds 0,1,2
+    Examples:
+
+    asca ablate ablation_small --data data/ablation --out runs/ablation --seeds 0,1,2
+
+    asca ablate ablation_two_stage --data data/ablation --out runs/two_stage --variants pv_rcnn,deform_paper
     """
     require("train")
     from rich.console import Console
@@ -32,7 +43,7 @@ def ablate(
 
     from asca_pillars.ablation.ablation_table import read_results, tables
     from asca_pillars.ablation.variants import evaluate_runs, runs, train_runs
-    from asca_pillars.commands.ablate_steps import claim, parse_seeds, parse_variants, setup, time_variants
+    from asca_pillars.commands.ablate_steps import claim, family_of, parse_seeds, parse_variants, setup, time_variants
     from asca_pillars.commands.prepare import prepare
     from asca_pillars.config import load_config
     from asca_pillars.files import atomic_path
@@ -40,16 +51,18 @@ def ablate(
     from asca_pillars.system import default_threads
 
     overrides = override or []
-    claim(out, {"config": to_dict(load_config(config, overrides)), "data": str(data)})
-    todo = runs(out, parse_seeds(seeds), parse_variants(variants))
+    base = load_config(config, overrides)
+    family = family_of(base)
+    todo = runs(out, parse_seeds(seeds), parse_variants(variants, family))
+    claim(out, {"config": to_dict(base), "data": str(data)})
     if any(one.variant.insert != "none" and not one.trained.exists() for one in todo):
         # Once, not by every run that finds nothing there.
         prepare(Path(config), data=data, override=overrides, workers=default_threads())
     train_runs(todo, config, data, jobs, overrides)
     evaluate_runs(todo, data, jobs)
     console = Console(markup=False)
-    speeds = time_variants(todo, data, console)
-    text = f"{setup(todo, config, data, jobs)}\n{tables(read_results(todo), speeds)}"
+    speeds = time_variants(todo, family, data, console)
+    text = f"{setup(todo, config, data, jobs)}\n{tables(family, read_results(todo), speeds)}"
     path = out / "results.md"
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -11,7 +11,9 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_pillars.ablation.ablation_table import Speed
-from asca_pillars.ablation.variants import VARIANTS, Run, Variant
+from asca_pillars.ablation.two_stage_variants import TWO_STAGE
+from asca_pillars.ablation.variants import PILLARS, Family, Row, Run
+from asca_pillars.config import Config
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path, require_own
@@ -61,24 +63,38 @@ def parse_seeds(text: str) -> list[int]:
         raise ConfigError(f"--seeds {text}: whole numbers with commas between them, such as 0,1") from None
 
 
-def parse_variants(text: str) -> list[Variant]:
+def family_of(config: Config) -> Family:
+    """The variants that fit a base.
+
+    Raises:
+        ConfigError: there are none for its kind.
+    """
+    families = {"pillar": PILLARS, "pv_rcnn": TWO_STAGE}
+    if config.model.kind not in families:
+        raise ConfigError(f"model.kind = {config.model.kind}: no variants; give a base of kind {' or '.join(families)}")
+    return families[config.model.kind]
+
+
+def parse_variants(text: str, family: Family) -> list[Row]:
     """Names with commas between them, or `all`.
 
     Raises:
         ConfigError: there is no such variant.
     """
-    names = list(VARIANTS) if text == "all" else text.split(",")
+    variants = family.variants
+    names = list(variants) if text == "all" else text.split(",")
     for name in names:
-        if name not in VARIANTS:
-            raise ConfigError(f"--variants {name}: no such variant; there are {', '.join(VARIANTS)}")
-    return [VARIANTS[name] for name in names]
+        if name not in variants:
+            raise ConfigError(f"--variants {name}: no such variant; there are {', '.join(variants)}")
+    return [variants[name] for name in names]
 
 
-def time_variants(todo: Sequence[Run], data: Path, console: Console) -> dict[str, Speed]:
+def time_variants(todo: Sequence[Run], family: Family, data: Path, console: Console) -> dict[str, Speed]:
     """Export one checkpoint of every variant and time them in alternation on the same scans."""
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
     from asca_export.exporter import MIN_SCANS, export_bundle
+    from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.checkpoint import load_checkpoint
 
@@ -87,16 +103,17 @@ def time_variants(todo: Sequence[Run], data: Path, console: Console) -> dict[str
     first = {one.variant.name: one for one in reversed(todo)}  # of several seeds the first one wins
     detectors: dict[str, Detector] = {}
     parameters: dict[str, int] = {}
+    export: Any = export_bundle if family is PILLARS else export_pv_rcnn_bundle
     with tempfile.TemporaryDirectory() as folder:
         for name, one in track(first.items(), "Exporting", console=console):
             checkpoint = load_checkpoint(one.checkpoint)
-            export_bundle(checkpoint, Path(folder) / name, scans)
+            export(checkpoint, Path(folder) / name, scans)
             detectors[name] = Detector(Path(folder) / name)
             parameters[name] = sum(part.numel() for part in checkpoint.detector.parameters())
         with console.status(f"Timing {len(detectors)} detectors in alternation"):
             frames = alternate(detectors, scans, TIMED_ROUNDS)
     times = {name: np.median(own, axis=1) for name, own in frames.items()}
-    reference = times[next(name for name in VARIANTS if name in times)]
+    reference = times[next(name for name in family.variants if name in times)]
     return {
         name: Speed(
             fps=1e3 / float(np.median(own)),

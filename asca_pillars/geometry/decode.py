@@ -53,7 +53,8 @@ class HeadMaps(NamedTuple, Generic[Map]):
     """
 
     scores: Map
-    """(A, H, W) logits; an anchor belongs to one class, so it has one."""
+    """(A, H, W) logits: an anchor belongs to one class, so it has one. Where it has one for each of C classes,
+    (A * C, H, W), those of an anchor side by side."""
     boxes: Map
     """(7A, H, W) residuals; those of anchor a are channels 7a..7a+6."""
     directions: Map
@@ -110,8 +111,10 @@ def decode_candidates(
         ValueError: if maps, anchors and classes do not belong together.
     """
     height, width, count, _ = anchors.shape
+    per_anchor = len(classes) if maps.scores.shape[0 if cells is None else 1] > count else 1
     expected = tuple(
-        (channels * count, height, width) if cells is None else (len(cells), channels * count) for channels in (1, 7, 2)
+        (channels * count, height, width) if cells is None else (len(cells), channels * count)
+        for channels in (per_anchor, 7, 2)
     )
     if tuple(m.shape for m in maps) != expected or count != len(classes) * len(ANCHOR_YAWS_RAD):
         raise ValueError(
@@ -119,9 +122,13 @@ def decode_candidates(
             f"not {tuple(m.shape for m in maps)}"
         )
     rows = maps if cells is not None else HeadMaps(*(part.reshape(len(part), -1).T for part in maps))
-    anchor, row = _candidates(rows.scores, classes, post.candidates)
+    scores, labels = rows.scores, None
+    if per_anchor > 1:
+        every = scores.reshape(-1, count, per_anchor)
+        scores, labels = every.max(axis=2), every.argmax(axis=2)  # one that is not a number stays so
+    anchor, row = _candidates(scores, labels, classes, post.candidates)
     cell = row if cells is None else cells[row]
-    logits = rows.scores[row, anchor]
+    logits = scores[row, anchor]
     residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
     directions = rows.directions.reshape(-1, count, 2)[row, anchor]
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
@@ -131,7 +138,7 @@ def decode_candidates(
     return Candidates(
         boxes[usable],
         logits[usable],
-        anchor[usable] // len(ANCHOR_YAWS_RAD),
+        _labels(anchor, row, labels)[usable],
         int(maps.scores.size - np.count_nonzero(np.isfinite(maps.scores)) + dropped),
     )
 
@@ -190,9 +197,11 @@ def _nms(boxes: NDArray[np.float64], iou_threshold: float, limit: int) -> NDArra
 
 
 def _candidates(
-    scores: NDArray[np.float32], classes: tuple[ClassSpec, ...], limit: int
+    scores: NDArray[np.float32], labels: NDArray[np.int64] | None, classes: tuple[ClassSpec, ...], limit: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
+
+    `labels` (M, A) are the classes that the scores are for; None: each anchor's own.
 
     Of equal scores that of the earlier anchor goes first, and among those that of the earlier row.
     """
@@ -204,14 +213,19 @@ def _candidates(
     above = np.flatnonzero(logits >= min(floors))
     logits = logits[above]
     row, anchor = np.divmod(above, count)
-    chosen = []
+    own_class, chosen = _labels(anchor, row, labels), []
     for label, floor in enumerate(floors):
-        own = np.flatnonzero((anchor // len(ANCHOR_YAWS_RAD) == label) & (logits >= floor))
+        own = np.flatnonzero((own_class == label) & (logits >= floor))
         if len(own) > limit:
             own = own[logits[own] >= np.partition(logits[own], -limit)[-limit]]
         chosen.append(own[np.lexsort((row[own], anchor[own], -logits[own]))[:limit]])
     best = np.concatenate(chosen)
     return anchor[best], row[best]
+
+
+def _labels(anchor: NDArray[np.int64], row: NDArray[np.int64], labels: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    """Classes (n,) of what anchors (n,) in rows (n,) of `labels` (M, A) say, see `_candidates`."""
+    return anchor // len(ANCHOR_YAWS_RAD) if labels is None else labels[row, anchor]
 
 
 def _logit(probability: float) -> float:

@@ -44,6 +44,10 @@ class DetectorSpec(ABC):
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
 
+    def anchor_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where anchors stand, likewise; in the centers of the cells unless a family says otherwise."""
+        return self.head_centers_m()
+
     @cached_property
     def class_names(self) -> tuple[str, ...]:
         """Names in the order of the labels 0, 1, ..."""
@@ -52,7 +56,7 @@ class DetectorSpec(ABC):
     @cached_property
     def anchors(self) -> NDArray[np.float32]:
         """(H, W, A, 7) boxes in the LiDAR frame, see `make_anchors`. Read-only."""
-        anchors = make_anchors(*self.head_centers_m(), self.classes)
+        anchors = make_anchors(*self.anchor_centers_m(), self.classes)
         anchors.flags.writeable = False
         return anchors
 

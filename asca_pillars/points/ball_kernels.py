@@ -1,10 +1,10 @@
-"""The loops of `ball_query` and `three_nearest`, compiled; what they compute is said in `ball_query`, in NumPy."""
+"""The loops of `ball_query` and `cube_neighbors`, compiled; what they compute is said there, in NumPy."""
 
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.compiling import compiled, given, written
+from asca_pillars.geometry.compiling import compiled, given, inner, written
 from asca_pillars.points.columns import Columns, cells_of
 
 _Floats = NDArray[np.float32]
@@ -42,6 +42,26 @@ def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_In
         at = centers, cells_of(centers, columns)
         _three_nearest(xyz, columns.order, columns.starts, *columns.shape, *at, columns.per_m, nearest, squared)
     return nearest, squared
+
+
+def nearest_in_cubes(
+    xyz: _Floats,
+    centers: _Floats,
+    columns: Columns,
+    first: _Cells,
+    last: _Cells,
+    offsets: _Floats,
+    reach_m: np.float32,
+) -> _Integers:
+    """`cube_neighbors._nearest_in_cubes`, in columns (Q, 2) `first` to `last`: metres (N, 3), (Q, 3) -> (Q, T, 3)."""
+    nearest = np.full((len(centers), len(offsets), 3), len(xyz), np.int32)
+    squared = np.full((len(offsets), 3), np.inf, np.float32)
+    room = np.empty(len(xyz), np.int32)
+    _nearest_in_cubes(
+        *(xyz, columns.order, columns.starts, columns.shape[1], centers, first, last, offsets, reach_m),
+        *(room, nearest, squared),
+    )
+    return nearest
 
 
 @compiled(
@@ -103,6 +123,19 @@ def _ball_query(
             found[query, rest] = found[query, 0] if count else len(xyz)
 
 
+@inner
+def _keep(nearest: _Integers, squared: _Floats, i: int, distance: float) -> None:
+    """Put a point among the three nearest (3,), of equally near ones the earlier first."""
+    place = 3
+    while place and (distance < squared[place - 1] or (distance == squared[place - 1] and i < nearest[place - 1])):
+        if place < 3:
+            squared[place] = squared[place - 1]
+            nearest[place] = nearest[place - 1]
+        place -= 1
+    if place < 3:
+        squared[place], nearest[place] = distance, i
+
+
 @compiled(
     *(given(types.float32, 2), *_COLUMNS, given(types.float32, 2), given(types.int64, 2), types.float32),
     *(written(types.int32, 2), written(types.float32, 2)),
@@ -136,15 +169,44 @@ def _three_nearest(
                     for k in range(starts[cell], starts[cell + 1]):
                         i = order[k]
                         dx, dy, dz = xyz[i, 0] - x, xyz[i, 1] - y, xyz[i, 2] - z
-                        distance = dx * dx + dy * dy + dz * dz
-                        place = 3
-                        while place and (
-                            distance < squared[query, place - 1]
-                            or (distance == squared[query, place - 1] and i < nearest[query, place - 1])
-                        ):
-                            if place < 3:
-                                squared[query, place] = squared[query, place - 1]
-                                nearest[query, place] = nearest[query, place - 1]
-                            place -= 1
-                        if place < 3:
-                            squared[query, place], nearest[query, place] = distance, i
+                        _keep(nearest[query], squared[query], i, dx * dx + dy * dy + dz * dz)
+
+
+@compiled(
+    *(given(types.float32, 2), given(types.int32), given(types.int32), types.int64, given(types.float32, 2)),
+    *(given(types.int64, 2), given(types.int64, 2), given(types.float32, 2), types.float32),
+    *(written(types.int32), written(types.int32, 3), written(types.float32, 2)),
+)
+def _nearest_in_cubes(
+    xyz: _Floats,
+    order: _Integers,
+    starts: _Integers,
+    nx: int,
+    centers: _Floats,
+    first: _Cells,
+    last: _Cells,
+    offsets: _Floats,
+    reach_m: float,
+    room: _Integers,
+    nearest: _Integers,
+    squared: _Floats,
+) -> None:
+    for query in range(len(centers)):
+        x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
+        count = 0
+        for row in range(first[query, 0], last[query, 0] + 1):
+            for column in range(first[query, 1], last[query, 1] + 1):
+                cell = row * nx + column
+                for k in range(starts[cell], starts[cell + 1]):
+                    i = order[k]
+                    inside = abs(xyz[i, 0] - x) < reach_m and abs(xyz[i, 1] - y) < reach_m
+                    if inside and abs(xyz[i, 2] - z) < reach_m:
+                        room[count] = i
+                        count += 1
+        squared[:] = np.inf
+        for cell in range(len(offsets)):
+            at_x, at_y, at_z = x + offsets[cell, 0], y + offsets[cell, 1], z + offsets[cell, 2]
+            for k in range(count):
+                i = room[k]
+                dx, dy, dz = xyz[i, 0] - at_x, xyz[i, 1] - at_y, xyz[i, 2] - at_z
+                _keep(nearest[query, cell], squared[cell], i, dx * dx + dy * dy + dz * dz)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.points.ball_query import ball_query
+from asca_pillars.points.cube_neighbors import nearest_in_cubes
 from asca_pillars.points.farthest_points import near_boxes
 from asca_pillars.points.first_stage import Proposed
 from asca_pillars.points.roi_grid import roi_grid_points
@@ -61,7 +62,8 @@ class GridNeighbors(NamedTuple):
     points: NDArray[np.float32]
     """(R * cells, 3), metres, LiDAR frame."""
     indices: tuple[NDArray[np.int32], ...]
-    """Of each radius (R * cells, samples); the number of keypoints stands for nothing."""
+    """Of each radius (R * cells, samples), or of each cell of a cube the nearest (R * cells, T, 3); the number of
+    keypoints stands for nothing."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +106,22 @@ def refine_scan(
     )
 
 
-def grid_neighbors(keypoints: NDArray[np.float32], boxes: NDArray[np.float32], settings: GridSettings) -> GridNeighbors:
-    """What RoI-grid pooling aggregates (PV-RCNN, section 3.3), for boxes (R, 7) among keypoints (K, 3), metres."""
+def grid_neighbors(
+    keypoints: NDArray[np.float32], boxes: NDArray[np.float32], settings: GridSettings, vector_cells: int = 0
+) -> GridNeighbors:
+    """What RoI-grid pooling aggregates (PV-RCNN, section 3.3), for boxes (R, 7) among keypoints (K, 3), metres.
+
+    Balls, or with `vector_cells` along each axis the cells of cubes whose half length is the radius.
+    """
     points = np.ascontiguousarray(roi_grid_points(boxes, settings.grid_size).reshape(-1, 3), np.float32)
     return GridNeighbors(
-        points, tuple(ball_query(keypoints, points, r, settings.grid_samples) for r in settings.grid_radii_m)
+        points,
+        tuple(
+            nearest_in_cubes(keypoints, points, radius_m, vector_cells)
+            if vector_cells
+            else ball_query(keypoints, points, radius_m, settings.grid_samples)
+            for radius_m in settings.grid_radii_m
+        ),
     )
 
 

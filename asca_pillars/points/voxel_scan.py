@@ -12,6 +12,7 @@ from asca_pillars.points.anchor_proposals import AnchorProposals
 from asca_pillars.points.ball_query import ball_query, three_nearest
 from asca_pillars.points.bilinear import bilinear_cells
 from asca_pillars.points.farthest_points import farthest_points
+from asca_pillars.points.point_scales import PointScale, point_scales
 from asca_pillars.tables.voxel_spec import VoxelSpec
 from asca_pillars.tables.voxel_tables import VoxelLevel, VoxelTableBuilder
 from asca_pillars.tables.voxels import voxelize
@@ -19,6 +20,8 @@ from asca_pillars.tables.voxels import voxelize
 Deform = Literal["none", "paper", "authors", "authors_frozen"]
 Source = Literal["points", "conv1", "conv2", "conv3", "conv4"]
 LEVEL_SOURCES: tuple[Source, ...] = ("conv1", "conv2", "conv3", "conv4")
+MOST_VECTOR_CELLS = 7
+"""Along an axis of a cube: more are more weights than keypoints to teach them."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,9 @@ class VoxelSetSettings:
     Attributes:
         keypoints: of a scan, at most.
         sources: what keypoints aggregate beside the map seen from above.
+        scale_radii_m: of groups of raw points at scales that have all keypoints, a quarter of them, a sixteenth, ...,
+            the finest first (AFE-RCNN's adaptive features); none without.
+        scale_samples: of each of these groups at most.
         deform: where keypoints look for voxels. `none`: around themselves. `paper`: around a place learnt from their
             surroundings, one for each level (Deformable PV-RCNN). `authors`: one for each level and radius, as in that
             paper's code. `authors_frozen`: likewise, learning nothing through the place, as that code does.
@@ -58,6 +64,8 @@ class VoxelSetSettings:
         grid_size: grid points along each axis of a proposal.
         grid_radii_m: around grid points, in which keypoints are aggregated.
         grid_samples: of each of these balls at most.
+        vector_cells: 0, or along each axis of a cube around a grid point, with `grid_radii_m` as half its length:
+            VectorPool interpolates the keypoints nearest to each cell instead of aggregating balls (AV PV-RCNN).
     """
 
     keypoints: int = 2048
@@ -68,11 +76,14 @@ class VoxelSetSettings:
         SourceBalls("conv3", (1.2, 2.4), (16, 32)),
         SourceBalls("conv4", (2.4, 4.8), (16, 32)),
     )
+    scale_radii_m: tuple[float, ...] = ()
+    scale_samples: int = 16
     deform: Deform = "none"
     proposals: AnchorProposals = field(default_factory=AnchorProposals)
     grid_size: int = 6
     grid_radii_m: tuple[float, ...] = (0.8, 1.6)
     grid_samples: int = 16
+    vector_cells: int = 0
 
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
@@ -83,6 +94,13 @@ class VoxelSetSettings:
                 raise ConfigError(f"{item.name} {value} must be at least 1")
         if not self.grid_radii_m or not min(self.grid_radii_m) > 0:
             raise ConfigError(f"grid_radii_m {list(self.grid_radii_m)} must be positive, one at least")
+        if not 0 <= self.vector_cells <= MOST_VECTOR_CELLS:
+            raise ConfigError(f"vector_cells {self.vector_cells} must lie between 0 and {MOST_VECTOR_CELLS}")
+        if not min(self.scale_radii_m, default=1) > 0 or self.scale_samples < 2:
+            raise ConfigError(
+                f"scale_radii_m {list(self.scale_radii_m)} must be positive, scale_samples {self.scale_samples} at "
+                "least 2"
+            )
         names = [each.source for each in self.sources]
         if len(set(names)) < len(names):
             raise ConfigError(f"sources {', '.join(names)} must be different ones")
@@ -128,6 +146,8 @@ class VoxelScan(NamedTuple):
     """(K, 4) flat indices into the map seen from above, see `bilinear_cells`."""
     bev_weights: NDArray[np.float32]
     """(K, 4)."""
+    scales: tuple[PointScale[NDArray[Any]], ...]
+    """Of raw points around keypoints, the finest first; none where they are not asked for."""
     counts: ScanCounts
 
 
@@ -191,6 +211,7 @@ def with_neighbors(
         tuple(indices for indices, _ in nearest),
         tuple(weights for _, weights in nearest),
         *bilinear_cells(keypoints, *spec.map_places_m()),
+        point_scales(inside, keypoints, settings.scale_radii_m, settings.scale_samples),
         counts,
     )
 

@@ -47,6 +47,11 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
             f"{bundle}: kind {manifest.kind}, {manifest.pillar.neck} neck, {manifest.spec.grid.map} map; the page runs "
             "kind pillar with a dense neck on a warped map"
         )
+    if manifest.spec.anchor_places != "cells" or manifest.spec.anchor_scores != "own":
+        raise BundleError(
+            f"{bundle}: anchor_places {manifest.spec.anchor_places}, anchor_scores {manifest.spec.anchor_scores}; the "
+            "page runs anchors at cell centers with one score for each (anchor_places cells, anchor_scores own)"
+        )
     version, read = _open_package(ort_web)
     points = read_scan(scan).points
     with atomic_directory(out, "asca export --browser", PAGE) as folder:

@@ -31,9 +31,10 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 
 _ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTIALS[:-1], "pv_rcnn")}
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
-# Of `pillar` and `spec.grid`, and what they are where they are not written: in bundles made before there were sparse
-# necks and pooled maps. The graphs' metadata tells whether they were taken out.
+# Of `pillar`, `spec` and `spec.grid`, and what they are where they are not written: in bundles made before there were
+# sparse necks, other anchors and pooled maps. The graphs' metadata tells whether they were taken out.
 _LATER_KEYS = {"neck": "dense", "active_cells": None}
+_LATER_SPEC_KEYS = {"anchor_places": "cells", "anchor_scores": "own"}
 _LATER_GRID_KEYS = {"map": "warped"}
 _LARGEST_BYTES = 1 << 20
 _LONGEST_REASON = 300
@@ -106,7 +107,7 @@ def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
         data["pillar"] = _LATER_KEYS | section
         layout = data["pillar"].pop("layout", None)
     if isinstance(spec := data.get("spec"), dict) and isinstance(grid := spec.get("grid"), dict):
-        data["spec"] = spec | {"grid": _LATER_GRID_KEYS | grid}
+        data["spec"] = _LATER_SPEC_KEYS | spec | {"grid": _LATER_GRID_KEYS | grid}
     return layout
 
 

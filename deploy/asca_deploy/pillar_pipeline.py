@@ -203,7 +203,7 @@ class CanvasBackbone:
         inputs = {"canvas": Tensor(section.canvas.type, (1, rows + 1, columns + 1, section.channels))}
         outputs = {
             name: Tensor("float32", (1, *grid.head_shape, channels * anchors))
-            for name, channels in zip(HeadMaps._fields, (1, 7, 2), strict=True)
+            for name, channels in zip(HeadMaps._fields, (bundle.spec.scores_per_anchor, 7, 2), strict=True)
         }
         if neck_channels:
             outputs[NECK] = Tensor("float32", (1, *grid.head_shape, neck_channels))

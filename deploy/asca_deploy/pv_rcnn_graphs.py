@@ -36,7 +36,7 @@ def keeps_memory(section: PvRcnnSection) -> bool:
     that time.
     """
     settings = section.settings
-    rows = settings.proposals.count * settings.grid_size**3 * settings.grid_samples
+    rows = settings.proposals.count * settings.grid_size**3 * (settings.vector_cells**3 or settings.grid_samples)
     return rows * section.keypoint_channels * 4 <= _KEPT_BYTES
 
 
@@ -70,6 +70,12 @@ def keypoints_interface(bundle: PvRcnnBundle) -> Interface:
         "keypoints": Tensor("float32", (None, 3)),
         "bev": Tensor("float32", (None, map_channels(bundle))),
     }
+    for number in range(len(bundle.pv_rcnn.settings.scale_radii_m)):
+        inputs[f"scale_{number}_groups"] = Tensor("int32", (None, bundle.pv_rcnn.settings.scale_samples))
+        if number:  # the finest is the keypoints
+            inputs[f"scale_{number}_positions"] = Tensor("float32", (None, 3))
+            inputs[f"scale_{number}_nearest"] = Tensor("int32", (None, 3))
+            inputs[f"scale_{number}_nearest_weights"] = Tensor("float32", (None, 3))
     for each in bundle.pv_rcnn.settings.sources:
         if each.source != "points":
             inputs[each.source] = Tensor("float32", (None, channels[each.source]))
@@ -108,7 +114,8 @@ def refine_interface(bundle: PvRcnnBundle) -> Interface:
         "grid_points": Tensor("float32", (None, 3)),
     }
     for number in range(len(settings.grid_radii_m)):
-        inputs[f"grid_{number}"] = Tensor("int32", (None, settings.grid_samples))
+        around = (settings.vector_cells**3, 3) if settings.vector_cells else (settings.grid_samples,)
+        inputs[f"grid_{number}"] = Tensor("int32", (None, *around))
     return inputs, {"confidence": Tensor("float32", (None,)), "residuals": Tensor("float32", (None, 7))}
 
 
@@ -128,6 +135,8 @@ def keypoint_inputs(
 ) -> dict[str, NDArray[Any]]:
     """What keypoints.onnx takes: features (N, C) of levels by name, the map (K, C) at the keypoints, and balls."""
     given: dict[str, NDArray[Any]] = {"points": scan.points, "keypoints": scan.keypoints, "bev": bev}
+    for number, scale in enumerate(scan.scales):
+        given |= {f"scale_{number}_{part}": array for part, array in scale._asdict().items()}
     for each, positions, balls in zip(sources, scan.positions, balls_of, strict=True):
         if each.source != "points":
             given |= {each.source: levels[each.source], f"{each.source}_positions": positions}

@@ -162,7 +162,7 @@ class PvRcnnPipeline:
         laps.append(("neighbors", perf_counter()))
         features = self.describe(raw.scan, raw.levels, raw.bev, places, balls)
         laps.append(("keypoints", perf_counter()))
-        grid = grid_neighbors(raw.scan.keypoints, proposals.boxes, self.settings)
+        grid = grid_neighbors(raw.scan.keypoints, proposals.boxes, self.settings, self.settings.vector_cells)
         laps.append(("neighbors", perf_counter()))
         confidence, residuals = self.refine(raw.scan.keypoints, features, grid)
         laps.append(("refine", perf_counter()))

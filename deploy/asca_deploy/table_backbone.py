@@ -51,7 +51,8 @@ class TableBackbone:
             inputs |= {f"{kind}_{number}": Tensor("int32", (None, 9)) for kind in ("strided", "first", "same")}
             inputs[f"places_{number}"] = Tensor("int32", (None,))
         anchors = bundle.spec.anchors.shape[2]
-        self._channels = dict(zip(HeadMaps._fields, (anchors, 7 * anchors, 2 * anchors), strict=True))
+        counts = (bundle.spec.scores_per_anchor * anchors, 7 * anchors, 2 * anchors)
+        self._channels = dict(zip(HeadMaps._fields, counts, strict=True))
         if neck_channels:
             self._channels[NECK] = neck_channels
         outputs = {name: Tensor("float32", (None, channels)) for name, channels in self._channels.items()}

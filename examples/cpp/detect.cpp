@@ -45,10 +45,12 @@ json read_manifest(const std::string& folder) {
     std::ifstream file(folder + "/bundle.json");
     if (!file) throw std::runtime_error(folder + "/bundle.json: cannot be read");
     const json manifest = json::parse(file);
-    const json &pillar = manifest.at("pillar"), &grid = manifest.at("spec").at("grid");
+    const json &pillar = manifest.at("pillar"), &spec = manifest.at("spec"), &grid = spec.at("grid");
     if (manifest.at("schema_version") != 3 || manifest.at("kind") != "pillar" ||
         pillar.value("neck", "dense") != "dense" || (grid.value("map", "warped") == "pooled" && grid.at("zones") > 1))
         throw std::runtime_error(folder + ": needs schema 3, kind pillar, a dense neck and a warped map");
+    if (spec.value("anchor_places", "cells") != "cells" || spec.value("anchor_scores", "own") != "own")
+        throw std::runtime_error(folder + ": needs anchors at cell centers with one score for each");
     return manifest;
 }
 

@@ -22,6 +22,7 @@ from asca_pillars.errors import ExportError
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 MIN_CALIBRATION = 8
 # Of the class logits of the best anchors. With the bundle that ships 0.04 costs 0.2 points of AP and 0.10 costs two;
@@ -90,7 +91,7 @@ def quantize_bundle(
             backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
             placed = (backbone.place(each.in_steps(steps), each.pillars.cells) for each in compared)
             found = (backbone.run(each).maps.scores for each in placed)
-            return _logit_error(expected, found, len(bundle.spec.classes))
+            return _logit_error(expected, found, bundle.spec)
 
         found = _sweep(rounded.layers, error_of, progress)
         eight_bit = [layer for layer in rounded.layers if layer not in found.kept_float]
@@ -152,11 +153,13 @@ def _encode(pipeline: PillarPipeline, points: Points) -> Encoded:
     return Encoded(pipeline.encode(pillars), pillars)
 
 
-def _logit_error(expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], classes: int) -> float:
+def _logit_error(
+    expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], spec: PillarSpec
+) -> float:
     """RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
     squares = []
     for want, got in zip(expected, found, strict=True):
-        for ours, theirs in zip(by_class(want, classes), by_class(got, classes), strict=True):
+        for ours, theirs in zip(by_class(want, spec), by_class(got, spec), strict=True):
             if len(ours):
                 best = np.argpartition(-ours, min(COMPARED_ANCHORS, ours.size - 1))[:COMPARED_ANCHORS]
                 squares.append(np.square(ours[best] - theirs[best]).mean())

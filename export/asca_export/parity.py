@@ -78,9 +78,13 @@ def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:
     return HeadMaps(*(part if batch.neck is not None else part[0] for part in maps))
 
 
-def by_class(scores: NDArray[np.float32], classes: int) -> NDArray[np.float32]:
-    """The logits (A, H, W), or rows (M, A), of each class: (classes, n)."""
-    return (scores if scores.ndim == 3 else scores.T).reshape(classes, scores.size // classes)
+def by_class(scores: NDArray[np.float32], spec: PillarSpec) -> NDArray[np.float32]:
+    """The logits (A, H, W), or rows (M, A), of each class: (classes, n); likewise of A * classes."""
+    classes = len(spec.classes)
+    channels = scores if scores.ndim == 3 else scores.T
+    if spec.scores_per_anchor > 1:  # of an anchor those of all classes, then the next anchor's
+        channels = channels.reshape(-1, classes, channels.size // len(channels)).swapaxes(0, 1)
+    return channels.reshape(classes, scores.size // classes)
 
 
 def require_close(
@@ -116,7 +120,7 @@ def compare_boxes(
     """
     classes = tuple(
         replace(class_, score_threshold=min(class_.score_threshold, _score_of_rank(logits)))
-        for class_, logits in zip(spec.classes, by_class(expected.scores, len(spec.classes)), strict=True)
+        for class_, logits in zip(spec.classes, by_class(expected.scores, spec), strict=True)
     )
     uncut = replace(spec.post, max_detections=spec.post.candidates * len(classes))
     worst = BoxDifference(0.0, 0.0)

@@ -1,6 +1,7 @@
 """PV-RCNN as four ONNX graphs, normalization folded into the layers before it; nothing is scattered in them."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pv_rcnn.deformation import Surroundings
 from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
 from asca_pillars.models.pv_rcnn.voxel_backbone import TableLayer, VoxelBackbone
-from asca_pillars.models.refine.keypoint_encoder import KeypointEncoder, SourceRows
+from asca_pillars.models.refine.keypoint_encoder import SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
+from asca_pillars.points.point_scales import PointScale
 from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls, VoxelSetSettings
 
 _EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
@@ -37,7 +39,7 @@ def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -
     inputs, _ = interfaces.keypoints_interface(bundle)
     sources = bundle.pv_rcnn.settings.sources
     rows = _source_rows(inputs, sources) | {"points": "points"}
-    keypoints = _Keypoints(network.encode, bundle.pv_rcnn.settings)
+    keypoints = _Keypoints(network, bundle.pv_rcnn.settings)
     _export(keypoints, graph_path(folder, KEYPOINTS), inputs, rows, ["features"])
     if bundle.pv_rcnn.settings.deformed:
         export_deform(network, bundle, graph_path(folder, DEFORM))
@@ -57,7 +59,15 @@ def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
 def _source_rows(inputs: Mapping[str, Declared], sources: Sequence[SourceBalls]) -> dict[str, str]:
     """What each input has a row of: a voxel of its source, or a keypoint."""
     of_source = {f"{each.source}{suffix}": each.source for each in sources for suffix in ("", "_positions")}
-    return {name: of_source.get(name, "keypoints") for name in inputs}
+    return {name: of_source.get(name) or _scale_row(name) or "keypoints" for name in inputs}
+
+
+def _scale_row(name: str) -> str:
+    """Of scale_1_groups scale_1; of scale_1_nearest, which has a row of each position of the scale before, scale_0."""
+    if not (found := re.fullmatch(r"scale_(\d+)_(groups|positions|nearest|nearest_weights)", name)):
+        return ""
+    scale = int(found[1]) - found[2].startswith("nearest")
+    return f"scale_{scale}" if scale else ""
 
 
 def _export(
@@ -134,13 +144,15 @@ class _Voxels(nn.Module):
 class _Keypoints(nn.Module):
     """Voxel set abstraction and keypoint weighting with one argument for each input of the graph."""
 
-    def __init__(self, encode: KeypointEncoder, settings: VoxelSetSettings) -> None:
+    def __init__(self, network: PvRcnn, settings: VoxelSetSettings) -> None:
         super().__init__()
-        self.encode, self.settings = encode, settings
+        self.encode, self.scales, self.settings = network.encode, network.scales, settings
 
     def forward(self, *inputs: Tensor) -> Tensor:
         points, keypoints, bev, *rest = inputs
         rows, indices, centers, left = [], [], [], iter(rest)
+        if self.scales is not None:
+            bev = torch.cat([self.scales(points, self._point_scales(keypoints, left)), bev], dim=1)
         for each in self.settings.sources:
             if each.source == "points":
                 rows.append(SourceRows(points[:, :3], points[:, 3:]))
@@ -152,6 +164,14 @@ class _Keypoints(nn.Module):
             centers += [places[min(ball, len(places) - 1)] for ball in range(len(each.radii_m))]
         features, _ = self.encode(rows, keypoints, bev, indices, centers)
         return features
+
+    def _point_scales(self, keypoints: Tensor, left: Iterator[Tensor]) -> list[PointScale[Tensor]]:
+        groups = next(left)
+        scales = [PointScale(keypoints, groups, groups[:0], keypoints[:0])]
+        for _ in self.settings.scale_radii_m[1:]:
+            groups, positions = next(left), next(left)
+            scales.append(PointScale(positions, groups, next(left), next(left)))
+        return scales
 
 
 class _Deform(nn.Module):

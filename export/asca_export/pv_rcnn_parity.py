@@ -71,7 +71,7 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
         found = runtime.describe(scan, levels, bev, places, balls_around(scan, network.settings, places))
         worst = max(worst, _require("keypoints", features, found, number))
         proposals = propose_anchors(maps, spec, network.settings.proposals)
-        grid = grid_neighbors(scan.keypoints, proposals.boxes, network.settings)
+        grid = grid_neighbors(scan.keypoints, proposals.boxes, network.settings, network.settings.vector_cells)
         with torch.inference_mode():
             indices = [torch.from_numpy(part) for part in grid.indices]
             refined = network.refine(batch.keypoints, described, torch.from_numpy(grid.points), indices)

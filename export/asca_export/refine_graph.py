@@ -12,6 +12,7 @@ from asca_deploy.refine_pipeline import OUTPUTS
 from asca_export.graphs import export_graph
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner, RefineInputs
 from asca_pillars.models.refine.set_abstraction import SetAbstraction
+from asca_pillars.models.refine.vector_pool import VectorPool
 from asca_pillars.points.refine_geometry import ROI_FEATURES, RefineSettings
 
 M = TypeVar("M", bound=nn.Module)
@@ -37,6 +38,8 @@ def fold_norms(network: M) -> M:
             if isinstance(module, SetAbstraction):
                 for index, norm in enumerate(module.norms):
                     module.norms[index] = _fold(module.layers[index], norm)  # type: ignore[arg-type]
+            elif isinstance(module, VectorPool):
+                module.norm = _fold_vectors(module)  # type: ignore[assignment]
             elif isinstance(module, nn.Sequential):
                 for index in range(1, len(module)):
                     if isinstance(norm := module[index], nn.BatchNorm1d):
@@ -45,10 +48,22 @@ def fold_norms(network: M) -> M:
 
 
 def _fold(layer: nn.Linear, norm: nn.BatchNorm1d) -> Shift:
+    scale, shift = _scale_and_shift(norm)
+    layer.weight *= scale[:, None]
+    return Shift(shift)
+
+
+def _fold_vectors(pool: VectorPool) -> Shift:
+    scale, shift = _scale_and_shift(pool.norm)
+    pool.features.weight *= scale[:, None]
+    pool.places.mul_(scale.view(len(pool.places), 1, -1))
+    return Shift(shift)
+
+
+def _scale_and_shift(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
     assert norm.running_var is not None and norm.running_mean is not None
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
-    layer.weight *= scale[:, None]
-    return Shift(norm.bias - norm.running_mean * scale)
+    return scale, norm.bias - norm.running_mean * scale
 
 
 class _Flat(nn.Module):

@@ -40,10 +40,17 @@ class PillarEncoder(nn.Module):
         channels: C, features of one pillar.
         cpa: reading of the attention; `point` acts before the max, `paper` and `channel` after it.
         limits: caps on pillars and points, which the `paper` and `point` readings lay their tables out for.
+        empty_slots: whether a pillar with fewer points than fit also has `empty_slot` among them, before its
+            normalization.
     """
 
-    def __init__(self, channels: int, cpa: CpaReading, limits: PillarLimits) -> None:
+    empty_slot: Tensor
+
+    def __init__(self, channels: int, cpa: CpaReading, limits: PillarLimits, *, empty_slots: bool = False) -> None:
         super().__init__()
+        self.slots = limits.max_points if empty_slots else 0
+        if empty_slots:
+            self.register_buffer("empty_slot", torch.zeros(channels))  # what a row of zeros gives
         self.linear = nn.Linear(len(FEATURES), channels, bias=False)
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
         self.point_attention = PointAttention(channels, limits.max_points) if cpa == "point" else None
@@ -68,10 +75,17 @@ class PillarEncoder(nn.Module):
             point_counts: (P,) points of each pillar.
             frame_pillars: pillars of each frame of a batch, summing to P; None is one frame.
         """
-        points = torch.relu(self.norm(self.linear(features)))  # (M, C)
+        points = self.linear(features)  # (M, C)
+        if self.slots:
+            points = torch.cat([points, self.empty_slot[None]])
+        points = torch.relu(self.norm(points))
+        if self.slots:
+            points, empty = points[:-1], points[-1:]
         if self.point_attention is not None:
             points = self.point_attention(points, pillar_index, point_counts)
         pillars = pillar_max(points, pillar_index, point_counts)  # (P, C)
+        if self.slots:
+            pillars = torch.where((point_counts < self.slots)[:, None], torch.maximum(pillars, empty), pillars)
         if self.pillar_attention is None:
             return pillars
         if frame_pillars is None:

@@ -150,7 +150,7 @@ def build_pillar_detector(model: PillarModel) -> PillarDetector:
     return PillarDetector(
         spec=spec,
         loss_weights=model.loss,
-        encode=PillarEncoder(network.pillar_channels, network.cpa, spec.limits),
+        encode=PillarEncoder(network.pillar_channels, network.cpa, spec.limits, empty_slots=network.empty_slots),
         neck=neck,
-        head=SSDHead(neck.out_channels, anchors_per_cell=spec.anchors.shape[2]),
+        head=SSDHead(neck.out_channels, spec.anchors.shape[2], spec.scores_per_anchor),
     )

@@ -3,17 +3,21 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
 from asca_pillars.models.pillar.head import SSDHead
+from asca_pillars.models.pv_rcnn.adaptive_scales import AdaptiveScales
 from asca_pillars.models.pv_rcnn.deformation import AuthorsDeformation, PaperDeformation, Surroundings
 from asca_pillars.models.pv_rcnn.dual_attention import DualAttention
 from asca_pillars.models.pv_rcnn.voxel_backbone import VoxelBackbone
 from asca_pillars.models.pv_rcnn.voxel_batch import VoxelBatch, deformed_balls
 from asca_pillars.models.refine.keypoint_encoder import BallSource, KeypointEncoder, SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
+from asca_pillars.models.refine.set_abstraction import SetAbstraction
+from asca_pillars.models.refine.vector_pool import VectorPool
 from asca_pillars.points.voxel_scan import LEVEL_SOURCES, Source, VoxelSetSettings
 from asca_pillars.pv_rcnn_config import Attention, PvRcnnModel
 from asca_pillars.tables.voxel_spec import VoxelSpec
@@ -78,6 +82,7 @@ class PvRcnn(nn.Module):
         encode: voxel set abstraction and keypoint weighting (sections 3.2 and 3.3).
         refine: RoI-grid pooling and the second stage's heads (section 3.4).
         deform: what shifts the keypoints of each deformed source, by its name.
+        scales: features of raw points at several scales, beside those of `settings.sources`.
     """
 
     def __init__(
@@ -91,6 +96,7 @@ class PvRcnn(nn.Module):
         encode: KeypointEncoder,
         refine: RoiHead,
         deform: Mapping[str, nn.Module],
+        scales: AdaptiveScales | None = None,
     ) -> None:
         super().__init__()
         self.spec, self.settings = spec, settings
@@ -100,6 +106,7 @@ class PvRcnn(nn.Module):
         self.encode = encode
         self.refine = refine
         self.deform = nn.ModuleDict(deform).requires_grad_(settings.deform != "authors_frozen")
+        self.scales = scales
 
     def propose(self, batch: VoxelBatch[Tensor]) -> FirstStageOutputs:
         """Voxels -> features of every level and head maps."""
@@ -128,12 +135,13 @@ class PvRcnn(nn.Module):
             for corner in range(batch.bev_cells.shape[1])
         )
         assert isinstance(bev, Tensor)
+        beside = bev if self.scales is None else torch.cat([self.scales(batch.points, batch.scales), bev], dim=1)
         rows = [
             SourceRows(where, _source_features(each.source, batch.points, levels))
             for each, where in zip(self.settings.sources, batch.positions, strict=True)
         ]
         if not self.settings.deformed:
-            features, logits = self.encode(rows, batch.keypoints, bev, batch.ball_indices)
+            features, logits = self.encode(rows, batch.keypoints, beside, batch.ball_indices)
             return features, logits
         places = self.deformed_places(batch, levels)
         if self.settings.deform == "authors_frozen":
@@ -143,7 +151,7 @@ class PvRcnn(nn.Module):
                 for each, own in zip(self.settings.sources, rows, strict=True)
             ]
         indices, centers = deformed_balls(batch, self.settings, places)
-        features, logits = self.encode(rows, batch.keypoints, bev, indices, centers)
+        features, logits = self.encode(rows, batch.keypoints, beside, indices, centers)
         return features, logits
 
     def deformed_places(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
@@ -193,15 +201,13 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
                 )
                 for each, widths in zip(settings.sources, network.source_widths, strict=True)
             ],
-            map_channels,
+            map_channels + (network.scale_channels if settings.scale_radii_m else 0),
             network.keypoint_channels,
             network.weighting_channels,
         ),
         refine=RoiHead(
-            network.keypoint_channels,
+            [_grid_pool(model, radius_m) for radius_m in settings.grid_radii_m],
             settings.grid_size,
-            radii=len(settings.grid_radii_m),
-            widths=network.grid_widths,
             roi_channels=0,
             hidden=network.hidden,
             dropout=network.dropout,
@@ -212,4 +218,14 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
             else AuthorsDeformation(channels[each.source], len(each.radii_m))
             for each in settings.deformed
         },
+        scales=AdaptiveScales(channels["points"], network.scale_widths, network.scale_channels)
+        if settings.scale_radii_m
+        else None,
     )
+
+
+def _grid_pool(model: PvRcnnModel, radius_m: float) -> SetAbstraction | VectorPool:
+    network, cells = model.network, model.settings.vector_cells
+    if not cells:
+        return SetAbstraction(network.keypoint_channels, network.grid_widths)
+    return VectorPool(network.keypoint_channels, radius_m, cells, network.vector_channels, network.grid_widths)

@@ -127,7 +127,7 @@ class PvRcnnDetector(nn.Module):
         settings, device = self.model.settings, features.device
         per_frame = np.split(scans.keypoints.cpu().numpy(), np.cumsum(scans.frame_keypoints)[:-1])
         grids = [
-            grid_neighbors(keypoints, frame.boxes, settings)
+            grid_neighbors(keypoints, frame.boxes, settings, settings.vector_cells)
             for keypoints, frame in zip(per_frame, proposals, strict=True)
         ]
         points = torch.from_numpy(np.concatenate([grid.points for grid in grids])).to(device)

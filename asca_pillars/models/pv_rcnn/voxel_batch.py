@@ -11,6 +11,7 @@ from torch.utils._pytree import tree_map_only
 
 from asca_pillars.models.pillar.loss import TargetBatch
 from asca_pillars.points.ball_query import ball_query
+from asca_pillars.points.point_scales import PointScale
 from asca_pillars.points.voxel_scan import VoxelScan, VoxelSetSettings
 from asca_pillars.tables.batching import stack_cells, stack_rows
 from asca_pillars.tables.voxel_spec import VoxelSpec
@@ -42,6 +43,8 @@ class VoxelBatch(NamedTuple, Generic[Array]):
     """(K, 4) flat indices into the maps of all frames."""
     bev_weights: Array
     """(K, 4)."""
+    scales: tuple[PointScale[Array], ...]
+    """Of raw points around keypoints."""
     frame_keypoints: tuple[int, ...]
     """Keypoints of each frame."""
     frame_rows: tuple[tuple[int, ...], ...]
@@ -87,11 +90,28 @@ def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch[Tenso
         nearest_weights=tuple(np.concatenate([scan.nearest_weights[source] for scan in scans]) for source in sources),
         bev_cells=stack_cells([scan.bev_cells for scan in scans], rows * columns),
         bev_weights=np.concatenate([scan.bev_weights for scan in scans]),
+        scales=_stack_scales(scans),
         frame_keypoints=tuple(len(scan.keypoints) for scan in scans),
         frame_rows=frame_rows,
     )
     tensors: VoxelBatch[Tensor] = tree_map_only(np.ndarray, torch.from_numpy, batch)
     return tensors
+
+
+def _stack_scales(scans: Sequence[VoxelScan]) -> tuple[PointScale[NDArray[Any]], ...]:
+    stacked, finer = [], [len(scan.points) for scan in scans]
+    for scales in zip(*(scan.scales for scan in scans), strict=True):
+        rows = [len(scale.positions) for scale in scales]
+        stacked.append(
+            PointScale(
+                np.concatenate([scale.positions for scale in scales]),
+                stack_rows([scale.groups for scale in scales], finer),
+                stack_rows([scale.nearest for scale in scales], rows),
+                np.concatenate([scale.nearest_weights for scale in scales]),
+            )
+        )
+        finer = rows
+    return tuple(stacked)
 
 
 def deformed_balls(

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.models.refine.set_abstraction import NORM_EPS, NORM_MOMENTUM, SetAbstraction
+from asca_pillars.models.refine.point_mlp import mlp
+from asca_pillars.models.refine.set_abstraction import SetAbstraction
 
 
 class BallSource(NamedTuple):
@@ -51,7 +52,7 @@ class KeypointEncoder(nn.Module):
 
     Args:
         sources: what is aggregated within balls.
-        bev_channels: of the first stage's map.
+        bev_channels: of what is known of a keypoint besides, such as the first stage's map under it.
         out_channels: of the fused feature.
         weighting_channels: of the hidden layers of the weighting.
     """
@@ -87,7 +88,7 @@ class KeypointEncoder(nn.Module):
         Args:
             rows: of each source.
             keypoints: (K, 3).
-            bev: (K, bev_channels) the map at the keypoints.
+            bev: (K, bev_channels) likewise.
             indices: (K, T) rows of the source, source by source and radius by radius.
             centers: (K, 3) of these balls; None where all are the keypoints.
         """
@@ -102,18 +103,3 @@ class KeypointEncoder(nn.Module):
         joined = torch.cat([*found, bev], dim=1)
         logits = self.weigh(joined)
         return self.fuse(joined) * torch.sigmoid(logits), logits[:, 0]
-
-
-def mlp(in_channels: int, widths: Sequence[int], dropout: float = 0.0) -> list[nn.Module]:
-    """Linear, BatchNorm, ReLU for each width; dropout between them."""
-    layers: list[nn.Module] = []
-    for width in widths:
-        if layers and dropout:
-            layers.append(nn.Dropout(dropout))
-        layers += [
-            nn.Linear(in_channels, width, bias=False),
-            nn.BatchNorm1d(width, eps=NORM_EPS, momentum=NORM_MOMENTUM),
-            nn.ReLU(),
-        ]
-        in_channels = width
-    return layers

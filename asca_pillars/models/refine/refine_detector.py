@@ -14,6 +14,7 @@ from asca_pillars.models.refine.keypoint_encoder import BallSource, KeypointEnco
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner, RefineInputs, Refinements, zero_of_weights
 from asca_pillars.models.refine.refine_loss import RefineTargets, refine_loss
 from asca_pillars.models.refine.roi_head import RoiHead
+from asca_pillars.models.refine.set_abstraction import SetAbstraction
 from asca_pillars.models.second_stage.refine_preparation import LabeledProposals, RefinePreparation, live_preparation
 from asca_pillars.points.refine_geometry import ROI_FEATURES
 from asca_pillars.points.refined_detections import reported_frames
@@ -113,10 +114,8 @@ def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> Pill
             weighting_channels=network.keypoint_channels,
         ),
         RoiHead(
-            network.keypoint_channels,
+            [SetAbstraction(network.keypoint_channels, network.grid_widths) for _ in neighbors.grid_radii_m],
             neighbors.grid_size,
-            radii=len(neighbors.grid_radii_m),
-            widths=network.grid_widths,
             roi_channels=classes + ROI_FEATURES,
             hidden=network.hidden,
             dropout=network.dropout,

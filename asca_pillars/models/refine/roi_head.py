@@ -5,18 +5,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.models.refine.keypoint_encoder import mlp
+from asca_pillars.models.refine.point_mlp import mlp
 from asca_pillars.models.refine.set_abstraction import SetAbstraction
+from asca_pillars.models.refine.vector_pool import VectorPool
 
 
 class RoiHead(nn.Module):
     """Keypoints around the grid points of each proposal -> its confidence and its residuals.
 
     Args:
-        in_channels: of a keypoint.
+        pools: what aggregates the keypoints around a grid point, one for each radius.
         grid_size: grid points along each axis of a box.
-        radii: how many balls around each grid point.
-        widths: of the MLP of each ball.
         roi_channels: of what is known of a proposal besides, appended to its pooled features.
         hidden: channels of the fully connected layers.
         dropout: between them.
@@ -24,18 +23,17 @@ class RoiHead(nn.Module):
 
     def __init__(
         self,
-        in_channels: int,
+        pools: Sequence[SetAbstraction | VectorPool],
         grid_size: int,
-        radii: int,
-        widths: Sequence[int],
         roi_channels: int,
         hidden: int,
         dropout: float,
     ) -> None:
         super().__init__()
         self.cells = grid_size**3
-        self.pools = nn.ModuleList(SetAbstraction(in_channels, widths) for _ in range(radii))
-        self.shared = nn.Sequential(*mlp(self.cells * radii * widths[-1], [hidden, hidden], dropout))
+        self.pools = nn.ModuleList(pools)
+        pooled = sum(pool.out_channels for pool in pools)
+        self.shared = nn.Sequential(*mlp(self.cells * pooled, [hidden, hidden], dropout))
         joined = hidden + roi_channels
         self.confidence = nn.Sequential(*mlp(joined, [hidden, hidden], dropout), nn.Linear(hidden, 1))
         self.residuals = nn.Sequential(*mlp(joined, [hidden, hidden], dropout), nn.Linear(hidden, 7))
@@ -55,9 +53,9 @@ class RoiHead(nn.Module):
 
         Args:
             keypoints: (K, 3).
-            features: (K, in_channels).
+            features: (K, C).
             grid_points: (R * cells, 3), see `roi_grid_points`.
-            indices: of each radius (R * cells, T) keypoints.
+            indices: of each radius (R * cells, T) or, for VectorPool, (R * cells, T, 3) keypoints.
             roi_features: (R, roi_channels); None where there are no such channels.
         """
         pooled = [

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-NORM_EPS, NORM_MOMENTUM = 1e-5, 0.1  # PV-RCNN's of point features: torch's own
+from asca_pillars.models.refine.point_mlp import NORM_EPS, NORM_MOMENTUM
 
 
 class SetAbstraction(nn.Module):
@@ -29,7 +29,11 @@ class SetAbstraction(nn.Module):
         self.out_channels = widths[-1]
 
     def forward(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """Features of the queries, (Q, out_channels).
+        """Features of the queries, (Q, out_channels), see `grouped`."""
+        return self.grouped(positions, features, queries, indices).max(dim=1).values
+
+    def grouped(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
+        """What the MLP says of each point of each ball, (Q, T, out_channels).
 
         Args:
             positions: (N, 3) of the points, metres, in the frame of the queries.
@@ -44,7 +48,7 @@ class SetAbstraction(nn.Module):
         found = (indices[:, :1] < positions.shape[0]).to(points.dtype)
         centers = F.linear(queries, first[:, :3]) * found  # (Q, widths[0])
         grouped = points.index_select(0, indices.reshape(-1)).unflatten(0, indices.shape) - centers[:, None]
-        return self._after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape).max(dim=1).values
+        return self._after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape)
 
     def naive(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
         """`forward` as the equation is printed: the first layer once for each pair."""

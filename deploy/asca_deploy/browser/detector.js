@@ -18,6 +18,9 @@ export class Detector {
       throw new Error(`this page runs bundles of schema 3 and kind pillar, not ${manifest.schema_version} and ${manifest.kind}`);
     }
     if ((manifest.pillar.neck ?? "dense") !== "dense") throw new Error("this page runs bundles with a dense neck");
+    if ((manifest.spec.anchor_places ?? "cells") !== "cells" || (manifest.spec.anchor_scores ?? "own") !== "own") {
+      throw new Error("this page runs bundles with anchors at cell centers and one score for each");
+    }
     const detector = new Detector();
     detector.ort = ort;
     detector.manifest = manifest;

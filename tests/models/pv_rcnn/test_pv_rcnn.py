@@ -163,8 +163,9 @@ def test_lower_precision_leaves_positions_alone() -> None:
     torch.testing.assert_close(found.found.keypoint_logits, exact.found.keypoint_logits, atol=0.05, rtol=0.05)
 
 
-def test_learns_one_frame_by_heart() -> None:
-    detector, wanted = tiny_detector(), frame(5)
+@pytest.mark.parametrize("variant", ["published", "VectorPool", "adaptive scales"])
+def test_learns_one_frame_by_heart(variant: str) -> None:
+    detector, wanted = tiny_detector(**VARIANTS[variant]), frame(5)
     for module in detector.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
             module.momentum = 0.1  # so that a hundred steps are enough for its statistics

@@ -53,14 +53,25 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "gate": {"network": dataclasses.replace(NETWORK, gate="keypoint")},
     "dual attention": {"network": dataclasses.replace(NETWORK, attention="dual")},
     "residual dual attention": {"network": dataclasses.replace(NETWORK, attention="rda")},
+    "adaptive scales": {
+        "settings": dataclasses.replace(
+            SETTINGS, sources=SETTINGS.sources[1:], scale_radii_m=(0.8, 1.6, 3.2), scale_samples=5
+        ),
+        "network": dataclasses.replace(
+            NETWORK, source_widths=NETWORK.source_widths[1:], scale_widths=(8, 12, 16), scale_channels=8
+        ),
+    },
+    "VectorPool": {"settings": dataclasses.replace(SETTINGS, vector_cells=2)},
     "distance IoU": {"box_loss": "va"},
     "deformed": {"settings": dataclasses.replace(SETTINGS, deform="paper")},
     "deformed as the authors": {"settings": dataclasses.replace(SETTINGS, deform="authors")},
 }
 """What differs from `MODEL`."""
 EVERYTHING: dict[str, Any] = {
-    "network": dataclasses.replace(NETWORK, gate="keypoint", attention="rda"),
-    "settings": dataclasses.replace(SETTINGS, deform="paper"),
+    "network": dataclasses.replace(NETWORK, gate="keypoint", attention="rda", scale_widths=(8, 12, 16)),
+    "settings": dataclasses.replace(
+        SETTINGS, deform="paper", vector_cells=2, scale_radii_m=(0.8, 1.6, 3.2), scale_samples=5
+    ),
     "box_loss": "va",
 }
 MODEL = PvRcnnModel(

@@ -12,6 +12,7 @@ from asca_pillars.models.refine.keypoint_encoder import BallSource, KeypointEnco
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.refine.refine_loss import refine_loss
 from asca_pillars.models.refine.roi_head import RoiHead
+from asca_pillars.models.refine.set_abstraction import SetAbstraction
 from asca_pillars.models.second_stage.refine_sample import RefineBatch, collate_samples, collate_scans
 from asca_pillars.models.second_stage.refined_detector import refine
 from asca_pillars.points.farthest_points import farthest_points
@@ -29,7 +30,9 @@ BEV_CHANNELS = 3
 def small_refiner(seed: int = 0) -> PillarRefiner:
     torch.manual_seed(seed)
     encode = KeypointEncoder([BallSource(1, 2, (8, 16))], BEV_CHANNELS, 16, weighting_channels=16)
-    head = RoiHead(16, 3, radii=2, widths=(16, 16), roi_channels=len(NAMES) + 4, hidden=32, dropout=0.0)
+    head = RoiHead(
+        [SetAbstraction(16, (16, 16)) for _ in range(2)], 3, roi_channels=len(NAMES) + 4, hidden=32, dropout=0.0
+    )
     return PillarRefiner(encode, head)
 
 
@@ -86,7 +89,8 @@ def test_every_weight_learns() -> None:
 def test_gradients() -> None:
     torch.manual_seed(0)
     encode = KeypointEncoder([BallSource(1, 1, (3,))], BEV_CHANNELS, 4, weighting_channels=4)
-    network = PillarRefiner(encode, RoiHead(4, 2, 1, (3,), roi_channels=7, hidden=4, dropout=0.0)).double().eval()
+    head = RoiHead([SetAbstraction(4, (3,))], 2, roi_channels=7, hidden=4, dropout=0.0)
+    network = PillarRefiner(encode, head).double().eval()
     settings = RefineSettings(ball_radii_m=(0.8,), ball_samples=3, grid_size=2, grid_radii_m=(1.6,), grid_samples=3)
     frame, proposed = proposed_frame(0)
     few = Proposed(proposed.proposals, proposed.keypoints[:12], proposed.bev[:12])

@@ -1,0 +1,1 @@
+"""Weights that OpenPCDet trained, as checkpoints of ours."""

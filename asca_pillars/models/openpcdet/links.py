@@ -1,0 +1,82 @@
+"""Which of OpenPCDet's arrays becomes which of ours, and that none is left over on either side."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+from torch import Tensor
+
+from asca_pillars.errors import TrainingError
+
+_NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
+_COUNTER = "num_batches_tracked"
+_WITHOUT_EFFECT = ("global_step",)  # OpenPCDet's counter of training steps lies beside the weights
+_NAMED = 5  # of the names that do not fit
+
+
+def as_it_is(array: Tensor) -> Tensor:
+    """Unitless weights (out, in, ...) as they are, and arrays of any other shape."""
+    return array
+
+
+def without_singletons(array: Tensor) -> Tensor:
+    """A 1x1 convolution's unitless weight (out, in, 1, ...) as a linear layer's (out, in)."""
+    return array.flatten(1) if array.shape[2:].numel() == 1 else array
+
+
+class Link(NamedTuple):
+    """One array: its name there, its name here, and how it is laid out anew."""
+
+    source: str
+    target: str
+    convert: Callable[[Tensor], Tensor] = as_it_is
+
+
+def norm_links(source: str, target: str) -> Iterator[Link]:
+    """Of a normalization."""
+    return (Link(f"{source}.{part}", f"{target}.{part}") for part in _NORM_PARTS)
+
+
+def convert_state(
+    state: Mapping[str, Tensor], links: Iterable[Link], wanted: Mapping[str, Tensor], blamed: str
+) -> dict[str, Tensor]:
+    """Our state dict from theirs; every array of theirs is used, or named in the error.
+
+    Args:
+        state: theirs by name: unitless weights (out, in, ...) and the (C,) values of normalizations.
+        links: what becomes what.
+        wanted: our state dict, for names and shapes.
+        blamed: the file, for messages.
+
+    Raises:
+        TrainingError: an array is missing, unknown, or of another shape than the configuration asks for.
+    """
+    links = list(links)
+    known = {link.source for link in links}
+    if missing := [name for name in known if name not in state]:
+        raise TrainingError(f"{blamed}: lacks {_some(missing)}; the network of --config has other layers")
+    if unknown := [name for name in state if name not in known and not _is_counter(name)]:
+        raise TrainingError(
+            f"{blamed}: {_some(unknown)}: no place for it in the network of --config; nothing is imported in part"
+        )
+    converted = {}
+    for source, target, convert in links:
+        found = convert(state[source])
+        if found.shape != wanted[target].shape:
+            raise TrainingError(
+                f"{blamed}: {source} has shape {tuple(state[source].shape)}, which does not fit {target} "
+                f"{tuple(wanted[target].shape)}; give the model's configuration with --config"
+            )
+        converted[target] = found.to(wanted[target].dtype).contiguous()
+    counters = {name: value for name, value in wanted.items() if name.endswith(_COUNTER)}
+    assert converted.keys() | counters.keys() == wanted.keys(), "a part of our network has no link"
+    return counters | converted
+
+
+def _is_counter(name: str) -> bool:
+    return name in _WITHOUT_EFFECT or name.endswith(_COUNTER)
+
+
+def _some(names: Iterable[str]) -> str:
+    names = sorted(names)
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{', '.join(names[:_NAMED])}{more}"

@@ -1,0 +1,83 @@
+"""The rows of the two-stage ablation: each is a network that can be built, and one goes through to the table."""
+
+import dataclasses
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TextIO
+
+import pytest
+import yaml
+
+from asca_pillars.ablation import variants
+from asca_pillars.ablation.two_stage_variants import BASE, TWO_STAGE
+from asca_pillars.commands.ablate import ablate
+from asca_pillars.commands.ablate_steps import family_of, parse_variants
+from asca_pillars.config import load_config
+from asca_pillars.errors import ConfigError
+from asca_pillars.models.build import build_model
+from asca_pillars.pv_rcnn_config import PvRcnnModel
+from asca_pillars.schema import to_dict
+from tests.in_process import run_here
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, tiny_config
+from tests.scenes import write_dataset
+
+
+def model_of(*overrides: str) -> PvRcnnModel:
+    model = load_config(BASE, overrides).model
+    assert isinstance(model, PvRcnnModel)
+    return model
+
+
+@pytest.mark.parametrize("name", TWO_STAGE.variants)
+def test_every_variant_fits_the_shipped_base_and_is_another_network(name: str) -> None:
+    row = TWO_STAGE.variants[name]
+    model = model_of(*row.overrides)
+    weights = sum(weight.numel() for weight in build_model(model).parameters())
+    assert 100_000 < weights < 1_500_000
+    baseline = TWO_STAGE.variants["pv_rcnn"]
+    assert (model == model_of(*baseline.overrides)) == (row == baseline)
+    assert len(row.components) == len(TWO_STAGE.components)
+    assert [other for other in TWO_STAGE.variants.values() if other.components == row.components] == [row]
+
+
+def test_the_baseline_is_the_base() -> None:
+    assert model_of(*TWO_STAGE.variants["pv_rcnn"].overrides) == model_of()
+
+
+def test_msaa_takes_the_place_of_the_points_alone() -> None:
+    base, scales = model_of(), model_of(*TWO_STAGE.variants["msaa"].overrides)
+    assert base.settings.sources[0].source == "points"
+    assert scales.settings.sources == base.settings.sources[1:]
+    assert scales.network.source_widths == base.network.source_widths[1:]
+    assert scales.settings.scale_radii_m and not base.settings.scale_radii_m
+
+
+def test_every_row_is_in_a_table() -> None:
+    assert {name for names in TWO_STAGE.tables.values() for name in names} == set(TWO_STAGE.variants)
+
+
+def test_names_are_those_of_the_base_s_family() -> None:
+    with pytest.raises(ConfigError, match="--variants asp_k3: no such variant; there are pv_rcnn, deform_paper"):
+        parse_variants("asp_k3", family_of(load_config(BASE)))
+    with pytest.raises(
+        ConfigError, match=r"model\.kind = pillar_refine: no variants; give a base of kind pillar or pv_rcnn"
+    ):
+        family_of(load_config("asca_refine_sim"))
+
+
+def test_from_training_to_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(command: list[str], *, stdout: TextIO, **_: object) -> subprocess.CompletedProcess[str]:
+        done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
+        stdout.write(done.stdout + done.stderr)
+        return done
+
+    # Training answers to Ctrl-C, which only a main thread can.
+    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
+    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+    data, base = write_dataset(tmp_path / "data", 10, val_frames=8), tmp_path / "tiny.yaml"
+    base.write_text(yaml.safe_dump(to_dict(dataclasses.replace(tiny_config(MODEL, epochs=1)))))
+    ablate(str(base), data=data, out=tmp_path / "out", seeds="0", variants="deform_gate_vector_pool")
+    text = (tmp_path / "out" / "results.md").read_text()
+    assert "| paper | yes | VectorPool | - | balls | - | 512 |" in text and "2 frames for training" in text
+    assert "(AV PV-RCNN, Tables 5 and 6)" in text and "AFE-RCNN" not in text

@@ -1,0 +1,171 @@
+"""OpenPCDet's PV-RCNN, imported from both versions of spconv: the same values after every part."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+from asca_pillars.config import Config, load_config
+from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
+from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn as OurNetwork
+from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
+from asca_pillars.points.refine_geometry import grid_neighbors
+from asca_pillars.pv_rcnn_config import PvRcnnModel
+from tests.models.openpcdet.foreign_networks import PvRcnn, pooled, random_weights, write_foreign
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SETTINGS, SPEC, batch, frame
+from tests.tables.test_cell_map import at_cells, dense
+
+CONFIG = Config(name="foreign", model=MODEL)
+LAYOUTS = {"1.x": (2, 3, 4, 1, 0), "2.x, native": (2, 3, 4, 0, 1), "2.x": (0, 2, 3, 4, 1)}
+"""Of a dense kernel (out, in, z, y, x), the order in which spconv has its axes."""
+CHANNELS = {"points": 1, "conv2": 6, "conv4": 8}
+
+
+def foreign_network(model: PvRcnnModel = MODEL, channels: dict[str, int] = CHANNELS) -> PvRcnn:
+    network, settings = model.network, model.settings
+    balls = [
+        (channels[each.source], len(each.radii_m), widths)
+        for each, widths in zip(settings.sources, network.source_widths, strict=True)
+    ]
+    return PvRcnn(
+        network.voxel_channels,
+        (network.block_channels, network.block_convs, network.upsample_channels),
+        3,
+        balls,
+        network.keypoint_channels,
+        network.weighting_channels,
+        (settings.grid_size, len(settings.grid_radii_m), network.grid_widths, network.hidden),
+    )
+
+
+def in_layout(state: dict[str, Tensor], layout: str) -> dict[str, Tensor]:
+    axes = LAYOUTS[layout]
+    return {
+        name: value.permute(axes).contiguous() if name.startswith("backbone_3d") and value.ndim == 5 else value
+        for name, value in state.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def foreign() -> Any:
+    return random_weights(foreign_network())
+
+
+def imported(foreign: PvRcnn, folder: Path, layout: str = "1.x") -> OurNetwork:
+    weights = read_foreign(write_foreign(folder / "theirs.pth", in_layout(foreign.state_dict(), layout)))
+    assert published_config(weights) == "pv_rcnn_kitti"
+    write_imported(weights, CONFIG, folder / "ours.ckpt")
+    detector = load_checkpoint(folder / "ours.ckpt").detector
+    assert isinstance(detector, PvRcnnDetector)
+    return detector.network
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_sparse_weights_of_every_layout_are_the_dense_ones(foreign: PvRcnn, tmp_path: Path, layout: str) -> None:
+    ours, theirs = imported(foreign, tmp_path, layout).voxels, foreign.backbone_3d
+    pairs = [(ours.get_submodule("same.0.0"), theirs.conv_input), (ours.get_submodule("same.0.1"), theirs.conv1[0])]
+    for level, block in enumerate((theirs.conv2, theirs.conv3, theirs.conv4)):
+        names = f"down.{level}", f"same.{level + 1}.0", f"same.{level + 1}.1"
+        pairs += list(zip(map(ours.get_submodule, names), block, strict=True))
+    for layer, (convolution, _) in [*pairs, (ours.get_submodule("down.3"), theirs.conv_out)]:
+        assert isinstance(layer.convolution, torch.nn.Conv3d)
+        assert torch.equal(layer.convolution.weight, convolution.weight)
+
+
+def test_every_part_gives_what_theirs_gives(foreign: PvRcnn, tmp_path: Path) -> None:
+    ours = imported(foreign, tmp_path)
+    detector = PvRcnnDetector(MODEL, ours).eval()
+    scans = batch(detector, frame(0)).scans
+    with torch.inference_mode():
+        first = ours.propose(scans)
+        volumes = voxel_volumes(foreign, scans)
+        for level, theirs, own in zip(first.levels, volumes, scans.levels, strict=True):
+            torch.testing.assert_close(
+                level.double(), torch.from_numpy(at_cells(theirs, own.cells.numpy())), atol=1e-4, rtol=1e-4
+            )
+        seen_from_above = volumes[-1].float().flatten(1, 2)  # (1, C * D, H, W)
+        features = foreign.backbone_2d(seen_from_above)
+        for ours_map, their_map in zip(first.maps, foreign.dense_head(features), strict=True):
+            torch.testing.assert_close(ours_map, their_map, atol=1e-4, rtol=1e-3)
+
+        described, logits = ours.describe(scans, first.levels, first.canvas)
+        cells = seen_from_above[0].flatten(1).T
+        parts: Any = [sum(cells[scans.bev_cells[:, i]] * scans.bev_weights[:, i, None] for i in range(4))]
+        sources = {"points": scans.points[:, 3:], "conv2": first.levels[1], "conv4": first.levels[3]}
+        balls, layers = iter(scans.ball_indices), (foreign.pfe.SA_rawpoints, *foreign.pfe.SA_layers)
+        for layer, positions, rows in zip(layers, scans.positions, sources.values(), strict=True):
+            parts += [pooled(mlp, positions, rows, scans.keypoints, next(balls)) for mlp in layer.mlps]
+        joined = torch.cat(parts, dim=1)  # theirs: map, raw points, levels
+        their_logits = foreign.point_head.cls_layers(joined)
+        torch.testing.assert_close(logits, their_logits[:, 0], atol=1e-4, rtol=1e-3)
+        their_features = foreign.pfe.vsa_point_feature_fusion(joined) * torch.sigmoid(their_logits)
+        torch.testing.assert_close(described, their_features, atol=1e-4, rtol=1e-3)
+
+        boxes = frame(0).boxes[:3]
+        grid = grid_neighbors(scans.keypoints.numpy(), boxes, SETTINGS)
+        indices, points = [torch.from_numpy(index) for index in grid.indices], torch.from_numpy(grid.points)
+        confidence, residuals = ours.refine(scans.keypoints, described, points, indices)
+        mlps = foreign.roi_head.roi_grid_pool_layer.mlps
+        balls_of = [pooled(mlp, scans.keypoints, described, points, i) for mlp, i in zip(mlps, indices, strict=True)]
+        of_grid = torch.cat(balls_of, dim=1).view(len(boxes), SETTINGS.grid_size**3, -1)
+        shared = foreign.roi_head.shared_fc_layer(of_grid.permute(0, 2, 1).reshape(len(boxes), -1, 1))
+        torch.testing.assert_close(confidence, foreign.roi_head.cls_layers(shared)[:, 0, 0], atol=1e-4, rtol=1e-3)
+        torch.testing.assert_close(residuals, foreign.roi_head.reg_layers(shared)[..., 0], atol=1e-4, rtol=1e-3)
+
+
+def voxel_volumes(foreign: PvRcnn, scans: Any) -> list[Tensor]:
+    """Dense volumes (1, C, D, H, W) of conv1 to conv4 and conv_out, zero where no voxel is active."""
+    volume, volumes = dense(scans.features.numpy(), scans.levels[0].cells.numpy(), SPEC.level_shapes[0]), []
+    part = foreign.backbone_3d
+    blocks = [[part.conv_input, *part.conv1], list(part.conv2), list(part.conv3), list(part.conv4), [part.conv_out]]
+    for number, block in enumerate(blocks):
+        cells = scans.levels[number].cells.numpy()
+        for place, (convolution, norm) in enumerate(block):
+            stride: Any = 1
+            padding: Any = 1
+            if number and place == 0:
+                stride, padding = SPEC.strided[number - 1].stride, SPEC.strided[number - 1].padding
+            volume = F.conv3d(volume, convolution.weight.double(), stride=stride, padding=padding)
+            active = torch.relu(norm.double()(torch.from_numpy(at_cells(volume, cells))))
+            norm.float()
+            volume = dense(active.numpy(), cells, SPEC.level_shapes[number])
+        volumes.append(volume)
+    return volumes
+
+
+def test_what_does_not_fit_is_named(foreign: PvRcnn, tmp_path: Path) -> None:
+    state = foreign.state_dict()
+    gated = dataclasses.replace(MODEL, network=dataclasses.replace(NETWORK, gate="keypoint"))
+    for changes, config, message in (
+        (
+            {},
+            Config(name="gated", model=gated),
+            "OpenPCDet's model has no encode.gates.0.gate.weight; switch off what gated",
+        ),
+        (
+            {},
+            load_config("pv_rcnn_kitti"),
+            "lacks backbone_2d.blocks.0.10.weight, .* and 95 more; the network of --config",
+        ),
+        ({"roi_head.more": torch.zeros(1)}, CONFIG, "roi_head.more: no place for it"),
+        ({"backbone_3d.conv2.0.0.weight": torch.zeros(3, 3)}, CONFIG, r"conv2\.0\.0\.weight has shape \(3, 3\)"),
+    ):
+        weights = read_foreign(write_foreign(tmp_path / "theirs.pth", state | changes))
+        with pytest.raises((TrainingError, ConfigError), match=message):
+            write_imported(weights, config, tmp_path / "ours.ckpt")
+
+
+def test_the_published_model_fits(tmp_path: Path) -> None:
+    config = load_config("pv_rcnn_kitti")
+    assert isinstance(config.model, PvRcnnModel)
+    published = foreign_network(config.model, {"points": 1, "conv1": 16, "conv2": 32, "conv3": 64, "conv4": 64})
+    assert sum(weight.numel() for weight in published.parameters()) == 13_115_697
+    weights = read_foreign(write_foreign(tmp_path / "theirs.pth", in_layout(published.state_dict(), "2.x")))
+    write_imported(weights, config, tmp_path / "ours.ckpt")
+    assert load_checkpoint(tmp_path / "ours.ckpt").steps == weights.steps

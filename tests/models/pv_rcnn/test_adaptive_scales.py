@@ -1,0 +1,120 @@
+"""Adjusted features and their scales against the equations, point by point."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.errors import ConfigError
+from asca_pillars.models.pv_rcnn.adaptive_scales import AdaptiveScales, Adjustment
+from asca_pillars.points.ball_query import three_nearest
+from asca_pillars.points.farthest_points import farthest_points
+from asca_pillars.points.point_scales import PointScale, point_scales
+from asca_pillars.points.voxel_scan import VoxelSetSettings
+from asca_pillars.pv_rcnn_config import PvRcnnModel
+from tests.models.pv_rcnn.tiny_pv_rcnn import VARIANTS, batch, frame, tiny_detector
+from tests.points.clouds import cloud
+
+
+def random_adjustment(channels: int) -> Adjustment:
+    module = Adjustment(channels).double()
+    for weight in module.parameters():
+        torch.nn.init.normal_(weight, std=0.5)
+    return module
+
+
+def in_double(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(array).double() if array.dtype == np.float32 else torch.from_numpy(array)
+
+
+def impact(module: Adjustment, value: np.ndarray) -> np.ndarray:
+    with torch.inference_mode():
+        return module.out(torch.relu(module.hidden(torch.from_numpy(value)))).numpy()
+
+
+def test_features_are_adjusted_as_eq_10_says() -> None:
+    torch.manual_seed(0)
+    module, features = random_adjustment(8), torch.randn(3, 4, 8, dtype=torch.float64)
+    counted = torch.tensor([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]], dtype=torch.float64)
+    with torch.inference_mode():
+        found = module(features, counted).numpy()
+    for group, own, members in zip(features.numpy(), found, counted.numpy().astype(bool), strict=True):
+        for i in np.flatnonzero(members):
+            wanted = (impact(module, group[i]) + 1) * group[i]  # beta_i F_i
+            for j in np.flatnonzero(members):
+                if j != i:
+                    wanted = wanted - impact(module, group[i] - group[j]) * (group[j] - group[i])  # beta_j (F_j - F_i)
+            np.testing.assert_allclose(own[i], wanted, atol=1e-12)
+
+
+def test_gradients() -> None:
+    torch.manual_seed(0)
+    module, counted = random_adjustment(4), torch.tensor([[1.0, 1, 0], [1, 1, 1]], dtype=torch.float64)
+    features = torch.randn(2, 3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda values, *_: module(values, counted), (features, *module.parameters()))
+
+
+def test_the_first_keypoints_are_what_sampling_them_again_takes() -> None:
+    points = cloud(3, 300, 3.0, coarse=False)
+    keypoints = np.ascontiguousarray(points[farthest_points(points, 60), :3])
+    finest, middle, coarse = point_scales(points, keypoints, (0.8, 1.6, 3.2), 6)
+    np.testing.assert_array_equal(middle.positions, keypoints[farthest_points(keypoints, 15)])
+    np.testing.assert_array_equal(coarse.positions, keypoints[farthest_points(keypoints, 4)])
+    assert finest.groups.max() < 300 and middle.groups.max() < 60 and coarse.groups.max() < 15
+    assert len(finest.nearest) == 0 and middle.nearest.shape == (60, 3) and coarse.nearest.shape == (15, 3)
+    for finer, scale in ((finest, middle), (middle, coarse)):
+        indices, weights = three_nearest(scale.positions, finer.positions)
+        np.testing.assert_array_equal(scale.nearest, indices)
+        np.testing.assert_array_equal(scale.nearest_weights, weights)
+
+
+def test_coarse_features_reach_every_keypoint() -> None:
+    torch.manual_seed(0)
+    points = cloud(4, 200, 2.0, coarse=False)
+    keypoints = np.ascontiguousarray(points[farthest_points(points, 40), :3])
+    scales = point_scales(points, keypoints, (0.8, 1.6), 5)
+    module = AdaptiveScales(1, (6, 7), 5).double().eval()
+    given: Any = [PointScale(*(in_double(part) for part in scale)) for scale in scales]
+    with torch.inference_mode():
+        found = module(torch.from_numpy(points).double(), given).numpy()
+        rows, positions, of_scales = points[:, 3:].astype(np.float64), points[:, :3].astype(np.float64), []
+        lifts: Any = module.lift
+        for lift, adjust, scale in zip(lifts, module.adjust, scales, strict=True):
+            own = []
+            for center, group in zip(scale.positions.astype(np.float64), scale.groups, strict=True):
+                members = list(dict.fromkeys(group.tolist()))
+                pairs = np.concatenate([positions[members] - center, rows[members]], axis=1)
+                lifted = torch.relu(lift.norms[0](lift.layers[0](torch.from_numpy(pairs))))
+                own.append(adjust(lifted[None], torch.ones(1, len(members)).double())[0].numpy().max(axis=0))
+            rows, positions = np.array(own), scale.positions.astype(np.float64)
+            of_scales.append(rows)
+        coarse = scales[1]
+        brought = (of_scales[1][coarse.nearest] * coarse.nearest_weights[:, :, None]).sum(axis=1)
+        wanted = module.join(torch.from_numpy(np.concatenate([of_scales[0], brought], axis=1))).numpy()
+    assert found.shape == (40, 5)
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_scales_of_a_batch_are_those_of_its_frames() -> None:
+    detector = tiny_detector(**VARIANTS["adaptive scales"]).eval()
+    together = batch(detector, frame(0), frame(1)).scans
+    alone = [batch(detector, each).scans for each in (frame(0), frame(1))]
+    scales = detector.network.scales
+    assert scales is not None
+    with torch.inference_mode():
+        found = scales(together.points, together.scales)
+        wanted = torch.cat([scales(each.points, each.scales) for each in alone])
+    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-4)
+
+
+def test_settings_that_cannot_be() -> None:
+    settings = VoxelSetSettings(scale_radii_m=(0.8, 1.6))
+    with pytest.raises(ConfigError, match=r"scale_widths has 3 entries: give one for each of the 2 radii"):
+        dataclasses.replace(PvRcnnModel(), settings=settings)
+    for changes in ({"scale_radii_m": (0.0,)}, {"scale_samples": 1}):
+        with pytest.raises(ConfigError, match="scale_radii_m"):
+            dataclasses.replace(settings, **changes)
+    with pytest.raises(ConfigError, match="vector_cells 8 must lie between 0 and 7"):
+        dataclasses.replace(settings, vector_cells=8)
