@@ -1,7 +1,13 @@
 """What holds for every test."""
 
+import contextlib
+import copy
+import functools
+import gc
 import logging
+import sys
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -9,6 +15,16 @@ from hypothesis import settings
 # How long an example takes depends on what else the machine does, and says nothing about whether it is right.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+# What is imported stays to the end. Looking through it for garbage again and again took an eighth of the suite's time.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is collected, of what the tests make."""
+    gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)
@@ -18,3 +34,26 @@ def _runtime_log() -> Iterator[None]:
     before = log.level
     yield
     log.setLevel(before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _operators_of_onnx_are_read_once() -> Iterator[None]:
+    """torch.onnx reads the source of its thousand operators anew for each graph: half of a small network's export."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "torch" in sys.modules:  # tests that do without need not wait for it
+            with contextlib.suppress(ImportError):  # a torch that has it elsewhere: exports only take longer
+                _keep_registry(patch)
+        yield
+
+
+def _keep_registry(patch: pytest.MonkeyPatch) -> None:
+    from torch.onnx._internal.exporter._registration import ONNXRegistry
+
+    read = functools.cache(ONNXRegistry.from_torchlib)
+
+    def from_torchlib(**version: Any) -> ONNXRegistry:
+        registry = copy.copy(read(**version))
+        registry.functions = {target: list(forms) for target, forms in registry.functions.items()}
+        return registry
+
+    patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(from_torchlib))

@@ -141,7 +141,7 @@ def test_detect_refuses_what_is_not_there(tmp_path: Path) -> None:
 
 def test_a_scan_without_points_gives_no_boxes(tmp_path: Path) -> None:
     np.save(tmp_path / "empty.npy", np.empty((0, 4), np.float32))
-    result = asca("detect", "empty.npy", cwd=tmp_path)
+    result = run_here("detect", "empty.npy", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert json.loads((tmp_path / "detections" / "empty.json").read_text())["boxes"] == []
 
@@ -221,7 +221,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
 def test_simulated_frames_are_what_detect_reads(tmp_path: Path) -> None:
     result = run_here("simulate", "sim", "-n", 2, "--view", "camera", "-w", 1, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    detected = asca("detect", "sim/training/velodyne", cwd=tmp_path)
+    detected = run_here("detect", "sim/training/velodyne", cwd=tmp_path)
     assert detected.returncode == 0, detected.stderr
     assert sorted(path.name for path in (tmp_path / "detections").glob("*.txt")) == ["000000.txt", "000001.txt"]
     assert "view" in refusal(run_here("simulate", "other", "--view", "rear", cwd=tmp_path))
@@ -230,13 +230,13 @@ def test_simulated_frames_are_what_detect_reads(tmp_path: Path) -> None:
 def test_a_file_where_the_output_folder_should_be(tmp_path: Path) -> None:
     target = tmp_path / "detections"
     target.write_text("keep me")
-    assert "detections" in refusal(asca("detect", cwd=tmp_path))
+    assert "detections" in refusal(run_here("detect", cwd=tmp_path))
     assert target.read_text() == "keep me"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no limit on the size of files")
 def test_a_full_disk_loses_nothing_that_was_there(tmp_path: Path) -> None:
-    assert asca("detect", cwd=tmp_path).returncode == 0
+    assert run_here("detect", cwd=tmp_path).returncode == 0
     before = {path.name: path.read_bytes() for path in (tmp_path / "detections").iterdir()}
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))\n"  # a write beyond it fails
     assert "File too large" in refusal(asca("detect", cwd=tmp_path, code=limit + WITHOUT_TORCH))

@@ -1,6 +1,5 @@
 """Training and validation batches, loaded by processes of their own."""
 
-import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from torch.utils.data import DataLoader
 
 from asca_pillars.config import Config
 from asca_pillars.training.dataset import Collate, LabeledDataset, open_dataset
+from asca_pillars.training.loader_processes import leave_interrupts_to_the_loop, loader_context
 from asca_pillars.training.sampler import EpochSampler
 
 
@@ -46,11 +46,6 @@ class DetectionData(L.LightningDataModule):
             num_workers=self.workers,
             collate_fn=Collate(frames.preparation),
             persistent_workers=self.workers > 0,
-            worker_init_fn=_leave_interrupts_to_the_loop,
-            multiprocessing_context="forkserver" if self.workers else None,
+            worker_init_fn=leave_interrupts_to_the_loop,
+            multiprocessing_context=loader_context() if self.workers else None,
         )
-
-
-def _leave_interrupts_to_the_loop(_: int) -> None:
-    """Ctrl-C reaches every process of the terminal; a step that is under way still needs its batch."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -25,7 +25,7 @@ from asca_deploy.manifest import load_any_bundle, write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
-from asca_export.int8 import quantize_bundle
+from asca_export.int8 import calibration_scans, quantize_bundle
 from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
@@ -71,13 +71,16 @@ def export_bundle(
         progress: told what is being done.
 
     Raises:
-        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
+        ExportError: too few scans, to prove parity or to calibrate on, or PyTorch and onnxruntime differ; names the
+            first stage that does.
     """
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
     config, detector = checkpoint.config, checkpoint.detector
     if not (isinstance(config.model, PillarModel) and isinstance(detector, PillarDetector)):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
+    if calibration is not None:
+        calibration_scans(calibration, scans, config.model.spec)  # too few are told before the work, not after it
     progress("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         graphs.export_encoder(detector, graphs.graph_path(folder, ENCODER))

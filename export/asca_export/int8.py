@@ -43,6 +43,34 @@ class _Sensitivity(NamedTuple):
     """Without those that are kept in floating point."""
 
 
+class CalibrationScans(NamedTuple):
+    """What can be calibrated on."""
+
+    used: list[Points]
+    dropped: int
+    """Those that parity is proven on."""
+
+
+def calibration_scans(calibration: Sequence[Points], scans: Sequence[Points], spec: PillarSpec) -> CalibrationScans:
+    """Those of `calibration`, scans (N, 4) in the LiDAR frame, that have points on the grid and are not among `scans`.
+
+    With one of `scans` the comparison would be with what the ranges were fitted to.
+
+    Raises:
+        ExportError: fewer than MIN_CALIBRATION.
+    """
+    shown = {_digest(points) for points in scans}
+    own = [points for points in calibration if _digest(points) not in shown]
+    dropped = len(calibration) - len(own)
+    used = [points for points in own if len(spec.pillarize(points).cells)]
+    if len(used) < MIN_CALIBRATION:
+        raise ExportError(
+            f"{len(used)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are "
+            f"needed; {dropped} were left out because parity is proven on them: give other scans to --calibrate"
+        )
+    return CalibrationScans(used, dropped)
+
+
 def quantize_bundle(
     folder: Path,
     bundle: Bundle,
@@ -56,25 +84,18 @@ def quantize_bundle(
     Args:
         folder: a proven float bundle.
         detector: what it was exported from, in evaluation mode.
-        calibration: scans (N, 4), LiDAR frame, that set the ranges, at least MIN_CALIBRATION of them with points on
-            the grid; those that are among `scans` are left out, or the comparison would be with what it was fitted to.
+        calibration: scans (N, 4), LiDAR frame, that set the ranges, see `calibration_scans`.
         scans: to measure on.
         progress: told what is being done.
 
     Raises:
         ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
     """
+    own = calibration_scans(calibration, scans, bundle.spec)
     runtime = Detector(folder)
-    pipeline, shown = runtime.pipeline, {_digest(points) for points in scans}
+    pipeline = runtime.pipeline
     assert isinstance(pipeline, PillarPipeline), "the bundle has just been exported from a pillar detector"
-    own = [points for points in calibration if _digest(points) not in shown]
-    encoded = [each for each in (_encode(pipeline, points) for points in own) if len(each.features)]
-    if len(encoded) < MIN_CALIBRATION:
-        raise ExportError(
-            f"{len(encoded)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are "
-            f"needed; {len(calibration) - len(own)} were left out because parity is proven on them: "
-            "give other scans to --calibrate"
-        )
+    encoded = [_encode(pipeline, points) for points in own.used]
     steps = canvas_steps(each.features for each in encoded)
     form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
     eight_bit_form = replace(bundle, pillar=replace(bundle.pillar, canvas=form))
@@ -99,7 +120,7 @@ def quantize_bundle(
     qdq.quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
     report = Quantization(
         calibration_scans=len(encoded),
-        dropped_scans=len(calibration) - len(own),
+        dropped_scans=own.dropped,
         compared_scans=len(scans),
         layers=tuple(LayerQuantization(name, found.alone[name], name in found.kept_float) for name in rounded.layers),
         logit_rms_error=found.total,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import subprocess
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TextIO
@@ -10,7 +11,7 @@ import pytest
 import yaml
 
 from asca_pillars.ablation import variants
-from asca_pillars.ablation.variants import VARIANTS, Variant, runs, train_runs
+from asca_pillars.ablation.variants import VARIANTS, Variant, evaluate_runs, runs, train_runs
 from asca_pillars.commands import ablate_steps
 from asca_pillars.commands.ablate import ablate
 from asca_pillars.config import load_config, pillar_spec
@@ -44,6 +45,24 @@ def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
     assert {(spec.positive_iou, spec.negative_iou) for spec in persons} == {variant.person_ious or (0.5, 0.35)}
 
 
+@pytest.fixture
+def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs one after the other, in this process, which has imported torch already; those of `baseline` in their own."""
+    start = subprocess.run
+
+    def run(command: list[str], *, stdout: TextIO, **options: Any) -> subprocess.CompletedProcess[Any]:
+        if any("baseline" in Path(part).parts for part in command):
+            return start(command, stdout=stdout, **options)
+        done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
+        stdout.write(done.stdout + done.stderr)
+        return done
+
+    # Training answers to Ctrl-C, which only a main thread can.
+    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
+    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+
+
+@pytest.mark.usefixtures("in_turn")
 def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_dataset(tmp_path / "data", 14, val_frames=8)
     out = tmp_path / "out"
@@ -66,21 +85,29 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: py
         ablate(config, data=data, out=out, seeds="0", variants="baseline")
 
 
-def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(
-    tmp_path: Path, config: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def run(command: list[str], *, stdout: TextIO, **_: object) -> subprocess.CompletedProcess[str]:
-        done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
-        stdout.write(done.stdout + done.stderr)
-        return done
-
-    # Training answers to Ctrl-C, which only a main thread can.
-    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
-    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+@pytest.mark.usefixtures("in_turn")
+def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(tmp_path: Path, config: str) -> None:
     data, names = write_dataset(tmp_path / "data", 14, val_frames=8), "asp_k3_pooled_cpa_channel_fine"
     any_zones = ["model.spec.grid.x_range_m=[4.8, 20.16]"]
     ablate(config, data=data, out=tmp_path / "out", override=any_zones, seeds="0", variants=names)
     assert "| K=3 pooled | channel | - | fine | - |" in (tmp_path / "out" / "results.md").read_text()
+
+
+def test_as_many_at_a_time_as_asked_for_share_the_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    together = threading.Barrier(2, timeout=60)
+    threads = []
+
+    def run(command: list[str], *, env: dict[str, str], **_: object) -> subprocess.CompletedProcess[str]:
+        threads.append(int(env["OMP_NUM_THREADS"]))
+        together.wait()  # breaks unless two runs are here at once
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(variants, "default_threads", lambda: 6)
+    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+    todo = runs(tmp_path, [0, 1], [VARIANTS["baseline"], VARIANTS["asp_k2"]])
+    train_runs(todo, "tiny.yaml", tmp_path, jobs=2)
+    evaluate_runs(todo, tmp_path, jobs=2)
+    assert threads == [3] * 8 and all(one.trained.exists() for one in todo)
 
 
 def test_a_failed_run_names_its_log(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.training.dataset import Collate, open_dataset
+from asca_pillars.training.loader_processes import loader_context
 from tests.data.insertion.simple_streets import TYPES, write_streets
 from tests.scenes import SPEC
 
@@ -186,7 +187,7 @@ def test_any_number_of_workers_gives_the_same(root: Path) -> None:
         batch_sampler=batches,
         num_workers=2,
         collate_fn=Collate(frames.preparation),
-        multiprocessing_context="forkserver",
+        multiprocessing_context=loader_context(),
     )
     for batch, indices in zip(loader, batches, strict=True):
         for boxes, labels, index in zip(batch.boxes, batch.labels, indices, strict=True):
