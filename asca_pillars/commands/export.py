@@ -110,7 +110,7 @@ def export(
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
     kind = loaded.config.model.kind
-    if int8 and kind != "pillar":
+    if int8 and kind == "pv_rcnn":
         raise ConfigError(f"--int8: {checkpoint} is of kind {kind}, which is exported in float32; leave it out")
     if loaded.expected_input is None and scans is None:
         raise ConfigError(
@@ -124,11 +124,13 @@ def export(
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
     with console.status("Exporting") as status:
         bundle: AnyBundle
-        if kind != "pillar":
-            export_kind = export_refine_bundle if kind == "pillar_refine" else export_pv_rcnn_bundle
-            bundle = export_kind(loaded, out, points, trained_on=trained_on, command=command, progress=status.update)
+        if kind == "pv_rcnn":
+            bundle = export_pv_rcnn_bundle(
+                loaded, out, points, trained_on=trained_on, command=command, progress=status.update
+            )
         else:
-            bundle = export_bundle(
+            export_kind = export_refine_bundle if kind == "pillar_refine" else export_bundle
+            bundle = export_kind(
                 loaded,
                 out,
                 points,

@@ -174,8 +174,6 @@ def _verify_refine(manifest: Path, bundle: Bundle) -> None:
         raise BundleError(f"{manifest}: `refine` is null, kind pillar_refine needs it; {_EXPORT_AGAIN}")
     if len(bundle.refine.seen.proposals.quotas) != len(bundle.spec.classes):
         raise BundleError(f"{manifest}: `refine.seen.proposals.quotas` has not one for each class; {_EXPORT_AGAIN}")
-    if bundle.precision != "float32":
-        raise BundleError(f"{manifest}: `precision` of kind pillar_refine is float32; {_EXPORT_AGAIN}")
 
 
 def _read_manifest(manifest: Path) -> dict[str, Any]:

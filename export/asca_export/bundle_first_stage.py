@@ -2,6 +2,7 @@
 
 import tempfile
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import onnx
@@ -12,27 +13,33 @@ from asca_deploy.manifest import load_bundle
 from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
 from asca_deploy.shipped import find_bundle
 from asca_export.neck_output import add_neck_output
+from asca_pillars.errors import ExportError
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.points.first_stage import FirstPass, require_pillar_kind
 
 
 class BundleFirstStage:
-    """A float32 bundle in onnxruntime, see `points.first_stage.FirstStage`.
+    """A bundle in onnxruntime, see `points.first_stage.FirstStage`.
 
     Args:
         bundle: folder, or name of one that ships.
         threads: of onnxruntime.
+        precision: that the bundle must have; the neck's channels of an 8-bit one are scaled, see `add_neck_output`.
 
     Raises:
         BundleError: the bundle is missing or damaged.
         ConfigError: it is of another kind.
-        ExportError: it is not in float32.
+        ExportError: it has another precision.
     """
 
-    def __init__(self, bundle: str | Path, *, threads: int = 1) -> None:
+    def __init__(
+        self, bundle: str | Path, *, threads: int = 1, precision: Literal["float32", "int8"] = "float32"
+    ) -> None:
         folder = find_bundle(bundle)
         manifest = load_bundle(folder)
         require_pillar_kind(folder, manifest.kind)
+        if manifest.precision != precision:
+            raise ExportError(f"{folder}: a bundle in {manifest.precision}; give one in {precision}")
         self._pipeline = PillarPipeline(folder, manifest, threads=threads)
         model = add_neck_output(onnx.load(folder / manifest.graphs[BACKBONE].file))
         with tempfile.TemporaryDirectory() as temporary:

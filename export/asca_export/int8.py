@@ -34,7 +34,7 @@ Points = NDArray[np.float32]
 
 
 class _Sensitivity(NamedTuple):
-    """What came out of the sweep over the layers; errors are those of `_logit_error`."""
+    """What came out of the sweep over the layers; errors are those of `logit_error`."""
 
     alone: dict[str, float]
     """With all layers in 8 bits but this one."""
@@ -112,7 +112,7 @@ def quantize_bundle(
             backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
             placed = (backbone.place(each.in_steps(steps), each.pillars.cells) for each in compared)
             found = (backbone.run(each).maps.scores for each in placed)
-            return _logit_error(expected, found, bundle.spec)
+            return logit_error(expected, found, bundle.spec)
 
         found = _sweep(rounded.layers, error_of, progress)
         eight_bit = [layer for layer in rounded.layers if layer not in found.kept_float]
@@ -131,7 +131,7 @@ def quantize_bundle(
     draft = replace(eight_bit_form, name=f"{bundle.name}_int8", precision="int8", quantization=report)
     draft = graphs.sign(folder, draft)
     write_bundle_manifest(folder, draft)
-    quantized = replace(draft, quantization=_count_boxes(report, boxes, list(map(Detector(folder), scans))))
+    quantized = replace(draft, quantization=count_boxes(report, boxes, list(map(Detector(folder), scans))))
     write_bundle_manifest(folder, quantized)
     return quantized
 
@@ -158,7 +158,7 @@ def _sweep(
     return _Sensitivity(alone, kept, total)
 
 
-def _count_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
+def count_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
     """The report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
     matched = sum(map(_partnered, expected, found))
     added = sum(map(len, found)) - sum(map(_partnered, found, expected))
@@ -174,7 +174,7 @@ def _encode(pipeline: PillarPipeline, points: Points) -> Encoded:
     return Encoded(pipeline.encode(pillars), pillars)
 
 
-def _logit_error(
+def logit_error(
     expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], spec: PillarSpec
 ) -> float:
     """RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""

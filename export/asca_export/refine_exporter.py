@@ -11,20 +11,25 @@ import onnx
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Bundle, Parity, RefineSection
-from asca_deploy.manifest import load_bundle
+from asca_deploy.detector import Detector
+from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
+from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import MIN_SCANS, draft_bundle, export_bundle, write_proven
+from asca_export.int8 import MAX_LOGIT_ERROR, count_boxes, logit_error
 from asca_export.neck_output import add_neck_output
 from asca_export.refine_graph import export_refine
 from asca_export.refine_parity import prove_refine_parity
 from asca_pillars.config import pillar_spec
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
+from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.models.second_stage.open_first_stage import CHECKPOINT_SUFFIX, open_first_stage, with_first_stage
+from asca_pillars.points.first_stage import FirstStage
 from asca_pillars.system import default_threads
 
 
@@ -35,15 +40,19 @@ def export_refine_bundle(
     *,
     trained_on: str = "not stated",
     command: str = "not stated",
+    calibration: Sequence[NDArray[np.float32]] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
     """Write the first stage's graphs, refine.onnx and bundle.json, and prove on `scans` that they are the checkpoint's.
 
-    Arguments as of `exporter.export_bundle`. The first stage is the one that the checkpoint was trained on.
+    Arguments as of `exporter.export_bundle`. The first stage is the one that the checkpoint was trained on. With
+    `calibration` it then gives way to its 8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint
+    one made on those scans. The second stage stays in float32.
 
     Raises:
-        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
-        AscaError: the first stage is not there any more, or another one.
+        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does. Or the 8-bit
+            form is not that of this first stage.
+        AscaError: the first stage is not there any more, or another one, or has no 8-bit form.
     """
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
@@ -55,9 +64,7 @@ def export_refine_bundle(
     with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, "asca export", MANIFEST) as folder:
         first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, progress)
         proposing = load_bundle(first)
-        shutil.copyfile(first / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
-        backbone = add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file))
-        onnx.save(backbone, graphs.graph_path(folder, BACKBONE))
+        _copy_first_stage(first, proposing, folder)
         progress("Exporting the second stage and proving parity")
         path, classes = graphs.graph_path(folder, REFINE), len(model.spec.classes)
         export_refine(detector.refiner, model.refine.neighbors, model.bev_channels, classes, path)
@@ -75,7 +82,87 @@ def export_refine_bundle(
             pipeline = RefinePipeline(folder, signed, threads=default_threads())
             return prove_refine_parity(detector.refiner, stage, pipeline, model, scans)
 
-        return write_proven(folder, draft, prove)
+        bundle = write_proven(folder, draft, prove)
+        if calibration is None:
+            return bundle
+        progress("Putting the first stage in 8 bits")
+        eight_bit = _eight_bit_first(model.first_stage, Path(temporary) / "int8", scans, calibration, progress)
+        return _in_eight_bits(folder, bundle, first, eight_bit, scans, calibration)
+
+
+def _copy_first_stage(first: Path, proposing: Bundle, folder: Path, gains: NDArray[np.float32] | None = None) -> None:
+    shutil.copyfile(first / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
+    backbone = add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file), gains)
+    onnx.save(backbone, graphs.graph_path(folder, BACKBONE))
+
+
+def _in_eight_bits(
+    folder: Path,
+    bundle: Bundle,
+    first: Path,
+    eight_bit: Path,
+    scans: Sequence[NDArray[np.float32]],
+    calibration: Sequence[NDArray[np.float32]],
+) -> Bundle:
+    """Replace the first stage's graphs in `folder` by those of `eight_bit`, and compare the refined boxes."""
+    proposing = load_bundle(eight_bit)
+    if proposing.quantization is None or proposing.spec.grid != bundle.spec.grid:
+        raise ExportError(f"{eight_bit}: not the 8-bit form of the first stage; export it again")
+    threads = default_threads()
+    stages = BundleFirstStage(first, threads=threads), BundleFirstStage(eight_bit, threads=threads, precision="int8")
+    wanted, found = ([stage(scan) for scan in scans] for stage in stages)
+    scores = ([each.maps.scores for each in answers] for answers in (wanted, found))
+    error = logit_error(next(scores), iter(next(scores)), proposing.spec)
+    if error > MAX_LOGIT_ERROR:
+        raise ExportError(
+            f"{eight_bit}: its class logits are {error:.3g} from the first stage's, more than {MAX_LOGIT_ERROR}; it is "
+            "not its 8-bit form: export that again"
+        )
+    expected = _detect(folder, scans)
+    _copy_first_stage(eight_bit, proposing, folder, _neck_gains(*stages, calibration))
+    report = dataclasses.replace(
+        proposing.quantization, compared_scans=len(scans), logit_rms_error=error, boxes=sum(map(len, expected))
+    )
+    draft = dataclasses.replace(
+        bundle, name=f"{bundle.name}_int8", precision="int8", pillar=proposing.pillar, quantization=report
+    )
+    signed = graphs.sign(folder, draft)
+    write_bundle_manifest(folder, signed)
+    quantized = dataclasses.replace(signed, quantization=count_boxes(report, expected, _detect(folder, scans)))
+    write_bundle_manifest(folder, quantized)
+    return quantized
+
+
+def _neck_gains(
+    floating: FirstStage, eight_bit: FirstStage, calibration: Sequence[NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """(C,) factors by which the 8-bit neck's channels come nearest to the float one's, by least squares."""
+    products = squares = np.float64(0)
+    for scan in calibration:
+        wanted, found = (stage(scan).neck.astype(np.float64) for stage in (floating, eight_bit))
+        axes = tuple(range(wanted.ndim - 1))
+        products, squares = products + (wanted * found).sum(axes), squares + np.square(found).sum(axes)
+    silent = squares == 0  # a channel that is zero everywhere
+    return np.where(silent, 1, products / np.where(silent, 1, squares)).astype(np.float32)
+
+
+def _detect(folder: Path, scans: Sequence[NDArray[np.float32]]) -> list[Detections]:
+    runtime = Detector(folder)
+    return [runtime(scan) for scan in scans]
+
+
+def _eight_bit_first(
+    source: str,
+    temporary: Path,
+    scans: Sequence[NDArray[np.float32]],
+    calibration: Sequence[NDArray[np.float32]],
+    progress: Callable[[str], None],
+) -> Path:
+    """Folder of the first stage in 8 bits; a checkpoint is exported to `temporary`."""
+    if Path(source).suffix != CHECKPOINT_SUFFIX:
+        return find_bundle(f"{source}_int8")
+    export_bundle(load_checkpoint(source), temporary, scans, calibration=calibration, progress=progress)
+    return temporary
 
 
 def _first_bundle(

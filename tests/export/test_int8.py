@@ -19,11 +19,9 @@ from asca_pillars.config import pillar_spec
 from asca_pillars.errors import ExportError
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillar_config import CpaReading
-from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.scenes import make_scene
+from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 
 Exports = Callable[[CpaReading], Path]
-CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
 
 
 def export_int8(folder: Path) -> Bundle:

@@ -13,10 +13,9 @@ from asca_export.exporter import export_bundle
 from asca_export.int8 import quantize_bundle
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.scan_detector import ScanDetector
-from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.scenes import SPEC, make_scene
+from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
+from tests.scenes import SPEC
 
-CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
 POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled")).with_score_threshold(0.02)
 
 

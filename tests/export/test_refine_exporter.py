@@ -18,15 +18,17 @@ from asca_deploy.manifest import load_bundle
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_export import refine_exporter
 from asca_export.exporter import export_bundle
+from asca_export.int8 import MAX_LOGIT_ERROR
 from asca_export.refine_exporter import export_refine_bundle
 from asca_export.refine_graph import fold_norms
 from asca_pillars.errors import BundleError, ExportError
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector
-from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 from tests.models.refine.test_pillar_refiner import batch, small_refiner
 from tests.models.second_stage.tiny_refine import opened_config, save_checkpoint, tiny_refine_config, write_first_stage
 from tests.scenes import SPEC, write_dataset
@@ -85,6 +87,39 @@ def test_a_sparse_neck_on_a_pooled_map_proposes(tmp_path: Path) -> None:
     assert len(runtime(np.empty((0, 4), np.float32))) == 0
 
 
+def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    quantized = export_refine_bundle(load_checkpoint(trained[0]), tmp_path / "a", SCANS, calibration=CALIBRATION)
+    assert (quantized.name, quantized.precision, quantized.kind) == ("tiny_refine_int8", "int8", "pillar_refine")
+    assert load_bundle(tmp_path / "a") == quantized
+    report = quantized.quantization
+    assert report is not None and report.boxes > 5 and report.boxes_matched > report.boxes / 2
+    assert 0 < report.logit_rms_error <= MAX_LOGIT_ERROR
+    floating, eight_bit = (Detector(folder, threads=1).pipeline for folder in (trained[1], tmp_path / "a"))
+    assert isinstance(floating, RefinePipeline) and isinstance(eight_bit, RefinePipeline)
+    one, other = (each.infer(each.prepare(SCANS[0], []), []).found.neck for each in (floating, eight_bit))
+    assert other.dtype == np.float32 and 0 < np.abs(one - other).mean() < 0.1 * np.abs(one).mean()
+
+
+def test_eight_bits_of_other_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bundle's 8-bit form goes by its name; another network may stand there."""
+    monkeypatch.chdir(tmp_path)
+    export_bundle(tiny_checkpoint("channel"), "first", SCANS)
+    config = opened_config(Path("first"))
+    detector = build_model(config.model)
+    assert isinstance(detector, RefineDetector)
+    checkpoint = Checkpoint(config, detector.eval(), 0)
+    with pytest.raises(BundleError, match="first_int8: no such folder"):
+        export_refine_bundle(checkpoint, "out", SCANS, calibration=CALIBRATION)
+    other = tiny_checkpoint("channel")
+    with torch.no_grad():
+        assert isinstance(other.detector, PillarDetector)
+        other.detector.head.scores.weight.mul_(-1)
+    export_bundle(other, "first_int8", SCANS, calibration=CALIBRATION)
+    with pytest.raises(ExportError, match="it is not its 8-bit form"):
+        export_refine_bundle(checkpoint, "out", SCANS, calibration=CALIBRATION)
+    assert not Path("out").exists()
+
+
 def test_scans_with_little_or_nothing(trained: tuple[Path, Path]) -> None:
     detector = Detector(trained[1], score_threshold=0.0, threads=1)
     for points in (np.empty((0, 4)), np.array([[200, 0, 0, 0.5]]), np.array([[10, 0, -1, 0.5]])):
@@ -121,7 +156,7 @@ def test_the_graph_needs_no_scatter_and_no_normalization(trained: tuple[Path, Pa
         (lambda data: data.update(kind="pillar"), "`refine` belongs to kind pillar_refine"),
         (lambda data: data["pillar"].update(neck="sparse", active_cells="sub"), "`pillar` is not the one that"),
         (lambda data: data["spec"]["grid"].update(map="pooled"), "`spec` is not the one that"),
-        (lambda data: data.update(precision="int8"), "`precision` of kind pillar_refine is float32"),
+        (lambda data: data.update(precision="int8"), "`precision` is not the one that"),
     ],
 )
 def test_manifests_that_were_changed(trained: tuple[Path, Path], tmp_path: Path, change: object, message: str) -> None:

@@ -18,10 +18,9 @@ from asca_pillars.errors import ConfigError, ProviderError
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.pillar_config import PillarModel
-from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.scenes import SPEC, make_scene
+from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
+from tests.scenes import SPEC
 
-CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
 STAGES = ("pillarize", "encode", "tables", "neck+head", "decode")
 NOTHING = np.empty((0, 4), np.float32)
 ONE_POINT = np.array([[10.0, 0.5, -1.0, 0.3]], np.float32)

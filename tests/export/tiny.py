@@ -14,6 +14,7 @@ from tests.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
 SCANS = [make_scene(seed)[0] for seed in range(8)]
+CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
 
 
 def tiny_checkpoint(cpa: CpaReading, spec: PillarSpec = SPEC, **network: Any) -> Checkpoint:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from asca_export.exporter import export_bundle
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, ExportError
 from asca_pillars.models.second_stage.open_first_stage import open_first_stage
 from asca_pillars.points.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
 from asca_pillars.points.proposals import ProposalSettings
@@ -62,6 +62,11 @@ def test_rows_of_active_cells_are_a_map_with_zeros_beside_them(tmp_path: Path) -
     assert len(found.proposals) and len(found.keypoints) and 0 < len(rows.cells) < height * width
     np.testing.assert_array_equal(found.proposals.boxes, wanted.proposals.boxes)
     np.testing.assert_array_equal(found.bev, wanted.bev)
+
+
+def test_a_second_stage_is_not_trained_on_eight_bits() -> None:
+    with pytest.raises(ExportError, match="asca_small_sim_int8: a bundle in int8; give one in float32"):
+        open_first_stage("asca_small_sim_int8")
 
 
 def test_two_stages_are_no_first_stage() -> None:
