@@ -14,7 +14,7 @@ from onnx import numpy_helper
 from asca_deploy import Bundle, Detector, load_bundle
 from asca_deploy.canvas_backbone import CanvasBackbone
 from asca_deploy.pillar_pipeline import PillarPipeline
-from asca_export import exporter, int8
+from asca_export import graphs, int8
 from asca_export.exporter import export_bundle
 from asca_pillars.config import pillar_spec
 from asca_pillars.errors import ExportError
@@ -135,7 +135,7 @@ def test_scans_that_cannot_calibrate(exported: Exports, tmp_path: Path, monkeypa
 def test_calibration_on_the_compared_scans_alone_is_refused_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(exporter.graphs, "export_encoder", lambda *_: pytest.fail("exported"))
+    monkeypatch.setattr(graphs, "export_encoder", lambda *_: pytest.fail("exported"))
     with pytest.raises(ExportError, match=r"8 were left out because parity is proven on them.*other scans to --calib"):
         export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, calibration=SCANS)
     assert not list(tmp_path.iterdir())
