@@ -4,8 +4,9 @@
 
 Stages are those of `simulate_frame`, in milliseconds of processor time on one core, so that other programs disturb them
 little (nor does linear algebra wait on every core, see OMP_NUM_THREADS): median, and the 5th and 95th percentile over
-the frames. Frames per second are wall-clock time of whole frames in memory, without writing them; the first frames of
-each process, which compile or load the ray caster, are left out.
+the frames. Frames per second are of whole frames in memory, without writing them: by the clock, and per second of one
+core's processor time, which hardly changes while others use the machine. The first frames of each process, which
+compile or load the ray caster, are left out.
 """
 
 import multiprocessing
@@ -18,6 +19,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
+import numpy.typing as npt
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -26,6 +28,7 @@ from asca_pillars.data.kitti import in_image
 from asca_pillars.sim.annotation import label_camera_view
 from asca_pillars.sim.casting.raycast import cast
 from asca_pillars.sim.scalar_draws import draws_of
+from asca_pillars.sim.sensor.image_border import outside_image
 from asca_pillars.sim.sensor.lidar import draw_firings
 from asca_pillars.sim.sensor.returns import measure
 from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
@@ -39,7 +42,7 @@ ROUNDS = 5
 
 def main(
     frames: Annotated[int, typer.Option(help="Frames that are timed, per view and number of processes.")] = 60,
-    workers: Annotated[str, typer.Option(help="Numbers of processes, separated by commas.")] = "1,2",
+    workers: Annotated[str, typer.Option(help="Numbers of processes, separated by commas; empty: stages alone.")] = "1,2",
     seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
 ) -> None:
     """Print frames per second and milliseconds per stage."""
@@ -47,17 +50,18 @@ def main(
     console.print(
         f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
     )
-    counts = [int(count) for count in workers.split(",")]
+    counts = [int(count) for count in workers.split(",") if count]
     for view in VIEWS:
         config = replace(SimulationConfig(), field_of_view=view)
         console.print(_stage_table(view, _stages(config, frames, seed)))
+        if not counts:
+            continue
         table = Table(title=f"Frames per second, {view} view: median of {ROUNDS} rounds (slowest to fastest)")
-        for column in ("processes", "all", "per process"):
+        for column in ("processes", "all", "per process", "per second of processor time"):
             table.add_column(column, justify="right")
         for count in counts:
-            rates = _rates(config, frames, seed, count)
-            spread = f"{np.median(rates):.1f} ({min(rates):.1f} to {max(rates):.1f})"
-            table.add_row(str(count), spread, f"{np.median(rates) / count:.1f}")
+            rates, busy = np.array(_rates(config, frames, seed, count)).T
+            table.add_row(str(count), _spread(rates), f"{np.median(rates) / count:.1f}", _spread(busy))
         console.print(table)
 
 
@@ -73,6 +77,8 @@ def _stages(config: SimulationConfig, frames: int, seed: int) -> dict[str, list[
         bodies = build(scene, config.scene, (seed, index), reach)
         marks.append(time.process_time())
         firings = draw_firings(config.lidar, draws_of(seed, index, 2), camera_only)
+        if camera_only:
+            firings = replace(firings, outside=outside_image(firings, scene.calibration))
         noise = draws_of(seed, index, 3)
         hits = cast(bodies, len(scene.targets), scene.ground, firings, int(noise.integers(1 << 62)))
         marks.append(time.process_time())
@@ -97,8 +103,12 @@ def _stage_table(view: str, spent: dict[str, list[float]]) -> Table:
     return table
 
 
-def _rates(config: SimulationConfig, frames: int, seed: int, workers: int) -> list[float]:
-    """Frames per second of `workers` processes together, of each round."""
+def _spread(rates: npt.NDArray[np.float64]) -> str:
+    return f"{np.median(rates):.1f} ({rates.min():.1f} to {rates.max():.1f})"
+
+
+def _rates(config: SimulationConfig, frames: int, seed: int, workers: int) -> list[tuple[float, float]]:
+    """Frames per second of `workers` processes together, and per second of processor time, of each round."""
     job = partial(_draw, config, seed)
     # As in `simulate`: forked threads could hang, and linear algebra must not spread over the cores by itself.
     before = os.environ.get("OPENBLAS_NUM_THREADS")
@@ -110,8 +120,8 @@ def _rates(config: SimulationConfig, frames: int, seed: int, workers: int) -> li
             for turn in range(ROUNDS):
                 first, count = turn * frames, max(frames // ROUNDS, workers)
                 start = time.perf_counter()
-                pool.map(job, range(first, first + count), chunksize=max(count // (4 * workers), 1))
-                rates.append(count / (time.perf_counter() - start))
+                busy = pool.map(job, range(first, first + count), chunksize=max(count // (4 * workers), 1))
+                rates.append((count / (time.perf_counter() - start), count / sum(busy)))
             return rates
     finally:
         if before is None:
@@ -120,8 +130,10 @@ def _rates(config: SimulationConfig, frames: int, seed: int, workers: int) -> li
             os.environ["OPENBLAS_NUM_THREADS"] = before
 
 
-def _draw(config: SimulationConfig, seed: int, index: int) -> int:
-    return len(simulate_frame(seed, index, config).points)
+def _draw(config: SimulationConfig, seed: int, index: int) -> float:
+    start = time.process_time()
+    simulate_frame(seed, index, config)
+    return time.process_time() - start
 
 
 if __name__ == "__main__":

@@ -95,7 +95,7 @@ def occlusion_around(points: int, visible_share: float, config: SceneConfig) -> 
 
 def occlusion_state(visible_share: float) -> int:
     """KITTI's occlusion state 0..3 of an object of which this share is visible."""
-    return int(np.searchsorted(-np.array(OCCLUSION_STEPS), -visible_share, side="right"))
+    return sum(step >= float(visible_share) for step in OCCLUSION_STEPS)
 
 
 def dont_care(bbox: tuple[float, float, float, float]) -> KittiObject:

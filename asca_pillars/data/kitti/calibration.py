@@ -82,15 +82,15 @@ def in_image(
 
     KITTI labels only what the camera sees, so training points are cropped to this view.
     """
-    # Coordinates by rows: NumPy handles three long ones several times faster than many short ones.
-    xyz = np.moveaxis(points_lidar[..., :3], -1, 0).reshape(3, -1).astype(np.float64)
-    rect_from_lidar = calib.rect_from_lidar_matrix
-    rect = rect_from_lidar[:3, :3] @ xyz + rect_from_lidar[:3, 3:]
-    u, v, depth_m = calib.p2[:, :3] @ rect + calib.p2[:, 3:]
-    before = depth_m >= NEAR_PLANE_M
-    divisor = np.where(before, depth_m, 1.0)
-    u, v = u / divisor, v / divisor
-    width, height = image_size_wh
+    # Coordinates by rows, and sums in place: several times faster than many short rows and new memory for each step.
+    xyz = np.ascontiguousarray(points_lidar[..., :3].reshape(-1, 3).T, np.float64)
+    rect = calib.rect_from_lidar_matrix[:3, :3] @ xyz
+    rect += calib.rect_from_lidar_matrix[:3, 3:]
+    image = calib.p2[:, :3] @ rect
+    image += calib.p2[:, 3:]
+    before = image[2] >= NEAR_PLANE_M
+    image[:2] /= np.where(before, image[2], 1.0)
+    (u, v), (width, height) = image[:2], image_size_wh
     inside = before & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return inside.reshape(points_lidar.shape[:-1])
 

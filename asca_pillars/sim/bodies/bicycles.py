@@ -19,6 +19,21 @@ STRIPED_TIRE_SHARE, VEST_SHARE = 0.25, 0.1  # with a ring of foil on the sidewal
 REFLECTOR = Surface(2.5, 0.5)  # sends the light back where it came from
 
 
+def _circle() -> Floats:
+    """Quadrilaterals (segments,4,3) from each point of the unit circle to the next and back."""
+    angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+    ring = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
+    a, b = ring[:-1], ring[1:]
+    return np.stack([a, b, b, a], 1)
+
+
+_CIRCLE = _circle()
+# Of a wheel's tread, its tire's side and its spokes: how far each corner lies from the hub, and aside of the wheel.
+_SHARE_OF_RADIUS = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, _RIM, _RIM], [_RIM, _RIM, 0.0, 0.0]])[:, None, :, None]
+_ASIDE = np.zeros((3, 1, 4, 3))
+_ASIDE[0, 0, :, 1] = 0.035, 0.035, -0.035, -0.035
+
+
 class _Frame(NamedTuple):
     """Where a bicycle's parts meet, metres."""
 
@@ -73,19 +88,10 @@ def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -
 
 def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
     """Tires with their rims, and spokes as disks that let many rays through."""
-    angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
-    ring = frame.wheel_radius * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
     rubber = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.3)))), 0.3)
     sidewall = Surface(float(rng.uniform(0.45, 0.95)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
     spokes = Surface(float(rng.uniform(0.05, 0.3)), 0.2, float(rng.uniform(0.5, 0.75)))
-    a, b, side = ring[:-1], ring[1:], np.array([0.0, 0.035, 0.0])
-    faces = np.stack(
-        [
-            np.stack([a + side, b + side, b - side, a - side], 1),
-            np.stack([a, b, _RIM * b, _RIM * a], 1),
-            np.stack([_RIM * a, _RIM * b, 0 * b, 0 * a], 1),
-        ]
-    )
+    faces = frame.wheel_radius * _CIRCLE * _SHARE_OF_RADIUS + _ASIDE
     hubs = np.array([[frame.hub_x, 0.0, frame.wheel_radius], [-frame.hub_x, 0.0, frame.wheel_radius]])
     corners = faces + hubs[:, None, None, None]
     table = np.stack([rubber.row, sidewall.row, spokes.row])[None, :, None]

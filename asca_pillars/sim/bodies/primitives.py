@@ -81,7 +81,7 @@ class Primitives:
 
 
 def rotated(vectors: Floats, rotation: Floats) -> Floats:
-    """Vectors (..., 3) turned by a rotation (3,3)."""
+    """Vectors (..., 3), in metres or unitless, turned by a rotation (3, 3)."""
     # One product: NumPy would multiply a stack of matrices one after another.
     return (vectors.reshape(-1, 3) @ rotation.T).reshape(vectors.shape)
 

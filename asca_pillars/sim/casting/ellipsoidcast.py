@@ -89,7 +89,10 @@ def ellipsoid_window(center: Floats, m: Floats, distance: float, limits: RayLimi
 
 @numba.njit(**PLAIN)
 def leaves_of(density_per_m: float, distance: float, slope: Floats, columns_per_turn: int) -> Leaves:
-    """Leaves grow in tufts, so that crowns have depth and not only noise."""
+    """Leaves grow in tufts, so that crowns have depth and not only noise.
+
+    The cloud is `distance` metres away; slope (K,) is as in `Rays`.
+    """
     away = max(distance, 2.0)
     columns = int(TUFT_M / (away * 2.0 * np.pi / columns_per_turn))
     rings = int(TUFT_M / (away * abs(slope[0] - slope[-1]) / len(slope)))

@@ -155,7 +155,7 @@ def are_needed(outside: Bools, owner: npt.NDArray[np.int32], k: int, first: int,
     """Whether it matters what ground columns [first, last) of ring k meet.
 
     It does for an object, which the ground may hide, and beside a ray that is asked for, which may lean over an edge;
-    outside and owner (K, C) are as in `Rays` and `NearestHits`.
+    outside (K, C) is a mask as in `Rays`, owner (K, C) an index as in `NearestHits`.
     """
     rings, columns = outside.shape
     for j in range(first, last):
