@@ -184,7 +184,7 @@ def test_pooling_of_balls(trained: Trained, tmp_path: Path) -> None:
         given = (torch.from_numpy(part) for part in (keypoints, features, grid.points))
         wanted = network.refine(*given, indices)
     session = onnxruntime.InferenceSession(tmp_path / "refine.onnx", providers=["CPUExecutionProvider"])
-    arrays = {f"grid_{number}": index for number, index in enumerate(grid.indices)}
+    arrays: dict[str, np.ndarray] = {f"grid_{number}": index for number, index in enumerate(grid.indices)}
     arrays |= {"keypoints": keypoints, "features": features, "grid_points": grid.points}
     for one, other in zip(session.run(["confidence", "residuals"], arrays), wanted, strict=True):
         np.testing.assert_allclose(one, other.numpy(), atol=1e-4)
