@@ -61,7 +61,7 @@ def test_names_are_those_of_the_base_s_family() -> None:
         family_of(load_config("asca_refine_sim"))
 
 
-@pytest.mark.usefixtures("commands_here")
+@pytest.mark.usefixtures("in_turn")
 def test_from_training_to_the_table(tmp_path: Path) -> None:
     data, base = write_dataset(tmp_path / "data", 10, val_frames=8), tmp_path / "tiny.yaml"
     base.write_text(yaml.safe_dump(to_dict(dataclasses.replace(tiny_config(MODEL, epochs=1)))))

@@ -1,12 +1,15 @@
 """The ablation's runs: real commands on a few made-up frames, resumable and repeatable."""
 
 import dataclasses
+import subprocess
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, TextIO
 
 import pytest
 import yaml
 
+from asca_pillars.ablation import variants
 from asca_pillars.ablation.variants import VARIANTS, Variant, runs, train_runs
 from asca_pillars.commands import ablate_steps
 from asca_pillars.commands.ablate import ablate
@@ -15,6 +18,7 @@ from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import shipped_configs
+from tests.in_process import run_here
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -62,8 +66,17 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: py
         ablate(config, data=data, out=out, seeds="0", variants="baseline")
 
 
-@pytest.mark.usefixtures("commands_here")
-def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(tmp_path: Path, config: str) -> None:
+def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(
+    tmp_path: Path, config: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(command: list[str], *, stdout: TextIO, **_: object) -> subprocess.CompletedProcess[str]:
+        done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
+        stdout.write(done.stdout + done.stderr)
+        return done
+
+    # Training answers to Ctrl-C, which only a main thread can.
+    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
+    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
     data, names = write_dataset(tmp_path / "data", 14, val_frames=8), "asp_k3_pooled_cpa_channel_fine"
     any_zones = ["model.spec.grid.x_range_m=[4.8, 20.16]"]
     ablate(config, data=data, out=tmp_path / "out", override=any_zones, seeds="0", variants=names)
