@@ -1,5 +1,7 @@
 """The loops of `ball_query` and `cube_neighbors`, compiled; what they compute is said there, in NumPy."""
 
+from typing import Any, TypeAlias
+
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from asca_pillars.points.columns import Columns, cells_of
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int32]
 _Cells = NDArray[np.int64]
+_Three: TypeAlias = tuple[Any, Any, Any]
 
 _COLUMNS = given(types.int32), given(types.int32), types.int64, types.int64
 
@@ -54,13 +57,10 @@ def nearest_in_cubes(
     reach_m: np.float32,
 ) -> _Integers:
     """`cube_neighbors._nearest_in_cubes`, in columns (Q, 2) `first` to `last`: metres (N, 3), (Q, 3) -> (Q, T, 3)."""
-    nearest = np.full((len(centers), len(offsets), 3), len(xyz), np.int32)
-    squared = np.full((len(offsets), 3), np.inf, np.float32)
+    nearest = np.empty((len(centers), len(offsets), 3), np.int32)
+    at = centers, first, last
     room = np.empty(len(xyz), np.int32)
-    _nearest_in_cubes(
-        *(xyz, columns.order, columns.starts, columns.shape[1], centers, first, last, offsets, reach_m),
-        *(room, nearest, squared),
-    )
+    _nearest_in_cubes(xyz, columns.order, columns.starts, columns.shape[1], *at, offsets, reach_m, room, nearest)
     return nearest
 
 
@@ -124,16 +124,17 @@ def _ball_query(
 
 
 @inner
-def _keep(nearest: _Integers, squared: _Floats, i: int, distance: float) -> None:
-    """Put a point among the three nearest (3,), of equally near ones the earlier first."""
-    place = 3
-    while place and (distance < squared[place - 1] or (distance == squared[place - 1] and i < nearest[place - 1])):
-        if place < 3:
-            squared[place] = squared[place - 1]
-            nearest[place] = nearest[place - 1]
-        place -= 1
-    if place < 3:
-        squared[place], nearest[place] = distance, i
+def _kept(i: int, distance: float, nearest: _Three, squared: _Three) -> tuple[_Three, _Three]:
+    """The three nearest with one more point, of equally near ones the earlier first."""
+    i0, i1, i2 = nearest
+    d0, d1, d2 = squared
+    if distance > d2 or (distance == d2 and i > i2):
+        return nearest, squared
+    if distance > d1 or (distance == d1 and i > i1):
+        return (i0, i1, i), (d0, d1, distance)
+    if distance > d0 or (distance == d0 and i > i0):
+        return (i0, i, i1), (d0, distance, d1)
+    return (i, i0, i1), (distance, d0, d1)
 
 
 @compiled(
@@ -152,13 +153,15 @@ def _three_nearest(
     nearest: _Integers,
     squared: _Floats,
 ) -> None:
+    none, infinity = np.int64(len(xyz)), np.float32(np.inf)
     for query in range(len(centers)):
         x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
         row, column = min(max(cells[query, 0], 0), ny - 1), min(max(cells[query, 1], 0), nx - 1)
+        found, away = (none, none, none), (infinity, infinity, infinity)
         for ring in range(max(nx, ny)):
             # What lies outside `ring - 1` rings is that many columns away, but for rounding.
             clear = max(ring - np.float32(1.01), np.float32(0)) / per_m
-            if squared[query, 2] < clear * clear:
+            if away[2] < clear * clear:
                 break
             for other_row in range(max(row - ring, 0), min(row + ring, ny - 1) + 1):
                 step = 1 if abs(other_row - row) == ring else max(2 * ring, 1)
@@ -167,15 +170,17 @@ def _three_nearest(
                         continue
                     cell = other_row * nx + other_column
                     for k in range(starts[cell], starts[cell + 1]):
-                        i = order[k]
+                        i = np.int64(order[k])
                         dx, dy, dz = xyz[i, 0] - x, xyz[i, 1] - y, xyz[i, 2] - z
-                        _keep(nearest[query], squared[query], i, dx * dx + dy * dy + dz * dz)
+                        found, away = _kept(i, dx * dx + dy * dy + dz * dz, found, away)
+        for rank in range(3):
+            nearest[query, rank], squared[query, rank] = found[rank], away[rank]
 
 
 @compiled(
     *(given(types.float32, 2), given(types.int32), given(types.int32), types.int64, given(types.float32, 2)),
     *(given(types.int64, 2), given(types.int64, 2), given(types.float32, 2), types.float32),
-    *(written(types.int32), written(types.int32, 3), written(types.float32, 2)),
+    *(written(types.int32), written(types.int32, 3)),
 )
 def _nearest_in_cubes(
     xyz: _Floats,
@@ -189,8 +194,8 @@ def _nearest_in_cubes(
     reach_m: float,
     room: _Integers,
     nearest: _Integers,
-    squared: _Floats,
 ) -> None:
+    none, infinity = np.int64(len(xyz)), np.float32(np.inf)
     for query in range(len(centers)):
         x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
         count = 0
@@ -203,10 +208,12 @@ def _nearest_in_cubes(
                     if inside and abs(xyz[i, 2] - z) < reach_m:
                         room[count] = i
                         count += 1
-        squared[:] = np.inf
         for cell in range(len(offsets)):
             at_x, at_y, at_z = x + offsets[cell, 0], y + offsets[cell, 1], z + offsets[cell, 2]
+            found, away = (none, none, none), (infinity, infinity, infinity)
             for k in range(count):
-                i = room[k]
+                i = np.int64(room[k])
                 dx, dy, dz = xyz[i, 0] - at_x, xyz[i, 1] - at_y, xyz[i, 2] - at_z
-                _keep(nearest[query, cell], squared[cell], i, dx * dx + dy * dy + dz * dz)
+                found, away = _kept(i, dx * dx + dy * dy + dz * dz, found, away)
+            for rank in range(3):
+                nearest[query, cell, rank] = found[rank]

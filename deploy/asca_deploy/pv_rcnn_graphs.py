@@ -120,7 +120,7 @@ def refine_interface(bundle: PvRcnnBundle) -> Interface:
 
 
 def voxel_inputs(features: NDArray[np.float32], levels: Sequence[VoxelLevel[NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """What voxels.onnx takes of a scan with voxel features (N, 4)."""
+    """What voxels.onnx takes of a scan with voxel features (N, 4), metres and reflectance."""
     same = {f"same_{number}": level.same for number, level in enumerate(levels[:-1])}
     strided = {f"strided_{number}": level.strided for number, level in enumerate(levels) if number}
     return {"features": features, **same, **strided}
@@ -133,7 +133,7 @@ def keypoint_inputs(
     bev: NDArray[np.float32],
     balls_of: Sequence[Sequence[NDArray[np.int32]]],
 ) -> dict[str, NDArray[Any]]:
-    """What keypoints.onnx takes: features (N, C) of levels by name, the map (K, C) at the keypoints, and balls."""
+    """What keypoints.onnx takes: unitless features (N, C) of levels and (K, C) of the map at keypoints, and balls."""
     given: dict[str, NDArray[Any]] = {"points": scan.points, "keypoints": scan.keypoints, "bev": bev}
     for number, scale in enumerate(scan.scales):
         given |= {f"scale_{number}_{part}": array for part, array in scale._asdict().items()}
@@ -147,7 +147,7 @@ def keypoint_inputs(
 def deform_inputs(
     scan: VoxelScan, settings: VoxelSetSettings, levels: Mapping[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[Any]]:
-    """What deform.onnx takes: features (N, C) of levels by name, and what stands around the keypoints."""
+    """What deform.onnx takes: unitless features (N, C) of levels by name, and what stands around the keypoints."""
     given: dict[str, NDArray[Any]] = {"keypoints": scan.keypoints}
     for number, each in enumerate(settings.sources):
         if each in settings.deformed:

@@ -171,7 +171,7 @@ class PvRcnnPipeline:
         return detections
 
     def encode(self, scan: VoxelScan) -> dict[str, NDArray[np.float32]]:
-        """Features (N, C) of the voxels of every level that is read, by name, see OUT; at least one voxel."""
+        """Unitless features (N, C) of the voxels of every level that is read, by name, see OUT; at least one voxel."""
         names = list(self._voxels.outputs)
         return dict(zip(names, _run(self._voxels, names, voxel_inputs(scan.features, scan.levels)), strict=True))
 
@@ -195,7 +195,7 @@ class PvRcnnPipeline:
         places: Mapping[str, NDArray[np.float32]],
         balls: Sequence[Sequence[NDArray[np.int32]]],
     ) -> NDArray[np.float32]:
-        """Weighted features (K, C) of the keypoints.
+        """Weighted unitless features (K, C) of the keypoints.
 
         Args:
             scan: with the keypoints.

@@ -28,6 +28,7 @@ _EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
 
 def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -> None:
     """Write the graphs that `bundle` describes, see `asca_deploy.pv_rcnn_graphs`; every number of rows is dynamic."""
+    export_refine_head(network, bundle, graph_path(folder, REFINE))
     network = fold_norms(network)
     inputs, outputs = interfaces.voxels_interface(bundle)
     levels = [name for name in (*LEVEL_SOURCES, interfaces.OUT) if name in outputs]
@@ -43,11 +44,14 @@ def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -
     _export(keypoints, graph_path(folder, KEYPOINTS), inputs, rows, ["features"])
     if bundle.pv_rcnn.settings.deformed:
         export_deform(network, bundle, graph_path(folder, DEFORM))
-    inputs, _ = interfaces.refine_interface(bundle)
-    cells = network.refine.cells
+
+
+def export_refine_head(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
+    """Write refine.onnx alone: RoI-grid pooling and the second stage's heads, without normalization."""
+    head = fold_norms(network.refine)
+    inputs, outputs = interfaces.refine_interface(bundle)
     rows = {name: "keypoints" if name in ("keypoints", "features") else "proposals" for name in inputs}
-    path = graph_path(folder, REFINE)
-    _export(_Refine(network.refine), path, inputs, rows, ["confidence", "residuals"], {"proposals": cells})
+    _export(_Refine(head), path, inputs, rows, list(outputs), {"proposals": head.cells})
 
 
 def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:

@@ -1,15 +1,11 @@
 """The rows of the two-stage ablation: each is a network that can be built, and one goes through to the table."""
 
 import dataclasses
-import subprocess
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TextIO
 
 import pytest
 import yaml
 
-from asca_pillars.ablation import variants
 from asca_pillars.ablation.two_stage_variants import BASE, TWO_STAGE
 from asca_pillars.commands.ablate import ablate
 from asca_pillars.commands.ablate_steps import family_of, parse_variants
@@ -18,7 +14,6 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.models.build import build_model
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.schema import to_dict
-from tests.in_process import run_here
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, tiny_config
 from tests.scenes import write_dataset
 
@@ -66,15 +61,8 @@ def test_names_are_those_of_the_base_s_family() -> None:
         family_of(load_config("asca_refine_sim"))
 
 
-def test_from_training_to_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(command: list[str], *, stdout: TextIO, **_: object) -> subprocess.CompletedProcess[str]:
-        done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
-        stdout.write(done.stdout + done.stderr)
-        return done
-
-    # Training answers to Ctrl-C, which only a main thread can.
-    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
-    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+@pytest.mark.usefixtures("in_turn")
+def test_from_training_to_the_table(tmp_path: Path) -> None:
     data, base = write_dataset(tmp_path / "data", 10, val_frames=8), tmp_path / "tiny.yaml"
     base.write_text(yaml.safe_dump(to_dict(dataclasses.replace(tiny_config(MODEL, epochs=1)))))
     ablate(str(base), data=data, out=tmp_path / "out", seeds="0", variants="deform_gate_vector_pool")

@@ -20,20 +20,21 @@ from asca_deploy.pv_rcnn_graphs import balls_around, deform_inputs, keeps_memory
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.voxel_canvas import VoxelCanvas
 from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
-from asca_export.pv_rcnn_forms import export_deform
+from asca_export.pv_rcnn_forms import export_deform, export_refine_head
 from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
 from asca_pillars.config import load_config
 from asca_pillars.errors import BundleError, ExportError
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
 from asca_pillars.models.pv_rcnn.voxel_batch import batch_scans
+from asca_pillars.points.refine_geometry import grid_neighbors
 from asca_pillars.points.voxel_scan import SourceBalls, voxel_scan
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, MODEL, NETWORK, SETTINGS, SPEC, tiny_config, tiny_detector
-from tests.scenes import write_dataset
+from tests.scenes import make_scene, write_dataset
 
 Trained = tuple[Checkpoint, Path]
 
@@ -166,6 +167,27 @@ def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) ->
             weight.copy_(kept)
     with pytest.raises(ExportError, match="none of the scans"):
         prove_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), [np.empty((0, 4), np.float32)])
+
+
+def test_pooling_of_balls(trained: Trained, tmp_path: Path) -> None:
+    bundle = load_any_bundle(trained[1])
+    assert isinstance(bundle, PvRcnnBundle) and bundle.pv_rcnn.settings.vector_cells
+    bundle = dataclasses.replace(bundle, pv_rcnn=dataclasses.replace(bundle.pv_rcnn, settings=SETTINGS))
+    network = tiny_detector().eval().network
+    export_refine_head(network, bundle, tmp_path / "refine.onnx")
+    rng, boxes = np.random.default_rng(0), make_scene(0)[1]
+    keypoints = np.concatenate([boxes[:, :3] + rng.normal(0, 1, (4, 3)) for _ in range(20)]).astype(np.float32)
+    features = rng.normal(size=(80, NETWORK.keypoint_channels)).astype(np.float32)
+    grid = grid_neighbors(keypoints, boxes, SETTINGS)
+    with torch.inference_mode():
+        indices = [torch.from_numpy(index) for index in grid.indices]
+        given = (torch.from_numpy(part) for part in (keypoints, features, grid.points))
+        wanted = network.refine(*given, indices)
+    session = onnxruntime.InferenceSession(tmp_path / "refine.onnx", providers=["CPUExecutionProvider"])
+    arrays: dict[str, np.ndarray] = {f"grid_{number}": index for number, index in enumerate(grid.indices)}
+    arrays |= {"keypoints": keypoints, "features": features, "grid_points": grid.points}
+    for one, other in zip(session.run(["confidence", "residuals"], arrays), wanted, strict=True):
+        np.testing.assert_allclose(one, other.numpy(), atol=1e-4)
 
 
 def test_a_place_for_each_radius(trained: Trained, tmp_path: Path) -> None:

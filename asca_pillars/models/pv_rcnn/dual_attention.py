@@ -31,7 +31,7 @@ class DualAttention(nn.Module):
         return features + _RESIDUAL_WEIGHT * attended if self.residual else attended
 
     def by_channel(self, features: Tensor) -> Tensor:
-        """Eq. (1) and (2): a weight in (0, 1) for each channel of (B, C, H, W)."""
+        """Eq. (1) and (2): a weight in (0, 1) for each channel of unitless (B, C, H, W)."""
         values = self.channel_value(features).flatten(2)  # (B, C / 2, HW)
         shares = torch.softmax(self.channel_query(features).flatten(2), dim=2)  # (B, 1, HW)
         pooled = (values @ shares.transpose(1, 2))[:, :, 0]
@@ -39,7 +39,7 @@ class DualAttention(nn.Module):
         return features * weights[:, :, None, None]
 
     def by_place(self, features: Tensor) -> Tensor:
-        """Eq. (3) and (4): a weight in (0, 1) for each place of (B, C, H, W)."""
+        """Eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
         values = self.place_value(features)  # (B, C / 2, H, W)
         shares = torch.softmax(self.place_query(features).mean(dim=(2, 3)), dim=1)  # (B, C / 2)
         return features * torch.sigmoid((values * shares[:, :, None, None]).sum(dim=1, keepdim=True))

@@ -109,7 +109,7 @@ class PvRcnn(nn.Module):
         self.scales = scales
 
     def propose(self, batch: VoxelBatch[Tensor]) -> FirstStageOutputs:
-        """Voxels -> features of every level and head maps."""
+        """Voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
         levels = self.voxels(batch.features, batch.levels)
         canvas = self.scatter(levels[-1], batch.levels[-1].cells, len(batch.frame_keypoints))
         maps: HeadMaps[Tensor] = self.head(self.neck(canvas.permute(0, 3, 1, 2)))

@@ -22,7 +22,7 @@ class TableLayer(nn.Module):
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
 
     def forward(self, features: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
-        """(N, in_channels) -> (M, channels), see `table_conv`."""
+        """Unitless (N, in_channels) -> (M, channels), see `table_conv`."""
         return torch.relu(self.norm(table_conv(features, self.convolution.weight, table, back)))
 
 

@@ -1,0 +1,27 @@
+"""The ablation's commands in this process."""
+
+import subprocess
+from types import SimpleNamespace
+from typing import Any, TextIO
+
+import pytest
+
+from asca_pillars.ablation import variants
+from tests.in_process import run_here
+
+
+@pytest.fixture
+def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs one after the other, in this process, which has imported torch already; those of `baseline` in their own."""
+    start = subprocess.run
+
+    def run(command: list[str], *, stdout: TextIO, **options: Any) -> subprocess.CompletedProcess[Any]:
+        if any("baseline" in part.split("/") for part in command):
+            return start(command, stdout=stdout, **options)
+        done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
+        stdout.write(done.stdout + done.stderr)
+        return done
+
+    # Training answers to Ctrl-C, which only a main thread can.
+    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
+    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
