@@ -42,7 +42,7 @@ ROUNDS = 5
 
 def main(
     frames: Annotated[int, typer.Option(help="Frames that are timed, per view and number of processes.")] = 60,
-    workers: Annotated[str, typer.Option(help="Numbers of processes, separated by commas; empty: stages alone.")] = "1,2",
+    workers: Annotated[str, typer.Option(help="Numbers of processes, by commas; empty: stages alone.")] = "1,2",
     seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
 ) -> None:
     """Print frames per second and milliseconds per stage."""

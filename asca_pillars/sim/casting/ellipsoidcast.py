@@ -7,17 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
-from asca_pillars.sim.casting.windows import (
-    NO_WINDOW,
-    PLAIN,
-    WHOLE_TURN,
-    Window,
-    columns_of,
-    keep,
-    ray_chance,
-    rings_of,
-    window_of,
-)
+from asca_pillars.sim.casting.windows import PLAIN, TURN, Window, columns_of, keep, ray_chance, rings_of, window_of
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -74,13 +64,13 @@ def ellipsoid_window(center: Floats, m: Floats, distance: float, limits: RayLimi
     if limits.wedge_slope > 0.0:
         reach = extent.flat * np.sqrt(1.0 + limits.wedge_slope**2)
         if abs(cy) - limits.wedge_slope * cx > reach:
-            return NO_WINDOW
+            return Window(0, 0, 0.0, 0.0)
     near, far = max(distance - extent.flat, 0.0), distance + extent.flat
     first, last = rings_of(cz - extent.up, cz + extent.up, near, far, limits)
     if first >= last:
-        return NO_WINDOW
+        return Window(0, 0, 0.0, 0.0)
     if distance <= extent.flat + _NEAR_AXIS_M:
-        return window_of(first, last, -np.pi, WHOLE_TURN, limits)
+        return window_of(first, last, -np.pi, TURN, limits)
     # Half the width seen from the axis: the extent across the line of sight, nearer than the center at most by the
     # extent along it.
     half_angle = np.arctan(extent.across / (distance - extent.flat))

@@ -7,17 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
-from asca_pillars.sim.casting.windows import (
-    NO_WINDOW,
-    PLAIN,
-    WHOLE_TURN,
-    Window,
-    columns_of,
-    keep,
-    ray_chance,
-    rings_of,
-    window_of,
-)
+from asca_pillars.sim.casting.windows import PLAIN, TURN, Window, columns_of, keep, ray_chance, rings_of, window_of
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -75,7 +65,7 @@ def triangle_window(corner: Floats, limits: RayLimits) -> Window:
         left = ay > wedge * ax and by > wedge * bx and cy > wedge * cx
         right = ay < -wedge * ax and by < -wedge * bx and cy < -wedge * cx
         if left or right:
-            return NO_WINDOW
+            return Window(0, 0, 0.0, 0.0)
     ab, bc, ca = ax * by - ay * bx, bx * cy - by * cx, cx * ay - cy * ax
     encloses_axis = (ab > 0 and bc > 0 and ca > 0) or (ab < 0 and bc < 0 and ca < 0)
     nearest = min(nearest_on_edge(ax, ay, bx, by), nearest_on_edge(bx, by, cx, cy), nearest_on_edge(cx, cy, ax, ay))
@@ -84,9 +74,9 @@ def triangle_window(corner: Floats, limits: RayLimits) -> Window:
     z_low, z_high = min(corner[0, 2], corner[1, 2], corner[2, 2]), max(corner[0, 2], corner[1, 2], corner[2, 2])
     first, last = rings_of(z_low, z_high, near, far, limits)
     if first >= last:  # most of them: there is no need to ask for azimuths
-        return NO_WINDOW
+        return Window(0, 0, 0.0, 0.0)
     if encloses_axis:
-        return window_of(first, last, -np.pi, WHOLE_TURN, limits)
+        return window_of(first, last, -np.pi, TURN, limits)
     azimuth = np.arctan2(ay, ax)
     to_b = wrap(np.arctan2(by, bx) - azimuth)
     to_c = wrap(np.arctan2(cy, cx) - azimuth)

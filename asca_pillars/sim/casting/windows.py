@@ -15,7 +15,7 @@ from asca_pillars.sim.casting.rays import NearestHits, RayLimits
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 PLAIN = {"cache": True, "error_model": "numpy"}  # NumPy's division, which does not look out for zeros
-WHOLE_TURN = 2 * np.pi - 1e-9
+TURN = 2 * np.pi - 1e-9
 
 
 class Window(NamedTuple):
@@ -28,9 +28,6 @@ class Window(NamedTuple):
     last_ring: int
     low_counts: float
     width_counts: float
-
-
-NO_WINDOW = Window(0, 0, 0.0, 0.0)
 
 
 @numba.njit(inline="always", **PLAIN)
