@@ -13,7 +13,7 @@ def test_a_bundle_is_found_by_folder_and_by_shipped_name(tiny_bundle: Path) -> N
     assert find_bundle("asca_small_sim") == shipped_bundles()["asca_small_sim"]
     assert find_bundle(None) == default_bundle_path()
     with pytest.raises(
-        BundleError, match=r"asca_smal: no such folder, and no bundle .* asca_small_sim, asca_small_sim_int8"
+        BundleError, match=r"asca_smal: no such folder, and no bundle .* asca_refine_sim, .*asca_small_sparse_sim_int8"
     ):
         find_bundle("asca_smal")
 
@@ -21,6 +21,8 @@ def test_a_bundle_is_found_by_folder_and_by_shipped_name(tiny_bundle: Path) -> N
 def test_shipped_files_lie_in_the_package() -> None:
     assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_small_sparse_sim_int8")
     assert [(name, load_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
+        ("asca_refine_sim", "asca_refine_sim"),
+        ("asca_refine_sim_int8", "asca_refine_sim_int8"),
         ("asca_small_sim", "asca_small_sim"),
         ("asca_small_sim_int8", "asca_small_sim_int8"),
         ("asca_small_sparse_sim", "asca_small_sparse_sim"),
