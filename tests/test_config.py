@@ -64,7 +64,9 @@ def test_configs_that_ship_load_and_build(path: Path) -> None:
         return
     assert isinstance(detector, PillarDetector) and detector.grid == config.model.spec.grid
     scores = detector.head.scores.weight
-    assert scores.shape == (2 * len(config.model.spec.classes), 3 * config.model.network.upsample_channels, 1, 1)
+    spec = config.model.spec
+    per_cell = 2 * len(spec.classes) * spec.scores_per_anchor
+    assert scores.shape == (per_cell, 3 * config.model.network.upsample_channels, 1, 1)
 
 
 def test_there_are_configs() -> None:

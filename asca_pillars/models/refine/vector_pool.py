@@ -52,20 +52,24 @@ class VectorPool(nn.Module):
             queries: (Q, 3).
             indices: (Q, T, 3) points nearest to each cell, see `nearest_in_cubes`; N stands for nothing: zeros.
         """
-        count = len(self.centers)
-        found = (indices < positions.shape[0]).to(positions.dtype)  # (Q, T, 3)
-        near = F.pad(positions, (0, 0, 0, 1)).index_select(0, indices.reshape(-1)).unflatten(0, indices.shape)
-        places = queries[:, None] + self.centers
-        away = (near - places[:, :, None]) * found[..., None]  # (Q, T, 3, 3): a_i - v_t
-        # Not `+`: onnxscript takes so small an addition for none.
-        shares = found / away.square().sum(dim=3).sqrt().clamp(min=_LEAST_DISTANCE_M)
-        shares = shares / shares.sum(dim=2, keepdim=True).clamp(min=_LEAST_DISTANCE_M)
-        # h_i W_t of every point and cell, and zeros for N
-        of_points = F.pad(self.features(features), (0, 0, 0, 1)).unflatten(1, (count, -1)).flatten(0, 1)
-        rows = indices * count + torch.arange(count, dtype=indices.dtype, device=indices.device)[:, None]
-        cells = torch.bmm(away.flatten(2).transpose(0, 1), self.places).transpose(0, 1)  # (Q, T, cell_channels)
-        for rank in range(_NEAREST):
-            chosen = of_points.index_select(0, rows[:, :, rank].reshape(-1)).unflatten(0, rows.shape[:2])
-            cells = cells + chosen * shares[:, :, rank, None]
-        pooled: Tensor = self.mlp(torch.relu(self.norm(cells.flatten(1))))
+        # h_i W_t of every point, cell by cell, and zeros for N
+        of_points = F.pad(self.features(features), (0, 0, 0, 1)).unflatten(1, (len(self.centers), -1)).transpose(0, 1)
+        padded = F.pad(positions, (0, 0, 0, 1))
+        cells = [
+            self._cell(self.places[cell], of_points[cell], padded, queries + self.centers[cell], indices[:, cell])
+            for cell in range(len(self.centers))  # all at once they take more time and memory
+        ]
+        pooled: Tensor = self.mlp(torch.relu(self.norm(torch.cat(cells, dim=1))))
         return pooled
+
+    @staticmethod
+    def _cell(place: Tensor, of_points: Tensor, padded: Tensor, centers: Tensor, index: Tensor) -> Tensor:
+        """[a_i - v_t ; h_t] W_t of one cell, (Q, cell_channels)."""
+        found = (index < padded.shape[0] - 1).to(padded.dtype)  # (Q, 3)
+        near = padded.index_select(0, index.reshape(-1)).unflatten(0, index.shape)
+        away = (near - centers[:, None]) * found[..., None]  # a_i - v_t
+        # Not `+`: onnxscript takes so small an addition for none.
+        shares = found / away.square().sum(dim=2).sqrt().clamp(min=_LEAST_DISTANCE_M)
+        shares = shares / shares.sum(dim=1, keepdim=True).clamp(min=_LEAST_DISTANCE_M)
+        rows = of_points.index_select(0, index.reshape(-1)).unflatten(0, index.shape)  # (Q, 3, cell_channels)
+        return away.flatten(1) @ place + (rows * shares[..., None]).sum(dim=1)
