@@ -5,6 +5,7 @@ import copy
 import functools
 import gc
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -15,6 +16,9 @@ from hypothesis import settings
 # How long an example takes depends on what else the machine does, and says nothing about whether it is right.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+# Before torch is imported: pytest has a process for each core, and networks as small as here are slower on several.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # What is imported stays to the end. Looking through it for garbage again and again took an eighth of the suite's time.
 gc.disable()
