@@ -9,16 +9,18 @@ import pytest
 from asca_export.exporter import export_bundle
 from asca_pillars.pillar_config import CpaReading
 from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.made_once import made_once
 
 
 @pytest.fixture(scope="session")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[CpaReading], Path]:
     """The bundle of `tiny_checkpoint(reading)` in floating point, which no test changes."""
-    folder = tmp_path_factory.mktemp("exported")
 
     @cache
     def export(cpa: CpaReading) -> Path:
-        export_bundle(tiny_checkpoint(cpa), folder / cpa, SCANS, trained_on="nothing", command="none")
-        return folder / cpa
+        def make(folder: Path) -> None:
+            export_bundle(tiny_checkpoint(cpa), folder / cpa, SCANS, trained_on="nothing", command="none")
+
+        return made_once(tmp_path_factory, f"exported_{cpa}", make) / cpa
 
     return export

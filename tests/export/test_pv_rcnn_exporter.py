@@ -33,6 +33,7 @@ from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.made_once import made_once
 from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, MODEL, NETWORK, SETTINGS, SPEC, tiny_config, tiny_detector
 from tests.scenes import make_scene, write_dataset
 
@@ -42,11 +43,14 @@ Trained = tuple[Checkpoint, Path]
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A trained checkpoint with every module that the papers add, and the bundle exported from it."""
-    folder = tmp_path_factory.mktemp("pv_rcnn")
-    config = tiny_config(dataclasses.replace(MODEL, **EVERYTHING), epochs=1)
-    checkpoint = load_checkpoint(train(config, write_dataset(folder / "data", 5), folder / "run"))
-    export_pv_rcnn_bundle(checkpoint, folder / "bundle", SCANS)
-    return checkpoint, folder / "bundle"
+
+    def make(folder: Path) -> None:
+        config = tiny_config(dataclasses.replace(MODEL, **EVERYTHING), epochs=1)
+        last = train(config, write_dataset(folder / "data", 5), folder / "run")
+        export_pv_rcnn_bundle(load_checkpoint(last), folder / "bundle", SCANS)
+
+    folder = made_once(tmp_path_factory, "pv_rcnn", make)
+    return load_checkpoint(folder / "run" / "checkpoints" / "last.ckpt"), folder / "bundle"
 
 
 def test_train_export_detect(trained: Trained, tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
+from tests.made_once import made_once
 from tests.models.refine.test_pillar_refiner import batch, small_refiner
 from tests.models.second_stage.tiny_refine import opened_config, save_checkpoint, tiny_refine_config, write_first_stage
 from tests.scenes import SPEC, write_dataset
@@ -37,18 +38,21 @@ from tests.scenes import SPEC, write_dataset
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A checkpoint of the second stage, and the bundle exported from it; beside it that of the first stage alone."""
-    folder = tmp_path_factory.mktemp("refine")
-    config = tiny_refine_config(write_first_stage(folder / "first.ckpt"), learning_rate=1e-2)
-    last = train(config, write_dataset(folder / "data", 5), folder / "run")
 
-    def export_and_keep(checkpoint: Checkpoint, out: Path, *rest: Any, **options: Any) -> None:
-        export_bundle(checkpoint, out, *rest, **options)
-        shutil.copytree(out, folder / "first_stage")
+    def make(folder: Path) -> None:
+        config = tiny_refine_config(write_first_stage(folder / "first.ckpt"), learning_rate=1e-2)
+        last = train(config, write_dataset(folder / "data", 5), folder / "run")
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refine_exporter, "export_bundle", export_and_keep)
-        export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
-    return last, folder / "bundle"
+        def export_and_keep(checkpoint: Checkpoint, out: Path, *rest: Any, **options: Any) -> None:
+            export_bundle(checkpoint, out, *rest, **options)
+            shutil.copytree(out, folder / "first_stage")
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(refine_exporter, "export_bundle", export_and_keep)
+            export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
+
+    folder = made_once(tmp_path_factory, "refine", make)
+    return folder / "run" / "checkpoints" / "last.ckpt", folder / "bundle"
 
 
 def test_golden_vectors_of_both_stages(trained: tuple[Path, Path]) -> None:
