@@ -114,7 +114,10 @@ def _read_neck(found: FirstPass, keypoints: NDArray[np.float32], spec: DetectorS
     cells, weights = bilinear_cells(keypoints, x_m, y_m)
     rows = found.neck.reshape(-1, found.neck.shape[-1])
     if found.cells is not None:
-        row_of_cell = np.full(len(x_m) * len(y_m), len(rows), np.int32)
+        if not len(rows):
+            return np.zeros((len(keypoints), rows.shape[1]), np.float32)
+        row_of_cell = np.full(len(x_m) * len(y_m), -1, np.int32)
         row_of_cell[found.cells] = np.arange(len(rows))
-        rows, cells = np.concatenate([rows, np.zeros_like(rows, shape=(1, rows.shape[1]))]), row_of_cell[cells]
+        cells = row_of_cell[cells]
+        weights, cells = np.where(cells < 0, np.float32(0), weights), np.maximum(cells, 0)
     return read_map(rows, cells, weights)
