@@ -73,8 +73,8 @@ class Detector:
     network's threads, so several callers get more scans per second only where one leaves cores idle.
 
     Args:
-        bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the 8-bit one
-            that ships.
+        bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the
+            default, see `default_bundle_path`.
         provider: of the slowest network: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one available
             that finds in the sample scan what "cpu" finds. `self.provider` and `self.precision` say what was taken,
             `self.candidates` how each one did. The other graphs always run on onnxruntime's CPU provider.

@@ -182,7 +182,7 @@ class CanvasBackbone:
 
     Every scan between `place` and `run` has a canvas of its own, taken from those that are free. There are as many
     as there ever were such scans at once: one in single calls, two in a stream, one per thread with several threads;
-    each takes (nx + 1)(ny + 1) C values, 5 MiB in the 8-bit bundle that ships and 20 MiB in the float one.
+    each takes (nx + 1)(ny + 1) C values, 5 MiB in asca_small_sim_int8 and 20 MiB in its float form.
 
     Args:
         path: of the graph, for messages.

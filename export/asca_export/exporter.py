@@ -74,8 +74,7 @@ def export_bundle(
         ExportError: too few scans, to prove parity or to calibrate on, or PyTorch and onnxruntime differ; names the
             first stage that does.
     """
-    if len(scans) < MIN_SCANS:
-        raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
+    require_parity_scans(scans)
     config, detector = checkpoint.config, checkpoint.detector
     if not (isinstance(config.model, PillarModel) and isinstance(detector, PillarDetector)):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
@@ -98,6 +97,16 @@ def export_bundle(
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, progress)
     return bundle
+
+
+def require_parity_scans(scans: Sequence[NDArray[np.float32]]) -> None:
+    """Refuse to prove parity on fewer than MIN_SCANS scans (N, 4), metres, LiDAR frame.
+
+    Raises:
+        ExportError: there are fewer.
+    """
+    if len(scans) < MIN_SCANS:
+        raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
 
 
 def draft_bundle(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import BACKBONE, MANIFEST, Parity, PvRcnnBundle, PvRcnnSection
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_export import graphs
-from asca_export.exporter import LICENSE, MIN_SCANS, provenance, write_proven
+from asca_export.exporter import LICENSE, provenance, require_parity_scans, write_proven
 from asca_export.pv_rcnn_forms import export_pv_rcnn_graphs
 from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
 from asca_pillars.data.measure_input import measure_expected_input
@@ -38,8 +38,7 @@ def export_pv_rcnn_bundle(
     Raises:
         ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
     """
-    if len(scans) < MIN_SCANS:
-        raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
+    require_parity_scans(scans)
     config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
     model = config.model
     if not (isinstance(model, PvRcnnModel) and isinstance(detector, PvRcnnDetector)):

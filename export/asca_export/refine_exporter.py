@@ -17,7 +17,7 @@ from asca_deploy.refine_pipeline import RefinePipeline
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
 from asca_export.bundle_first_stage import BundleFirstStage
-from asca_export.exporter import MIN_SCANS, draft_bundle, export_bundle, write_proven
+from asca_export.exporter import draft_bundle, export_bundle, require_parity_scans, write_proven
 from asca_export.int8 import MAX_LOGIT_ERROR, count_boxes, logit_error
 from asca_export.neck_output import add_neck_output
 from asca_export.refine_graph import export_refine
@@ -54,8 +54,7 @@ def export_refine_bundle(
             form is not that of this first stage.
         AscaError: the first stage is not there any more, or another one, or has no 8-bit form.
     """
-    if len(scans) < MIN_SCANS:
-        raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
+    require_parity_scans(scans)
     config, detector = checkpoint.config, checkpoint.detector
     if not isinstance(detector, RefineDetector):
         raise ExportError(f"model.kind {config.model.kind}: not a second stage")
@@ -86,7 +85,7 @@ def export_refine_bundle(
         if calibration is None:
             return bundle
         progress("Putting the first stage in 8 bits")
-        eight_bit = _eight_bit_first(model.first_stage, Path(temporary) / "int8", scans, calibration, progress)
+        eight_bit = _first_bundle(model.first_stage, Path(temporary) / "int8", scans, progress, calibration)
         return _in_eight_bits(folder, bundle, first, eight_bit, scans, calibration)
 
 
@@ -110,9 +109,8 @@ def _in_eight_bits(
         raise ExportError(f"{eight_bit}: not the 8-bit form of the first stage; export it again")
     threads = default_threads()
     stages = BundleFirstStage(first, threads=threads), BundleFirstStage(eight_bit, threads=threads, precision="int8")
-    wanted, found = ([stage(scan) for scan in scans] for stage in stages)
-    scores = ([each.maps.scores for each in answers] for answers in (wanted, found))
-    error = logit_error(next(scores), iter(next(scores)), proposing.spec)
+    wanted, found = ([stage(scan).maps.scores for scan in scans] for stage in stages)
+    error = logit_error(wanted, iter(found), proposing.spec)
     if error > MAX_LOGIT_ERROR:
         raise ExportError(
             f"{eight_bit}: its class logits are {error:.3g} from the first stage's, more than {MAX_LOGIT_ERROR}; it is "
@@ -151,25 +149,15 @@ def _detect(folder: Path, scans: Sequence[NDArray[np.float32]]) -> list[Detectio
     return [runtime(scan) for scan in scans]
 
 
-def _eight_bit_first(
+def _first_bundle(
     source: str,
     temporary: Path,
     scans: Sequence[NDArray[np.float32]],
-    calibration: Sequence[NDArray[np.float32]],
     progress: Callable[[str], None],
+    calibration: Sequence[NDArray[np.float32]] | None = None,
 ) -> Path:
-    """Folder of the first stage in 8 bits; a checkpoint is exported to `temporary`."""
+    """Folder of the first stage, with `calibration` in 8 bits; a checkpoint is exported to `temporary`."""
     if Path(source).suffix != CHECKPOINT_SUFFIX:
-        return find_bundle(f"{source}_int8")
+        return find_bundle(source if calibration is None else f"{source}_int8")
     export_bundle(load_checkpoint(source), temporary, scans, calibration=calibration, progress=progress)
-    return temporary
-
-
-def _first_bundle(
-    source: str, temporary: Path, scans: Sequence[NDArray[np.float32]], progress: Callable[[str], None]
-) -> Path:
-    """Folder of the first stage as a float32 bundle; a checkpoint is exported to `temporary`."""
-    if Path(source).suffix != CHECKPOINT_SUFFIX:
-        return find_bundle(source)
-    export_bundle(load_checkpoint(source), temporary, scans, progress=progress)
     return temporary
