@@ -4,12 +4,14 @@ Features are rows, one for each active cell; a table's entry beyond the last row
 inside a matrix product or runs in a fixed order, so results do not differ from run to run.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+from asca_pillars.models.row_product import pad_rows, rounded_rows
 
 CHUNK_VALUES = 1 << 20  # gathered at a time: on a CPU they stay in its cache; all at once would be memory-bound
 
@@ -37,7 +39,7 @@ class _TableConv(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, table: Tensor, back: Tensor) -> Tensor:
         ctx.save_for_backward(features, weight, table, back)
-        return _gathered_product(features, table, _by_tap(weight).flatten(0, 1))
+        return _gathered_product(features, table, _by_output(weight).T)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, Tensor | None, None, None]:
@@ -45,42 +47,45 @@ class _TableConv(torch.autograd.Function):
         gradient = gradients[0].to(features.dtype)
         of_features = of_weight = None
         if ctx.needs_input_grad[0]:
-            of_features = _gathered_product(gradient, back, _by_tap(weight).transpose(1, 2).flatten(0, 1))
+            by_tap = _by_output(weight).unflatten(1, (table.shape[1], -1)).transpose(0, 1)  # (K, outputs, C)
+            of_features = _gathered_product(gradient, back, by_tap.flatten(0, 1))
         if ctx.needs_input_grad[1]:
             of_weight = _weight_gradient(features, table, gradient).to(weight.dtype)
-            of_weight = of_weight.unflatten(0, (table.shape[1], -1)).permute(2, 1, 0).reshape(weight.shape)
+            kernel = weight.shape[2:]
+            of_weight = of_weight.unflatten(1, (*kernel, -1)).movedim(-1, 1)
         return of_features, of_weight, None, None
 
 
-def _by_tap(weight: Tensor) -> Tensor:
-    """(outputs, C, *kernel) -> (K, C, outputs)."""
-    return weight.flatten(2).permute(2, 1, 0)
+def _by_output(weight: Tensor) -> Tensor:
+    """(outputs, C, *kernel) -> (outputs, K * C), without a copy if channels are last in memory."""
+    return weight.movedim(1, -1).flatten(1)
 
 
 def _gathered_product(features: Tensor, table: Tensor, matrix: Tensor) -> Tensor:
     """Rows gathered by the table (M, K), side by side, times the matrix (K * C, outputs)."""
     if len(table) == 0:
         return features.new_zeros(0, matrix.shape[1])
-    return torch.cat([gathered @ matrix for gathered in _chunks(features, table)])
+    return torch.cat([(gathered @ matrix)[:rows] for rows, gathered in _chunks(features, table)])
 
 
 def _weight_gradient(features: Tensor, table: Tensor, gradient: Tensor) -> Tensor:
-    """(K * C, outputs), summed over chunks in float32 at least."""
+    """(outputs, K * C), summed over chunks in float32 at least."""
     total = torch.promote_types(features.dtype, torch.float32)
-    matrix = torch.zeros(table.shape[1] * features.shape[1], gradient.shape[1], dtype=total, device=features.device)
+    matrix = torch.zeros(gradient.shape[1], table.shape[1] * features.shape[1], dtype=total, device=features.device)
     first = 0
-    for gathered in _chunks(features, table):
-        matrix += gathered.T @ gradient[first : first + len(gathered)]
-        first += len(gathered)
+    for rows, gathered in _chunks(features, table):
+        matrix += pad_rows(gradient[first : first + rows]).T @ gathered
+        first += rows
     return matrix
 
 
-def _chunks(features: Tensor, table: Tensor) -> Any:
-    """Gathered rows (m, K * C), chunk by chunk."""
+def _chunks(features: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
+    """Chunk by chunk, how many rows it is of, and these gathered (m, K * C), followed by zeros, see `row_product`."""
     padded = F.pad(features, (0, 0, 0, 1))
-    rows = max(CHUNK_VALUES // (table.shape[1] * features.shape[1]), 1)
-    for part in table.split(rows):
-        yield padded.index_select(0, part.flatten()).view(len(part), table.shape[1] * features.shape[1])
+    values = table.shape[1] * features.shape[1]
+    for part in table.split(rounded_rows(max(CHUNK_VALUES // values, 1))):
+        entries = pad_rows(part, len(features))
+        yield len(part), padded.index_select(0, entries.flatten()).view(len(entries), values)
 
 
 def at_active_cells(norm: Callable[[Tensor], Tensor], features: Tensor) -> Tensor:

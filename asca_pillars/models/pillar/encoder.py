@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from asca_pillars.models.map_layers import NORM_EPS, NORM_MOMENTUM
 from asca_pillars.models.pillar.attention import ChannelAttention, PaperAttention, PointAttention
+from asca_pillars.models.row_product import linear_rows
 from asca_pillars.pillar_config import CpaReading
 from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
 
@@ -75,7 +76,7 @@ class PillarEncoder(nn.Module):
             point_counts: (P,) points of each pillar.
             frame_pillars: pillars of each frame of a batch, summing to P; None is one frame.
         """
-        points = self.linear(features)  # (M, C)
+        points = linear_rows(features, self.linear.weight)  # (M, C)
         if self.slots:
             points = torch.cat([points, self.empty_slot[None]])
         points = torch.relu(self.norm(points))

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
+from asca_pillars.models.row_product import linear_rows
 from asca_pillars.models.table_conv import at_active_cells, table_conv
 from asca_pillars.pillars.grid import HEAD_STRIDE, NECK_STRIDE
 from asca_pillars.tables.neck_tables import MaskRule, NeckTables
@@ -66,6 +67,8 @@ class SparseRPNNeck(RPNLayers):
     def __init__(self, *widths: Any, rule: MaskRule) -> None:
         super().__init__(*widths)
         self.rule: MaskRule = rule
+        # A tap's channels lie side by side in memory, as gathered rows do: products read the weights without a copy.
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, pillars: Tensor, tables: NeckTables[Tensor]) -> Tensor:
         """Unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
@@ -105,7 +108,7 @@ def _upsampled(deblock: nn.Module, features: Tensor, places: Tensor) -> Tensor:
     """A deblock at active parents (N, C), read at head cells: (M, upsample_channels)."""
     transposed, norm, _ = deblock.children()
     assert isinstance(transposed, nn.ConvTranspose2d)
-    by_place = transposed.weight.permute(2, 3, 0, 1).flatten(0, 1)  # (stride^2, C, channels)
-    outputs = (features @ by_place.transpose(0, 1).flatten(1)).view(-1, by_place.shape[2])
+    by_place = transposed.weight.movedim(1, -1).flatten(1).T  # (stride^2 * channels, C)
+    outputs = linear_rows(features, by_place).view(-1, transposed.out_channels)
     outputs = torch.relu(at_active_cells(norm, outputs))  # (N * stride^2, channels), one parent after the other
     return F.pad(outputs, (0, 0, 0, 1)).index_select(0, places)

@@ -170,9 +170,10 @@ def test_learns_one_frame_by_heart(variant: str) -> None:
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
             module.momentum = 0.1  # so that a hundred steps are enough for its statistics
     inputs = batch(detector, wanted)
-    optimizer = torch.optim.Adam(detector.parameters(), lr=4e-3)
+    optimizer = torch.optim.Adam(detector.parameters())
     for step in range(80):
         torch.manual_seed(step)
+        optimizer.param_groups[0]["lr"] = 6e-3 * (1 - step / 80)
         loss = torch.stack(list(detector.loss(detector.predict(inputs), inputs).values())).sum()
         optimizer.zero_grad()
         loss.backward()
