@@ -1,6 +1,7 @@
 """The ablation's commands in this process."""
 
 import subprocess
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TextIO
 
@@ -12,11 +13,11 @@ from tests.in_process import run_here
 
 @pytest.fixture
 def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs one after the other, in this process, which has imported torch already; those of `baseline` in their own."""
+    """Runs one after the other, in this process, which has imported torch already; `baseline` is trained in its own."""
     start = subprocess.run
 
     def run(command: list[str], *, stdout: TextIO, **options: Any) -> subprocess.CompletedProcess[Any]:
-        if any("baseline" in part.split("/") for part in command):
+        if "train" in command and any("baseline" in Path(part).parts for part in command):
             return start(command, stdout=stdout, **options)
         done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
         stdout.write(done.stdout + done.stderr)
