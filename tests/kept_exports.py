@@ -23,7 +23,7 @@ def exports_kept(factory: pytest.TempPathFactory) -> Iterator[None]:
 
     def kept(module: nn.Module, example: Sequence[Tensor], **options: Any) -> Any:
         try:
-            name = f"onnx_{_digest(module, example, options)}"
+            name = f"onnx_{digest(module, example, options)}"
         except (pickle.PicklingError, AttributeError, TypeError):  # made of what has no name, such as a lambda
             return export(module, tuple(example), **options)
         path = made_once(
@@ -41,7 +41,7 @@ def _model(program: Any) -> onnx.ModelProto:
     return model
 
 
-def _digest(module: nn.Module, example: Sequence[Tensor], options: Mapping[str, Any]) -> str:
+def digest(module: nn.Module, example: Sequence[Tensor], options: Mapping[str, Any]) -> str:
     """Of all that an export depends on: code by its name, settings and weights by value, examples by their shape."""
     shapes = [(each.dtype, each.shape) for each in example]
     stream = io.BytesIO()
