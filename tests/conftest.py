@@ -41,12 +41,19 @@ def _runtime_log() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _operators_of_onnx_are_read_once() -> Iterator[None]:
-    """torch.onnx reads the source of its thousand operators anew for each graph: half of a small network's export."""
-    with pytest.MonkeyPatch.context() as patch:
-        if "torch" in sys.modules:  # tests that do without need not wait for it
-            with contextlib.suppress(ImportError):  # a torch that has it elsewhere: exports only take longer
-                _keep_registry(patch)
+def _onnx_makes_nothing_twice(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """torch.onnx reads the source of its thousand operators anew for each graph: half of a small network's export.
+
+    Networks that several tests export are exported for the first of them.
+    """
+    if "torch" not in sys.modules:  # tests that do without need not wait for it
+        yield
+        return
+    from tests.kept_exports import exports_kept
+
+    with pytest.MonkeyPatch.context() as patch, exports_kept(tmp_path_factory):
+        with contextlib.suppress(ImportError):  # a torch that has it elsewhere: exports only take longer
+            _keep_registry(patch)
         yield
 
 

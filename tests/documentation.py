@@ -1,5 +1,6 @@
 """The code blocks of a page of the documentation, and a folder with the files that the pages speak of."""
 
+import functools
 import json
 import re
 import shlex
@@ -57,6 +58,14 @@ def blocks(page: Path) -> Iterator[Block]:
             indent = match["indent"]
             code = "\n".join(line.removeprefix(indent) for line in match["code"].splitlines())
             yield Block(match["language"], code, text.count("\n", 0, match.start("language")) + 1, match["reason"])
+
+
+@functools.cache
+def help_of(command: str) -> str:
+    """What `asca COMMAND --help` prints."""
+    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, command
+    return result.output
 
 
 def run(block: Block, page: str) -> None:

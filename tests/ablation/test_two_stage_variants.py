@@ -14,8 +14,14 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.models.build import build_model
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.schema import to_dict
-from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, tiny_config
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SETTINGS, tiny_config
 from tests.scenes import write_dataset
+
+FEW_BALLS = dataclasses.replace(  # each takes its share of the export
+    MODEL,
+    settings=dataclasses.replace(SETTINGS, sources=SETTINGS.sources[::2], grid_radii_m=(1.6,)),
+    network=dataclasses.replace(NETWORK, source_widths=NETWORK.source_widths[::2]),
+)
 
 
 def model_of(*overrides: str) -> PvRcnnModel:
@@ -64,7 +70,7 @@ def test_names_are_those_of_the_base_s_family() -> None:
 @pytest.mark.usefixtures("in_turn")
 def test_from_training_to_the_table(tmp_path: Path) -> None:
     data, base = write_dataset(tmp_path / "data", 10, val_frames=8), tmp_path / "tiny.yaml"
-    base.write_text(yaml.safe_dump(to_dict(dataclasses.replace(tiny_config(MODEL, epochs=1)))))
+    base.write_text(yaml.safe_dump(to_dict(tiny_config(FEW_BALLS, epochs=1))))
     ablate(
         str(base), data=data, out=tmp_path / "out", seeds="0", variants="deform_gate"
     )  # graphs of VectorPool take half a minute

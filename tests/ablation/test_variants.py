@@ -5,7 +5,7 @@ import subprocess
 import threading
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, TextIO
+from typing import Any
 
 import pytest
 import yaml
@@ -19,7 +19,6 @@ from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import shipped_configs
-from tests.in_process import run_here
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -43,23 +42,6 @@ def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
     car, *persons = config.model.spec.classes
     assert (car.positive_iou, car.negative_iou) == (0.6, 0.45)
     assert {(spec.positive_iou, spec.negative_iou) for spec in persons} == {variant.person_ious or (0.5, 0.35)}
-
-
-@pytest.fixture
-def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs one after the other, in this process, which has imported torch already; those of `baseline` in their own."""
-    start = subprocess.run
-
-    def run(command: list[str], *, stdout: TextIO, **options: Any) -> subprocess.CompletedProcess[Any]:
-        if any("baseline" in Path(part).parts for part in command):
-            return start(command, stdout=stdout, **options)
-        done = run_here(*command[command.index("asca_pillars.cli") + 1 :])
-        stdout.write(done.stdout + done.stderr)
-        return done
-
-    # Training answers to Ctrl-C, which only a main thread can.
-    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
-    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
 
 
 @pytest.mark.usefixtures("in_turn")

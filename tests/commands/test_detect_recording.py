@@ -24,6 +24,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError, ConfigError, OutputError, ScanError
 from tests.data.recordings.cloud_recordings import laid_out, odometry_message, stamps, write_mcap
+from tests.in_process import run_here
 from tests.scenes import write_dataset
 
 POINTS = read_scan(sample_scan_path()).points[::4].copy()
@@ -207,8 +208,8 @@ def test_after_sigkill(drive: Path, undisturbed: Path, tmp_path: Path) -> None:
         time.sleep(0.001)
     assert process.wait() == -signal.SIGKILL, "it was killed in time"
     assert not (out / "detections.jsonl").exists()
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "going on after the" in said
+    resumed = run_here(*command[3:])
+    assert resumed.returncode == 0 and "going on after the" in resumed.stdout
     assert outputs(out) == outputs(undisturbed)
 
 

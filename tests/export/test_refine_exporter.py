@@ -109,6 +109,7 @@ def test_eight_bits_of_other_weights_are_refused(tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     export_bundle(tiny_checkpoint("channel"), "first", SCANS)
     config = opened_config(Path("first"))
+    torch.manual_seed(0)
     detector = build_model(config.model)
     assert isinstance(detector, RefineDetector)
     checkpoint = Checkpoint(config, detector.eval(), 0)

@@ -172,19 +172,29 @@ def test_learns_one_frame_by_heart(variant: str) -> None:
     inputs = batch(detector, wanted)
     optimizer = torch.optim.Adam(detector.parameters())
     for step in range(80):
+        if step in (40, 50, 60, 70) and not _mistakes(detector, inputs, wanted):
+            break
         torch.manual_seed(step)
         optimizer.param_groups[0]["lr"] = 6e-3 * (1 - step / 80)
         loss = torch.stack(list(detector.loss(detector.predict(inputs), inputs).values())).sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+    assert not _mistakes(detector, inputs, wanted)
+
+
+def _mistakes(detector: PvRcnnDetector, inputs: LabeledVoxels, wanted: LabeledFrame) -> str:
+    """How what is found differs from the frame's boxes; empty where each of them is found once, and nothing else."""
     with torch.inference_mode():
         (found,) = detector.eval().detect(detector.predict(inputs), SPEC.with_score_threshold(0.5))
+    detector.train()
+    if len(found) != len(wanted.boxes):
+        return f"{len(found)} boxes"
     overlap = iou_3d(found.boxes, wanted.boxes)
     best = overlap.argmax(axis=0)
-    assert len(found) == len(wanted.boxes) and set(best) == set(range(len(best)))
-    assert overlap.max(axis=0).min() > 0.85
-    np.testing.assert_array_equal(found.labels[best], wanted.labels)
+    if set(best) != set(range(len(best))) or overlap.max(axis=0).min() <= 0.85:
+        return f"overlaps {overlap.max(axis=0)}"
+    return "" if np.array_equal(found.labels[best], wanted.labels) else f"labels {found.labels[best]}"
 
 
 def test_settings_that_cannot_be() -> None:

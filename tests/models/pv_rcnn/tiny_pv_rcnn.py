@@ -70,7 +70,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
 EVERYTHING: dict[str, Any] = {
     "network": dataclasses.replace(NETWORK, gate="keypoint", attention="rda", scale_widths=(8, 12, 16)),
     "settings": dataclasses.replace(
-        SETTINGS, deform="paper", vector_cells=2, scale_radii_m=(0.8, 1.6, 3.2), scale_samples=5
+        SETTINGS,
+        deform="paper",
+        sources=(SourceBalls("points", (1.2,), (6,)), *SETTINGS.sources[1:]),
+        grid_radii_m=(1.6,),  # one radius: the graph of a cube is eight times that of a ball
+        vector_cells=2,
+        scale_radii_m=(0.8, 1.6, 3.2),
+        scale_samples=5,
     ),
     "box_loss": "va",
 }
