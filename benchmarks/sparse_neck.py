@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from asca_deploy import sample_scan_path
 from asca_deploy.bundle import CanvasFormat
 from asca_deploy.ort_session import OrtSession
+from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_deploy.pillar_pipeline import Canvas
-from asca_deploy.table_backbone import FEATURES
 from asca_export import graphs, qdq
 from asca_export.fast_forms import FastBackbone
 from asca_export.quantize import STEPS, canvas_steps, layer_names, scale_to_steps
@@ -103,7 +103,7 @@ class _Forms:
             if "canvas" in session.inputs:
                 inputs = {"canvas": self.canvases[canvas].scatter(features[feature], cells)}
             else:
-                given = {FEATURES: features[feature], **tables}
+                given = {PILLAR_FEATURES: features[feature], **tables}
                 inputs = {name: given[name] for name in session.inputs}
             steps.append(partial(session.run, HeadMaps._fields, inputs))
         return [*steps, lambda: self.tables.build(cells)]

@@ -13,6 +13,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import STEP_VALUE
 from asca_export.graphs import OPSET
 from asca_export.quantize import WEIGHT_STEPS
@@ -20,7 +21,6 @@ from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.tables.neck_tables import NeckTables, table_inputs
 
-FEATURES = "pillar_features"
 _TINY = 1e-12
 
 
@@ -65,7 +65,7 @@ class _Graph:
         self.row_type = np.dtype(np.uint8 if steps else np.float32)
 
     def build(self) -> onnx.GraphProto:
-        backbone, rows, maps = self.backbone, FEATURES, []
+        backbone, rows, maps = self.backbone, PILLAR_FEATURES, []
         element = helper.np_dtype_to_tensor_dtype(self.row_type)
         self.inputs[rows] = helper.make_tensor_value_info(rows, element, ["pillars", backbone.channels])
         missing = backbone.empty.numpy().astype(self.row_type)

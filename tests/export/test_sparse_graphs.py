@@ -11,7 +11,7 @@ import torch
 from torch.utils._pytree import tree_map_only
 
 from asca_deploy.ort_session import OrtSession
-from asca_deploy.table_backbone import FEATURES
+from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.quantize import STEPS, canvas_steps
 from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
@@ -59,7 +59,7 @@ class OpenGraph:
         self.session = OrtSession(path, "cpu", "float32", threads)
 
     def run(self, features: np.ndarray, tables: NeckTables[np.ndarray]) -> HeadMaps[np.ndarray]:
-        given = {FEATURES: features, **table_inputs(tables)}
+        given = {PILLAR_FEATURES: features, **table_inputs(tables)}
         return HeadMaps(*self.session.run(HeadMaps._fields, {name: given[name] for name in self.session.inputs}))
 
 
