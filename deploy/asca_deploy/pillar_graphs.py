@@ -67,24 +67,10 @@ def open_encoder(folder: Path, bundle: Bundle) -> Session:
     return check_interface(path, session, *encoder_interface(bundle))
 
 
-def open_backbone_graph(
-    path: Path,
-    bundle: Bundle,
-    provider: providers.Provider,
-    precision: providers.Precision,
-    threads: int,
-    neck_channels: int = 0,
-) -> Session:
-    """Open backbone.onnx of a dense or of a sparse neck; with `neck_channels` it has the output NECK.
-
-    Raises:
-        BundleError: the graph cannot be run or is not what the manifest says.
-        ProviderError: the provider does not start, or cannot run a sparse neck.
-    """
+def check_neck(bundle: Bundle, provider: str) -> None:
+    """Raise ProviderError, which says what to choose, if this provider cannot run the bundle's neck."""
     if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
         raise ProviderError(
             f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
             "choose provider cpu, or a bundle with a dense neck such as asca_small_sim"
         )
-    session = providers.open_session(path, provider, precision, threads)
-    return check_interface(path, session, *backbone_interface(bundle, neck_channels))

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK, Bundle, CanvasFormat
-from asca_deploy.graph import Session
+from asca_deploy.graph import Session, check_interface
 from asca_deploy.pillar_backbone import HeadAnswer, Maps, PillarBackbone
-from asca_deploy.pillar_graphs import PILLAR_FEATURES, open_backbone_graph, open_encoder, output_channels
+from asca_deploy.pillar_graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.geometry.decode import HeadMaps, decode
 from asca_pillars.geometry.detections import Detections
@@ -112,7 +112,9 @@ def open_backbone(
         BundleError: the graph cannot be run or is not what the manifest says.
         ProviderError: the provider does not start, or cannot run a sparse neck.
     """
-    session = open_backbone_graph(path, bundle, provider, precision, threads, neck_channels)
+    check_neck(bundle, provider)
+    session = providers.open_session(path, provider, precision, threads)
+    check_interface(path, session, *backbone_interface(bundle, neck_channels))
     return (
         CanvasBackbone(session, bundle)
         if bundle.pillar.neck == "dense"
@@ -164,7 +166,7 @@ class CanvasBackbone:
     each takes (nx + 1)(ny + 1) C values, 5 MiB in asca_small_sim_int8 and 20 MiB in its float form.
 
     Args:
-        session: that has opened it, see `pillar_graphs.open_backbone_graph`.
+        session: that has opened it, see `open_backbone`.
         bundle: the manifest.
     """
 
@@ -221,7 +223,7 @@ class TableBackbone:
     tables themselves belong to their scan.
 
     Args:
-        session: that has opened it, see `pillar_graphs.open_backbone_graph`.
+        session: that has opened it, see `open_backbone`.
         bundle: the manifest.
         neck_channels: of the graph's output NECK, if it has one.
     """
