@@ -8,7 +8,8 @@ milliseconds. Memory is as after a frame of the network: other data has pushed t
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 from unittest.mock import patch
@@ -23,7 +24,9 @@ from asca_pillars.data.input_check import check_input
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.geometry.decode import HeadMaps, rotated_nms
+from asca_pillars.pillars.map_pooling import map_cells
 from asca_pillars.system import cpu_model
+from asca_pillars.tables.neck_tables import NeckTableBuilder
 
 CAMERA_VIEW = 0.84, 0.25  # |y| / x and |z| / x: about what KITTI's camera 2 sees
 DISTURBANCE = np.zeros(4 << 20, np.float32)  # 16 MB
@@ -39,12 +42,17 @@ def main(
     print(f"{cpu_model()}, bundle {bundle.name}, {rounds} rounds\n")
     for path in scans or [sample_scan_path()]:
         points = read_scan(path).points
-        in_view = (np.abs(points[:, 1:3]) <= points[:, :1] * np.array(CAMERA_VIEW, np.float32)).all(axis=1)
-        for view, part in (("full", points), ("camera view", points[in_view])):
+        for view, part in (("full", points), ("camera view", points[camera_view(points)])):
             print(f"{path.name}, {view}: {len(part)} points")
-            report(host_path(part, bundle), rounds)
+            report(partial(host_path, part, bundle), rounds)
     print("rotated NMS, 60 m by 60 m at nms_iou 0.01")
-    report({f"{count} candidates": suppression(count) for count in CANDIDATES}, rounds)
+    report(lambda: {f"{count} candidates": suppression(count) for count in CANDIDATES}, rounds)
+
+
+def camera_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which points (N, >= 3), metres, LiDAR frame, the camera sees: (N,)."""
+    seen = np.abs(points[:, 1:3]) <= points[:, :1] * np.array(CAMERA_VIEW, np.float32)
+    return np.asarray(seen.all(axis=1))
 
 
 def host_path(points: NDArray[np.float32], bundle: Bundle) -> dict[str, Callable[[], Any]]:
@@ -56,12 +64,18 @@ def host_path(points: NDArray[np.float32], bundle: Bundle) -> dict[str, Callable
     boxes = rng.normal(0, 0.2, (height, width, 7 * count)).astype(np.float32)
     directions = rng.normal(0, 1, (height, width, 2 * count)).astype(np.float32)
     maps = HeadMaps(*(np.moveaxis(m, -1, 0) for m in (scores, boxes, directions)))
-    counts = spec.pillarize(points).stats
-    return {
+    pillars = spec.pillarize(points)
+    counts, rule = pillars.stats, bundle.pillar.active_cells
+    stages: dict[str, Callable[[], Any]] = {
         "input": lambda: (usable_points(points), check_input(points, counts, bundle.expected_input)),
         "pillarize": lambda: spec.pillarize(points),
         "decode": lambda: spec.decode(maps),
     }
+    if rule is not None:
+        pooled, builder = map_cells(pillars.cells, spec.grid), NeckTableBuilder(*spec.grid.map_shape, rule)
+        cells = pillars.cells if pooled is None else pooled.cells
+        stages["tables"] = lambda: builder.build(cells)
+    return stages
 
 
 def suppression(count: int) -> Callable[[], Any]:
@@ -72,15 +86,19 @@ def suppression(count: int) -> Callable[[], Any]:
     return lambda: rotated_nms(boxes, scores, 0.01)
 
 
-def report(stages: dict[str, Callable[[], Any]], rounds: int) -> None:
-    """Time the stages in both forms and print them."""
-    times_ms = np.empty((rounds + 1, 2, len(stages)))  # the first round is not counted
+def report(make_stages: Callable[[], dict[str, Callable[[], Any]]], rounds: int) -> None:
+    """Time the stages in both forms, in which they are made as well, and print them."""
     forms: tuple[Callable[[], AbstractContextManager[None]], ...] = (nullcontext, in_numpy)
+    stages_of = []
+    for form in forms:
+        with form():
+            stages_of.append(make_stages())
+    stages = list(stages_of[0])
+    times_ms = np.empty((rounds + 1, 2, len(stages)))  # the first round is not counted
     for one_round in times_ms:
-        for form, one_form in zip(forms, one_round, strict=True):
+        for form, one_form, steps in zip(forms, one_round, stages_of, strict=True):
             with form():
-                for index, stage in enumerate(stages.values()):
-                    one_form[index] = measure_ms(stage)
+                one_form[:] = [measure_ms(step) for step in steps.values()]
     if len(stages) > 2:
         times_ms = np.concatenate([times_ms, times_ms.sum(axis=2, keepdims=True)], axis=2)
     quarter, median, three_quarters = np.quantile(times_ms[1:], [0.25, 0.5, 0.75], axis=0)
@@ -106,9 +124,9 @@ def measure_ms(stage: Callable[[], Any]) -> float:
 @contextmanager
 def in_numpy() -> Iterator[None]:
     """As without numba."""
-    modules = ("pillars.pillarize", "geometry.decode")
-    first, second = (patch(f"asca_pillars.{name}.load_kernels", lambda _: None) for name in modules)
-    with first, second:
+    with ExitStack() as patches:
+        for module in ("pillars.pillarize", "tables.cell_map", "geometry.decode"):
+            patches.enter_context(patch(f"asca_pillars.{module}.load_kernels", lambda _: None))
         yield
 
 

@@ -6,8 +6,10 @@
 The weights are the same on every run. How good 8 bits are, they cannot say; neither how many boxes there will be.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import nn
 
-from asca_deploy import sample_scan_path
+from asca_deploy import Bundle, sample_scan_path
 from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.config import load_config
 from asca_pillars.data.scans.scan_reader import read_scan
@@ -26,6 +28,8 @@ from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
 from asca_pillars.pillar_config import PillarModel
 
+Neck: TypeAlias = Literal["dense", "sparse"]
+
 
 def main(
     out: Annotated[Path, typer.Argument(help="Folder for the bundles float32 and int8.")],
@@ -34,35 +38,50 @@ def main(
     """Export both, calibrated on the sample scan, each time without another eighth of its points."""
     console = Console(markup=False)
     points = read_scan(sample_scan_path()).points
-    model, scans = random_weights(config, points), [points] * MIN_SCANS
-    thinned = [np.delete(points, slice(part, None, MIN_SCANS), axis=0) for part in range(MIN_SCANS)]
+    model = random_weights(config, points)
     with console.status("Exporting") as status:
-        for name, calibration in (("float32", None), ("int8", thinned)):
-            bundle = export_bundle(
-                model,
-                out / name,
-                scans,
-                trained_on="nothing: random weights",
-                calibration=calibration,
-                progress=status.update,
-            )
+        for name in ("float32", "int8"):
+            bundle = export_random_weights(model, points, out / name, int8=name == "int8", progress=status.update)
             console.print(f"{out / name}: {bundle.backbone_gmac:.2f} GMAC, {bundle.precision}")
 
 
-def random_weights(config: str, points: NDArray[np.float32]) -> Checkpoint:
-    """A network with random weights, normalized on a scan (N, 4), so that its maps depend on the points."""
+def export_random_weights(
+    model: Checkpoint, points: NDArray[np.float32], out: Path, *, int8: bool, progress: Callable[[str], None]
+) -> Bundle:
+    """Export, in 8 bits calibrated on a scan (N, 4), metres, LiDAR frame, each time without another eighth of it."""
+    thinned = [np.delete(points, slice(part, None, MIN_SCANS), axis=0) for part in range(MIN_SCANS)]
+    return export_bundle(
+        model,
+        out,
+        [points] * MIN_SCANS,
+        trained_on="nothing: random weights",
+        calibration=thinned if int8 else None,
+        progress=progress,
+    )
+
+
+def random_weights(config: str, points: NDArray[np.float32], neck: Neck | None = None) -> Checkpoint:
+    """A network with random weights, normalized on a scan (N, 4), so that its maps depend on the points.
+
+    Args:
+        config: YAML, or the name of one that ships.
+        points: metres, LiDAR frame, and reflectance.
+        neck: in place of the configuration's.
+    """
     torch.manual_seed(0)
     resolved = load_config(config)
-    if not isinstance(resolved.model, PillarModel):
-        raise ConfigError(f"{config}: model.kind {resolved.model.kind}; give a configuration of kind pillar")
-    network = build_pillar_detector(resolved.model).train()
-    norms = [module for module in network.modules() if isinstance(module, (nn.BatchNorm1d, nn.BatchNorm2d))]
+    model = resolved.model
+    if not isinstance(model, PillarModel):
+        raise ConfigError(f"{config}: model.kind {model.kind}; give a configuration of kind pillar")
+    model = replace(model, network=replace(model.network, neck=neck or model.network.neck))
+    detector = build_pillar_detector(model).train()
+    norms = [module for module in detector.modules() if isinstance(module, (nn.BatchNorm1d, nn.BatchNorm2d))]
     for norm in norms:
         norm.momentum = 1.0  # the running statistics become those of this scan
     with torch.no_grad():
-        pillars = resolved.model.spec.pillarize(points)
-        network(batch_pillars([pillars], [network.preparation.place(pillars)]))
-    return Checkpoint(resolved, network.eval(), 0)
+        pillars = model.spec.pillarize(points)
+        detector(batch_pillars([pillars], [detector.preparation.place(pillars)]))
+    return Checkpoint(replace(resolved, model=model), detector.eval(), 0)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from asca_pillars.points.cube_neighbors import nearest_in_cubes
 from asca_pillars.points.farthest_points import farthest_points, near_boxes
 from asca_pillars.points.roi_grid import roi_grid_points
 from asca_pillars.system import cpu_model
-from benchmarks.host_path import CAMERA_VIEW
+from benchmarks.host_path import camera_view
 
 RANGE_M = np.array([[0, 70.4], [-40, 40], [-3, 1]], np.float32)
 BOXES, GRID = 50, 6
@@ -40,8 +40,7 @@ def main(
     for path in scans or [sample_scan_path()]:
         points = read_scan(path).points
         points = points[((points[:, :3] >= RANGE_M[:, 0]) & (points[:, :3] < RANGE_M[:, 1])).all(axis=1)]
-        in_view = (np.abs(points[:, 1:3]) <= points[:, :1] * np.array(CAMERA_VIEW, np.float32)).all(axis=1)
-        for view, part in (("whole range", points), ("camera view", points[in_view])):
+        for view, part in (("whole range", points), ("camera view", points[camera_view(points)])):
             print(f"{path.name}, {view}: {len(part)} points")
             rows = [(name, *(f"{ms:.2f}" for ms in measure(step, rounds))) for name, step in steps(part).items()]
             print(markdown_table(("step", "best", "median"), rows, left=1) + "\n")

@@ -156,7 +156,7 @@ def ground_z_m(points: NDArray[np.float32]) -> float | None:
         squared_range = x * x + y * y
     ring = np.flatnonzero((squared_range > _RING_M[0] ** 2) & (squared_range < _RING_M[1] ** 2))
     near_z = points[:, 2].take(ring)
-    return float(np.percentile(near_z, _LOW_PERCENTILE)) if len(near_z) >= _MIN_GROUND_POINTS else None
+    return _percentile(np.sort(near_z), _LOW_PERCENTILE) if len(near_z) >= _MIN_GROUND_POINTS else None
 
 
 def doubt_frame(points: NDArray[np.float32], ground_z_m: float | None) -> FrameDoubt | None:
@@ -188,7 +188,8 @@ def _upside_down(z: _Floats) -> FrameDoubt | None:
     """The points end sharply above the sensor, as they do at the ground, and gradually below it."""
     if len(z) < _MIN_POINTS:
         return None
-    lowest, low, high, highest = np.percentile(z, _EDGE_PERCENTILES)
+    ordered = np.sort(z)
+    lowest, low, high, highest = (_percentile(ordered, percent) for percent in _EDGE_PERCENTILES)
     if highest < _GROUND_ABOVE_M or highest - high > min(_SHARP_M, low - lowest):
         return None
     text = f"the points near the sensor end at z = {highest:.1f} m as at the ground: z may point down"
@@ -215,7 +216,7 @@ def _across(radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> FrameDoubt |
     for quadrant in quadrants:
         if np.count_nonzero(quadrant) < _MIN_POINTS:
             return None
-        reach.append(float(np.median(radius[quadrant])))
+        reach.append(_percentile(np.sort(radius[quadrant]), 50.0))
     along, across = reach[0] + reach[2], reach[1] + reach[3]
     if along >= _MIN_ALONG * across:
         return None
@@ -229,8 +230,8 @@ def _tilted(z: _Floats, radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> 
     for quadrant in quadrants:
         if np.count_nonzero(quadrant) < _MIN_POINTS:
             return None
-        height = float(np.percentile(z[quadrant], _LOW_PERCENTILE))
-        low.append((height, float(np.median(radius[quadrant & (z <= height)]))))
+        height = _percentile(np.sort(z[quadrant]), _LOW_PERCENTILE)
+        low.append((height, _percentile(np.sort(radius[quadrant & (z <= height)]), 50.0)))
     along, across = ((low[a][0] - low[b][0]) / (low[a][1] + low[b][1]) for a, b in ((0, 2), (1, 3)))
     tilt_deg = float(np.degrees(np.arctan(np.hypot(along, across))))
     if tilt_deg < _MAX_TILT_DEG:
@@ -243,3 +244,10 @@ def _quadrants(x: _Floats, y: _Floats, half_width_deg: float) -> list[NDArray[np
     slope = float(np.tan(np.radians(half_width_deg)))
     along_x, along_y = np.abs(y) < slope * np.abs(x), np.abs(x) < slope * np.abs(y)
     return [along_x & (x > 0), along_y & (y > 0), along_x & (x < 0), along_y & (y < 0)]
+
+
+def _percentile(ordered: _Floats, percent: float) -> float:
+    """`np.percentile` of ascending values (n,), n at least 1, which takes ten times as long for a thousand of them."""
+    place, part = divmod(percent / 100 * (len(ordered) - 1), 1)
+    low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])
+    return low + part * (high - low)

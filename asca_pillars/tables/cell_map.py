@@ -5,8 +5,10 @@ at which its column starts plus the number of bits set below it. No hash, no sor
 (y, x, z), z running fastest, which makes every table and every network output independent of threads and machine.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from itertools import product
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.kernels import load_kernels
-from asca_pillars.tables.convolution import Links, Shape
+from asca_pillars.tables.convolution import Convolution, Links, Shape
 
 KERNELS = "asca_pillars.tables.table_kernels"
 MAX_Z_CELLS = 64  # the bits of a column's mask
@@ -24,9 +26,9 @@ class Columns(NamedTuple):
     """The lattice column by column, (ny * nx,) each; in use only where numba runs the loops."""
 
     mask: NDArray[np.uint64]
-    """Bit z: the cell is active."""
+    """Bit z: the cell is active. A lattice one cell high has none, and -1 as the start of a column without any."""
     start: NDArray[np.int32]
-    """Row of the column's first active cell; undefined in a column without any."""
+    """Row of the column's first active cell."""
 
 
 class CellMap:
@@ -58,7 +60,8 @@ class CellMap:
         self.columns: Any = None
         if self._kernels is not None:
             columns = shape[1] * shape[2]
-            self.columns = Columns(np.zeros(columns, np.uint64), np.empty(columns, np.int32))
+            masks = 0 if shape[0] == 1 else columns
+            self.columns = Columns(np.zeros(masks, np.uint64), np.full(columns + 1, -1, np.int32))
 
     def __len__(self) -> int:
         return len(self.cells)
@@ -67,7 +70,7 @@ class CellMap:
         """Make these cells (N,) the active ones: flat indices, ascending, none twice."""
         cells = np.ascontiguousarray(cells, np.int64)
         if self._kernels is not None:
-            self._kernels.clear_columns(self.cells, self.shape[0], self.columns.mask)
+            self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
             self._kernels.enter_cells(cells, self.shape[0], *self.columns)
         self.cells = cells
 
@@ -76,9 +79,8 @@ class CellMap:
         if self._kernels is None:
             self.cells = np.unique(cell_of_point[cell_of_point >= 0])
             return
-        self._kernels.clear_columns(self.cells, self.shape[0], self.columns.mask)
-        self.cells = np.empty(self._kernels.mark_points(cell_of_point, self.shape[0], self.columns.mask), np.int64)
-        self._kernels.list_cells(*self.columns, self.shape[0], self.cells)
+        self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
+        self._list_cells(self._kernels, self._kernels.mark_points(cell_of_point, self.shape[0], *self.columns))
 
     def activate_joined(self, sources: Sequence[tuple["CellMap", Links]]) -> None:
         """Make active what any tap joins with an active cell of any of the sources, none of which may be this map."""
@@ -88,12 +90,17 @@ class CellMap:
             ]
             self.cells = np.unique(np.concatenate(joined))
             return
-        self._kernels.clear_columns(self.cells, self.shape[0], self.columns.mask)
+        self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
         found = 0
         for source, links in sources:
-            found += self._kernels.mark_joined(source.cells, *links, *self.shape[1:], self.columns.mask)
-        self.cells = np.empty(found, np.int64)
-        self._kernels.list_cells(*self.columns, self.shape[0], self.cells)
+            found += self._kernels.mark_joined(source.cells, *links, self.shape[2], *self.columns)
+        self._list_cells(self._kernels, found)
+
+    def _list_cells(self, kernels: ModuleType, count: int) -> None:
+        """Make active what the kernels have marked, so many cells."""
+        cells = np.empty(count + 1, np.int64)
+        kernels.list_cells(*self.columns, self.shape[0], cells)
+        self.cells = cells[:count]
 
     def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
         """Index of the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
@@ -101,7 +108,7 @@ class CellMap:
         With `Convolution.inputs` it is what the convolution from `source` to this map reads. With `outputs` it is
         the inverse that its backward pass reads: which output, of the map `source`, each input was read by.
         """
-        table = np.empty((len(self.cells), links.taps), np.int32)
+        table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in links)), np.int32)
         if self._kernels is None:
             for tap, (cells, joins) in enumerate(_taps(self.cells, links, source.shape)):
                 table[:, tap] = np.where(joins, _rows(source.cells, cells), len(source))
@@ -120,13 +127,38 @@ class CellMap:
         if self._kernels is not None:
             places = np.empty(len(self.cells), np.int32)
             self._kernels.fill_places(
-                self.cells, self.shape[2], parents.shape[2], *parents.columns, missing, halvings, places
+                self.cells, self.shape[2], parents.shape[2], parents.columns.start, missing, halvings, places
             )
             return places
         y, x = np.divmod(self.cells, self.shape[2])
         parent = _rows(parents.cells, y // stride * parents.shape[2] + x // stride)
         places = parent * stride**2 + y % stride * stride + x % stride
         return np.where(parent < len(parents), places, missing).astype(np.int32)
+
+
+class Join(NamedTuple):
+    """A convolution between two maps; made once, as they are, for scan after scan."""
+
+    source: CellMap
+    target: CellMap
+    inputs: Links
+    """From the cells of `target` to those of `source` that they read."""
+    outputs: Links
+    """From the cells of `source` to those of `target` that read them."""
+
+    def table(self) -> NDArray[np.int32]:
+        """What the convolution reads: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
+        return self.target.table(self.source, self.inputs)
+
+    def inverse(self) -> NDArray[np.int32]:
+        """What its backward pass reads: (cells of `source`, K) rows of `target`."""
+        return self.source.table(self.target, self.outputs)
+
+
+def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
+    """The convolution from one map to another."""
+    inputs = convolution.inputs(target.shape, source.shape)
+    return Join(source, target, inputs, convolution.outputs(source.shape, target.shape))
 
 
 def _taps(

@@ -26,11 +26,6 @@ class Links(NamedTuple):
     y: NDArray[np.int64]
     x: NDArray[np.int64]
 
-    @property
-    def taps(self) -> int:
-        """K."""
-        return self.z.shape[1] * self.y.shape[1] * self.x.shape[1]
-
 
 @dataclass(frozen=True)
 class Convolution:
@@ -77,7 +72,7 @@ def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convoluti
     return Convolution((1, kernel, kernel), (1, stride, stride), (0, padding, padding))
 
 
-@lru_cache(maxsize=256)  # the same few for every scan
+@lru_cache(maxsize=256)  # the same few for every map
 def _links(convolution: Convolution, shape: Shape, other: Shape, *, backward: bool) -> Links:
     axes = []
     for axis in range(3):

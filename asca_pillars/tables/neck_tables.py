@@ -19,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.tables.batching import stack_cells, stack_rows
-from asca_pillars.tables.cell_map import CellMap
-from asca_pillars.tables.convolution import Convolution, map_convolution
+from asca_pillars.tables.cell_map import CellMap, join
+from asca_pillars.tables.convolution import map_convolution
 
 MaskRule = Literal["sub", "fine"]
 
 LEVELS = 3
 STRIDED = map_convolution(3, stride=2, padding=1)
 SAME = map_convolution(3, padding=1)
+_NO_TABLE = np.empty((0, 9), np.int32)
 
 Array = TypeVar("Array")
 
@@ -79,55 +80,50 @@ class NeckTableBuilder:
         self.training = training
         shapes = [(1, ny >> level, nx >> level) for level in range(LEVELS + 1)]
         self._pillars, *self._strided = (CellMap(shape) for shape in shapes)
-        self._grown = CellMap(shapes[1])
+        self._outputs = list(self._strided)
+        if rule == "fine":
+            self._outputs[0] = CellMap(shapes[1])
         self._head = CellMap(shapes[1])
+        before = [self._pillars, *self._outputs[:-1]]
+        self._halvings = [join(STRIDED, *maps) for maps in zip(before, self._strided, strict=True)]
+        self._growths = [join(SAME, *maps) for maps in zip(self._strided, self._outputs, strict=True)]
+        self._stays = [join(SAME, level, level) for level in self._outputs]
+        strides = [map_convolution(1 << level, stride=1 << level) for level in range(LEVELS)]
+        self._children = [join(stride, self._head, level) for stride, level in zip(strides, self._outputs, strict=True)]
 
     def build(self, cells: NDArray[np.int64]) -> NeckTables[NDArray[np.int32]]:
         """Tables of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
-        self._pillars.activate(cells)
-        before = self._pillars
-        for level in self._strided:
-            level.activate_joined([(before, STRIDED.outputs(before.shape, level.shape))])
-            before = level
-        outputs = list(self._strided)
-        if self.rule == "fine":
-            self._grown.activate_joined([(outputs[0], SAME.outputs(outputs[0].shape, self._grown.shape))])
-            outputs[0] = self._grown
-        children = [map_convolution(1 << level, stride=1 << level) for level in range(LEVELS)]
-        self._head.activate_joined(
-            [
-                (level, child.inputs(level.shape, self._head.shape))
-                for level, child in zip(outputs, children, strict=True)
-            ]
-        )
-
-        tables, before = [], self._pillars
-        for number, (strided, output) in enumerate(zip(self._strided, outputs, strict=True)):
-            grows = output is not strided
-            same = _reads(output, output, SAME)
-            tables.append(
+        self._activate(cells)
+        levels = []
+        for number in range(LEVELS):
+            halving, growth, stay = self._halvings[number], self._growths[number], self._stays[number]
+            strided, output = growth.source, growth.target
+            same = stay.table()
+            levels.append(
                 LevelTables(
-                    strided=_reads(strided, before, STRIDED),
-                    first=_reads(output, strided, SAME) if grows else same,
+                    strided=halving.table(),
+                    first=same if strided is output else growth.table(),
                     same=same,
-                    strided_back=self._inverse(before, strided, STRIDED),
-                    first_back=self._inverse(strided, output, SAME),
+                    strided_back=halving.inverse() if self.training else _NO_TABLE,
+                    first_back=growth.inverse() if self.training else _NO_TABLE,
                     strided_cells=strided.cells.astype(np.int32),
                     cells=output.cells.astype(np.int32),
                     places=self._head.places(output, number),
                 )
             )
-            before = output
-        return NeckTables(tuple(tables), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
+        return NeckTables(tuple(levels), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
 
-    def _inverse(self, source: CellMap, target: CellMap, convolution: Convolution) -> NDArray[np.int32]:
-        if not self.training:
-            return np.empty((0, convolution.taps), np.int32)
-        return source.table(target, convolution.outputs(source.shape, target.shape))
-
-
-def _reads(target: CellMap, source: CellMap, convolution: Convolution) -> NDArray[np.int32]:
-    return target.table(source, convolution.inputs(target.shape, source.shape))
+    def _activate(self, cells: NDArray[np.int64]) -> None:
+        """Find the active cells of every map, as the rule says."""
+        self._pillars.activate(cells)
+        before = self._pillars
+        for halving, level in zip(self._halvings, self._strided, strict=True):
+            level.activate_joined([(before, halving.outputs)])  # the coarser levels do not see the growth
+            before = level
+        if self.rule == "fine":
+            growth = self._growths[0]
+            growth.target.activate_joined([(growth.source, growth.outputs)])
+        self._head.activate_joined([(children.target, children.inputs) for children in self._children])
 
 
 def stack_neck_tables(

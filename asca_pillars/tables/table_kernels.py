@@ -30,9 +30,18 @@ def bits_set(mask: np.uint64) -> Any:
     return np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@compiled(_CELLS, types.int64, written(types.uint64))
-def clear_columns(cells: _Integers, nz: int, mask: _Masks) -> None:
-    """Empty the columns of these cells: flat indices (N,), `mask` (ny * nx,)."""
+@inner
+def bits_of(mask: _Masks, start: _Rows, column: np.uint64) -> Any:
+    """The active cells of a column; on a lattice one cell high, which has no masks, the lowest bit alone."""
+    return mask[column] if len(mask) else np.uint64(start[column] >= 0)
+
+
+@compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
+def clear_columns(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
+    """Empty the columns (ny * nx,) of these cells, flat indices (N,)."""
+    if nz == 1:
+        start[:] = -1
+        return
     for i in range(len(cells)):
         mask[np.uint64(cells[i]) // np.uint64(nz)] = 0
 
@@ -40,6 +49,10 @@ def clear_columns(cells: _Integers, nz: int, mask: _Masks) -> None:
 @compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
 def enter_cells(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
     """Enter ascending cells, flat indices (N,), into empty columns (ny * nx,)."""
+    if nz == 1:
+        for i in range(len(cells)):
+            start[np.uint64(cells[i])] = i
+        return
     for i in range(len(cells)):
         column = np.uint64(cells[i]) // np.uint64(nz)
         if mask[column] == 0:
@@ -47,29 +60,72 @@ def enter_cells(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
         mask[column] |= _ONE << (np.uint64(cells[i]) - column * np.uint64(nz))
 
 
-@compiled(_CELLS, types.int64, written(types.uint64))
-def mark_points(cells: _Integers, nz: int, mask: _Masks) -> int:
+@inner
+def _mark(mask: _Masks, start: _Rows, column: np.uint64, bits: np.uint64) -> Any:
+    """Set these bits of a column, and say how many were not set before."""
+    new = bits & ~bits_of(mask, start, column)
+    if new and len(mask):
+        mask[column] |= new
+    elif new:
+        start[column] = 0
+    return bits_set(new)
+
+
+@inner
+def _mark_flat(cells: _Integers, y_links: _Integers, x_links: _Integers, taps: int, nx: int, start: _Rows) -> Any:
+    """`mark_joined` where both lattices are one cell high and the kernel is square, several times as fast."""
+    nowhere, width = np.uint64(len(start) - 1), len(x_links)
+    row, found = 0, np.int64(0)
+    start[nowhere] = 0
+    for i in range(len(cells)):
+        while cells[i] >= (row + 1) * width:
+            row += 1
+        x_of = x_links[np.uint64(cells[i] - row * width)]
+        for ky in range(taps):
+            y = y_links[np.uint64(row), np.uint64(ky)]
+            if y < 0:
+                continue
+            for kx in range(taps):
+                # Without branches: what is joined and new is hard to predict.
+                x = x_of[np.uint64(kx)]
+                place = np.uint64(y * nx + x) if x >= 0 else nowhere
+                found -= start[place]
+                start[place] = 0
+    start[nowhere] = -1
+    return found
+
+
+@compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
+def mark_points(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> int:
     """Set the bits of the points' cells, flat indices (M,) or -1, and say how many were not set before."""
     found = 0
     for i in range(len(cells)):
         if cells[i] >= 0:
             column = cells[i] // nz
-            bit = _ONE << np.uint64(cells[i] - column * nz)
-            if not mask[column] & bit:
-                mask[column] |= bit
-                found += 1
+            found += _mark(mask, start, np.uint64(column), _ONE << np.uint64(cells[i] - column * nz))
     return found
 
 
-@compiled(_CELLS, *_LINKS, types.int64, types.int64, written(types.uint64))
+@compiled(_CELLS, *_LINKS, types.int64, written(types.uint64), written(types.int32))
 def mark_joined(
-    cells: _Integers, z_links: _Integers, y_links: _Integers, x_links: _Integers, ny: int, nx: int, mask: _Masks
+    cells: _Integers,
+    z_links: _Integers,
+    y_links: _Integers,
+    x_links: _Integers,
+    nx: int,
+    mask: _Masks,
+    start: _Rows,
 ) -> int:
     """Set the bits of what is joined with these cells, and say how many were not set before.
 
-    `cells`: (N,) flat indices; links: (cells along an axis, taps) indices along it; `mask`: (ny * nx,).
+    `cells`: (N,) flat indices; links: (cells along an axis, taps) indices along it; columns: (ny * nx,).
     """
     depth, width = len(z_links), len(x_links)
+    taps = x_links.shape[1]
+    if not len(mask) and depth == z_links.shape[1] == 1 and y_links.shape[1] == taps:
+        if taps == 3:  # a number that the compiler knows
+            return _mark_flat(cells, y_links, x_links, 3, nx, start)
+        return _mark_flat(cells, y_links, x_links, taps, nx, start)
     found = i = row = 0
     while i < len(cells):
         column = cells[i] // depth if depth > 1 else cells[i]
@@ -90,18 +146,24 @@ def mark_joined(
             for kx in range(len(x_of)):
                 x = x_of[np.uint64(kx)]
                 if x >= 0:
-                    place = np.uint64(y * nx + x)
-                    new = bits & ~mask[place]
-                    if new:
-                        mask[place] |= new
-                        found += bits_set(new)
+                    found += _mark(mask, start, np.uint64(y * nx + x), bits)
     return found
 
 
 @compiled(given(types.uint64), written(types.int32), types.int64, written(types.int64))
 def list_cells(mask: _Masks, start: _Rows, nz: int, cells: _Integers) -> None:
-    """The cells whose bits are set, ascending flat indices (N,), and where each column (ny * nx,) starts among them."""
+    """The cells whose bits are set, ascending flat indices (N,), and where each column (ny * nx,) starts among them.
+
+    `cells` comes with room for one more.
+    """
     count = 0
+    if nz == 1:
+        for column in range(len(start) - 1):
+            missing = start[np.uint64(column)] >> 31  # -1 or 0: no branches
+            cells[np.uint64(count)] = column
+            start[np.uint64(column)] = count | missing
+            count += 1 + missing
+        return
     for column in range(len(mask)):
         left = mask[np.uint64(column)]
         if left == 0:
@@ -119,29 +181,26 @@ def _fill_flat(
     cells: _Integers,
     y_links: _Integers,
     x_links: _Integers,
+    taps: int,
     nx: int,
-    mask: _Masks,
     start: _Rows,
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """Likewise on maps with one cell along z, three times as fast."""
-    taps_y, taps_x, width = y_links.shape[1], x_links.shape[1], len(x_links)
+    """`fill_table` where both lattices are one cell high and the kernel is square, several times as fast."""
+    nowhere, width = np.uint64(len(start) - 1), len(x_links)
     row = 0
     for i in range(len(cells)):
         while cells[i] >= (row + 1) * width:
             row += 1
-        column = np.uint64(cells[i] - row * width)
-        for ky in range(taps_y):
+        x_of, entries = x_links[np.uint64(cells[i] - row * width)], table[np.uint64(i)]
+        for ky in range(taps):
             y = y_links[np.uint64(row), np.uint64(ky)]
-            for kx in range(taps_x):
-                x = x_links[column, np.uint64(kx)]
-                entry = missing
-                if y >= 0 and x >= 0:
-                    place = np.uint64(y * nx + x)
-                    if mask[place]:
-                        entry = start[place]
-                table[np.uint64(i), np.uint64(ky * taps_x + kx)] = entry
+            for kx in range(taps):
+                # Without branches: which cells are active is hard to predict. Unsigned, -1 is the largest number.
+                x = x_of[np.uint64(kx)]
+                place = np.uint64(y * nx + x) if (y | x) >= 0 else nowhere
+                entries[np.uint64(ky * taps + kx)] = np.int32(min(np.uint32(start[place]), np.uint32(missing)))
 
 
 @compiled(_CELLS, *_LINKS, types.int64, *_COLUMNS, types.int32, written(types.int32, 2))
@@ -159,8 +218,11 @@ def fill_table(
     """`CellMap.table`, column by column: cells (N,) -> indices (N, K)."""
     depth, width = len(z_links), len(x_links)
     taps_z, taps_y, taps_x = z_links.shape[1], y_links.shape[1], x_links.shape[1]
-    if depth == taps_z == 1:
-        _fill_flat(cells, y_links, x_links, nx, mask, start, missing, table)
+    if not len(mask) and depth == taps_z == 1 and taps_y == taps_x:
+        if taps_x == 3:  # a number that the compiler knows
+            _fill_flat(cells, y_links, x_links, 3, nx, start, missing, table)
+        else:
+            _fill_flat(cells, y_links, x_links, taps_x, nx, start, missing, table)
         return
     first = row = 0
     while first < len(cells):
@@ -178,7 +240,7 @@ def fill_table(
                 bits, begin = np.uint64(0), np.int32(0)
                 if y >= 0 and x >= 0:
                     place = np.uint64(y * nx + x)
-                    bits, begin = mask[place], start[place]
+                    bits, begin = bits_of(mask, start, place), start[place]
                 for i in range(first, end):
                     z_of, entries = z_links[np.uint64(cells[i] - column * depth)], table[np.uint64(i)]
                     for kz in range(taps_z):
@@ -191,12 +253,11 @@ def fill_table(
         first = end
 
 
-@compiled(_CELLS, types.int64, types.int64, *_COLUMNS, types.int32, types.int64, written(types.int32))
+@compiled(_CELLS, types.int64, types.int64, given(types.int32), types.int32, types.int64, written(types.int32))
 def fill_places(
     cells: _Integers,
     nx: int,
     parent_nx: int,
-    mask: _Masks,
     start: _Rows,
     missing: np.int32,
     halvings: int,
@@ -209,7 +270,5 @@ def fill_places(
             row += 1
         x = cells[i] - row * nx
         parent = np.uint64((row >> halvings) * parent_nx + (x >> halvings))
-        place = missing
-        if mask[parent]:
-            place = np.int32((((start[parent] << halvings) + (row & within)) << halvings) + (x & within))
-        places[np.uint64(i)] = place
+        place = (((np.int64(start[parent]) << halvings) + (row & within)) << halvings) + (x & within)
+        places[np.uint64(i)] = np.int32(min(np.uint32(place), np.uint32(missing)))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.geometry.compiling import compiled, given, written
 from asca_pillars.tables.convolution import Shape
-from asca_pillars.tables.table_kernels import bits_set
+from asca_pillars.tables.table_kernels import bits_of, bits_set
 
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int64]
@@ -59,7 +59,7 @@ def sum_points(
         if cells[i] < 0:
             continue
         column = cells[i] // nz
-        below = mask[column] & ((_ONE << np.uint64(cells[i] - column * nz)) - _ONE)
+        below = bits_of(mask, start, np.uint64(column)) & ((_ONE << np.uint64(cells[i] - column * nz)) - _ONE)
         voxel = start[column] + bits_set(below)
         if counts[voxel] < max_points:
             counts[voxel] += 1

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.tables.batching import stack_rows
-from asca_pillars.tables.cell_map import CellMap
+from asca_pillars.tables.cell_map import CellMap, join
 from asca_pillars.tables.convolution import Convolution, Shape
 
 SUBMANIFOLD = Convolution((3, 3, 3), (1, 1, 1), (1, 1, 1))
@@ -66,24 +66,22 @@ class VoxelTableBuilder:
         """One for each level; the first is filled by whoever finds the voxels."""
         for convolution in strided:
             self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
+        self._strides = [join(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)]
+        self._stays = [join(SUBMANIFOLD, level, level) for level in self.maps]
 
     def build(self) -> list[VoxelLevel[NDArray[Any]]]:
         """Tables for the active cells of `maps[0]`, level by level."""
-        before, levels = self.maps[0], [self._level(self.maps[0], 0)]
-        for number, (convolution, level) in enumerate(zip(self.strided, self.maps[1:], strict=True), start=1):
-            readers = convolution.outputs(before.shape, level.shape)
-            level.activate_joined([(before, readers)])
-            back = before.table(level, readers) if self.training else _none(convolution.taps)
-            strided = level.table(before, convolution.inputs(level.shape, before.shape))
-            levels.append(self._level(level, number)._replace(strided=strided, strided_back=back))
-            before = level
+        levels = [self._level(0)]
+        for number, stride in enumerate(self._strides, start=1):
+            stride.target.activate_joined([(stride.source, stride.outputs)])
+            strided = stride.table()
+            back = stride.inverse() if self.training else _none(strided.shape[1])
+            levels.append(self._level(number)._replace(strided=strided, strided_back=back))
         return levels
 
-    def _level(self, level: CellMap, number: int) -> VoxelLevel[NDArray[Any]]:
-        same = _none(SUBMANIFOLD.taps)
-        if self.submanifold[number]:
-            same = level.table(level, SUBMANIFOLD.inputs(level.shape, level.shape))
-        return VoxelLevel(level.cells, same, _none(0), _none(0))
+    def _level(self, number: int) -> VoxelLevel[NDArray[Any]]:
+        same = self._stays[number].table() if self.submanifold[number] else _none(SUBMANIFOLD.taps)
+        return VoxelLevel(self.maps[number].cells, same, _none(0), _none(0))
 
 
 def stack_voxel_levels(

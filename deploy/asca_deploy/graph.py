@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from numpy.typing import NDArray
 
@@ -14,6 +14,10 @@ class Tensor(NamedTuple):
 
     type: str
     shape: tuple[int | None, ...]
+
+
+Interface: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor]]
+"""Inputs and outputs of a graph."""
 
 
 class Session(Protocol):

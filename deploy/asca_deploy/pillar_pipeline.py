@@ -9,25 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
-from asca_deploy.bundle import BACKBONE, ENCODER, NECK, Bundle, CanvasFormat
-from asca_deploy.graph import Session, Tensor, check_interface
+from asca_deploy.bundle import BACKBONE, NECK, Bundle, CanvasFormat
+from asca_deploy.graph import Session, check_interface
 from asca_deploy.pillar_backbone import HeadAnswer, Maps, PillarBackbone
+from asca_deploy.pillar_graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
 from asca_deploy.pipeline import Laps, Pipeline
-from asca_deploy.table_backbone import TableBackbone
-from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.decode import HeadMaps, decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.map_pooling import pool_pillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import FEATURES, KERNELS, PillarCounts, Pillars, pillarize
+from asca_pillars.pillars.pillarize import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.points.first_stage import FirstPass
-
-_NO_SPARSE_NECK = {
-    "openvino": "it needs outputs of fixed shapes",
-    "tensorrt": "it would build another engine for every number of pillars",
-}
+from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables, table_inputs
 
 
 class PreparedPillars(NamedTuple):
@@ -63,7 +58,7 @@ class PillarPipeline:
         load_kernels(KERNELS)  # here rather than in the first scan
         self.bundle = bundle
         self.spec: PillarSpec = bundle.spec
-        self._encoder = _open_encoder(folder, bundle)
+        self._encoder = open_encoder(folder, bundle)
         path, neck = folder / bundle.graphs[BACKBONE].file, 0 if bundle.refine is None else bundle.refine.bev_channels
         self.backbone = open_backbone(path, bundle, provider, precision, threads, neck)
         self.stages = ("pillarize", "encode", self.backbone.stage, "neck+head", "decode")
@@ -100,21 +95,7 @@ class PillarPipeline:
         if not len(pillars.cells):
             return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
         values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three
-        return self._encoder.run(("pillar_features",), values)[0]
-
-
-def _open_encoder(folder: Path, bundle: Bundle) -> Session:
-    # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
-    # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is
-    # still the fastest form, ten times faster than ScatterElements.
-    path = folder / bundle.graphs[ENCODER].file
-    inputs = {
-        "features": Tensor("float32", (None, len(FEATURES))),
-        "pillar_index": Tensor("int64", (None,)),
-        "point_counts": Tensor("int64", (None,)),
-    }
-    outputs = {"pillar_features": Tensor(bundle.pillar.canvas.type, (None, bundle.pillar.channels))}
-    return check_interface(path, providers.open_session(path, "cpu", "float32", threads=1), inputs, outputs)
+        return self._encoder.run((PILLAR_FEATURES,), values)[0]
 
 
 def open_backbone(
@@ -131,14 +112,14 @@ def open_backbone(
         BundleError: the graph cannot be run or is not what the manifest says.
         ProviderError: the provider does not start, or cannot run a sparse neck.
     """
-    if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
-        raise ProviderError(
-            f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
-            "choose provider cpu, or a bundle with a dense neck such as asca_small_sim"
-        )
+    check_neck(bundle, provider)
     session = providers.open_session(path, provider, precision, threads)
-    kind = CanvasBackbone if bundle.pillar.neck == "dense" else TableBackbone
-    return kind(path, session, bundle, neck_channels)
+    check_interface(path, session, *backbone_interface(bundle, neck_channels))
+    return (
+        CanvasBackbone(session, bundle)
+        if bundle.pillar.neck == "dense"
+        else TableBackbone(session, bundle, neck_channels)
+    )
 
 
 class Canvas:
@@ -185,29 +166,14 @@ class CanvasBackbone:
     each takes (nx + 1)(ny + 1) C values, 5 MiB in asca_small_sim_int8 and 20 MiB in its float form.
 
     Args:
-        path: of the graph, for messages.
-        session: that has opened it.
+        session: that has opened it, see `open_backbone`.
         bundle: the manifest.
-        neck_channels: of the graph's output NECK, if it has one.
-
-    Raises:
-        BundleError: the graph's inputs and outputs are not those of this bundle.
     """
 
     stage = "scatter"
 
-    def __init__(self, path: Path, session: Session, bundle: Bundle, neck_channels: int = 0) -> None:
-        self._bundle, self._pools = bundle, bundle.spec.grid.pools
-        grid, section, anchors = bundle.spec.grid, bundle.pillar, bundle.spec.anchors.shape[2]
-        rows, columns = grid.map_shape
-        inputs = {"canvas": Tensor(section.canvas.type, (1, rows + 1, columns + 1, section.channels))}
-        outputs = {
-            name: Tensor("float32", (1, *grid.head_shape, channels * anchors))
-            for name, channels in zip(HeadMaps._fields, (bundle.spec.scores_per_anchor, 7, 2), strict=True)
-        }
-        if neck_channels:
-            outputs[NECK] = Tensor("float32", (1, *grid.head_shape, neck_channels))
-        self._session = check_interface(path, session, inputs, outputs)
+    def __init__(self, session: Session, bundle: Bundle) -> None:
+        self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
         self._free = [self.new_canvas()]
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
@@ -240,6 +206,67 @@ class CanvasBackbone:
     def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
         """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
         return _channels_first(self._session.run(HeadMaps._fields, {"canvas": canvas}))
+
+
+class PlacedPillars(NamedTuple):
+    """What the graph reads of one scan."""
+
+    features: NDArray[Any]
+    """(P, C), of a pooled map (cells, C)"""
+    tables: NeckTables[NDArray[np.int32]]
+
+
+class TableBackbone:
+    """backbone.onnx of a sparse neck, see `pillar_backbone.PillarBackbone`.
+
+    Tables are built in memory that is kept from scan to scan, as many builders as threads ever built at once; the
+    tables themselves belong to their scan.
+
+    Args:
+        session: that has opened it, see `open_backbone`.
+        bundle: the manifest.
+        neck_channels: of the graph's output NECK, if it has one.
+    """
+
+    stage = "tables"
+
+    def __init__(self, session: Session, bundle: Bundle, neck_channels: int = 0) -> None:
+        self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
+        self._channels = output_channels(bundle, neck_channels)
+        self._free = [self._new_builder()]
+
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
+        """Pillar features (P, C) with the tables that their cells, flat indices (P,), make."""
+        try:
+            builder = self._free.pop()  # atomic, as append is: two threads never get the same one
+        except IndexError:
+            builder = self._new_builder()
+        if self._pools:
+            pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
+        tables = builder.build(cells)
+        self._free.append(builder)
+        return PlacedPillars(pillar_features, tables)
+
+    def run(self, placed: PlacedPillars) -> HeadAnswer:
+        """Scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
+        return HeadAnswer(HeadMaps(*self._rows(placed, HeadMaps._fields)), placed.tables.head_cells)
+
+    def infer_with_neck(self, placed: PlacedPillars) -> FirstPass:
+        """As `run`, and the head's input (M, C), which a second stage reads; for graphs with the output NECK."""
+        *maps, neck = self._rows(placed, (*HeadMaps._fields, NECK))
+        return FirstPass(HeadMaps(*maps), neck, placed.tables.head_cells)
+
+    def _rows(self, placed: PlacedPillars, names: Sequence[str]) -> list[NDArray[np.float32]]:
+        if not len(placed.tables.head_cells):
+            return [np.empty((0, self._channels[name]), np.float32) for name in names]
+        given = {PILLAR_FEATURES: placed.features, **table_inputs(placed.tables)}
+        # A graph takes what its layers read.
+        return list(self._session.run(names, {name: given[name] for name in self._session.inputs}))
+
+    def _new_builder(self) -> NeckTableBuilder:
+        rule = self._bundle.pillar.active_cells
+        assert rule is not None
+        return NeckTableBuilder(*self._bundle.spec.grid.map_shape, rule)
 
 
 def _channels_first(channels_last: Sequence[NDArray[Any]]) -> Maps:

@@ -1,13 +1,13 @@
 """What the graphs of a pv_rcnn bundle take and give, by name."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import PvRcnnBundle, PvRcnnSection
-from asca_deploy.graph import Tensor
+from asca_deploy.graph import Interface, Tensor
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.points.ball_query import ball_query
 from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls, VoxelScan, VoxelSetSettings
@@ -19,9 +19,6 @@ OUT = "out"
 """Output of voxels.onnx: conv_out. The others have the names of sources."""
 
 _KEPT_BYTES = 64 << 20
-
-Interface: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor]]
-"""Inputs and outputs of a graph."""
 
 
 def map_channels(bundle: PvRcnnBundle) -> int:

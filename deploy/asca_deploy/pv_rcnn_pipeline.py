@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
-from asca_deploy.graph import Session, check_interface
+from asca_deploy.graph import Interface, Session, check_interface
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_deploy.pv_rcnn_graphs import (
     OUT,
-    Interface,
     backbone_interface,
     balls_around,
     deform_inputs,

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from asca_deploy.bundle import AnyBundle
 from asca_deploy.manifest import essentials, graph_files
+from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
@@ -47,7 +48,7 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
         example,
         path,
         input_names=["features", "pillar_index", "point_counts"],
-        output_names=["pillar_features"],
+        output_names=[PILLAR_FEATURES],
         dynamic_shapes=({0: rows}, {0: rows}, {0: cells}),
     )
 

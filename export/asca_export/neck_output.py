@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from asca_deploy.bundle import NECK
+from asca_export.sparse_graphs import JOINED
 from asca_pillars.errors import ExportError
 
 
@@ -24,7 +25,7 @@ def add_neck_output(backbone: onnx.ModelProto, gains: NDArray[np.float32] | None
     """
     model = onnx.ModelProto()
     model.CopyFrom(backbone)
-    joined = [node for node in model.graph.node if node.op_type == "Concat"]
+    joined = [node for node in model.graph.node if node.op_type == "Concat" or node.output[0] == JOINED]
     types = {value.name: value.type.tensor_type for value in onnx.shape_inference.infer_shapes(model).graph.value_info}
     kind = types.get(joined[-1].output[0]) if joined else None
     if kind is None or not kind.shape.dim[-1].dim_value:

@@ -1,10 +1,12 @@
 """`SparseBackbone` -> backbone.onnx: for each layer Concat (row of zeros), Gather, Reshape, Gemm, Relu.
 
+The head reads the rows of all upsamplings by one more Gather.
+
 In 8 bits all rows are uint8 from one Gemm to the next. Gemm stands between DequantizeLinear and QuantizeLinear, which
 runtimes join into one integer operator; the quantization's zero point is the ReLU.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import STEP_VALUE
 from asca_export.graphs import OPSET
 from asca_export.quantize import WEIGHT_STEPS
@@ -20,7 +23,8 @@ from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.tables.neck_tables import NeckTables, table_inputs
 
-FEATURES = "pillar_features"
+JOINED = f"{HEAD}.joined"
+"""What the head's product reads, by name."""
 _TINY = 1e-12
 
 
@@ -65,22 +69,20 @@ class _Graph:
         self.row_type = np.dtype(np.uint8 if steps else np.float32)
 
     def build(self) -> onnx.GraphProto:
-        backbone, rows, maps = self.backbone, FEATURES, []
+        backbone, rows, maps = self.backbone, PILLAR_FEATURES, []
         element = helper.np_dtype_to_tensor_dtype(self.row_type)
         self.inputs[rows] = helper.make_tensor_value_info(rows, element, ["pillars", backbone.channels])
         missing = backbone.empty.numpy().astype(self.row_type)
-        for number, level in enumerate(backbone.levels):
+        for level in backbone.levels:
             for layer in level.convolutions:
                 taps = backbone.product(layer.name).in_features // len(missing)
                 read = self._gather(layer.name, rows, missing, layer.table, taps)
                 rows = self._product(layer.name, read)
                 missing = np.zeros(backbone.product(layer.name).out_features, self.row_type)
             channels = backbone.product(level.upsample).out_features // level.stride**2
-            upsampled = self._reshape(level.upsample, self._product(level.upsample, rows), channels)
-            nothing = np.zeros(channels, self.row_type)
-            maps.append(self._gather(f"head{number}", upsampled, nothing, level.places, 0))
-        joined = self._node("Concat", HEAD, "joined", *maps, axis=1)
-        outputs = self._product(HEAD, joined)
+            maps.append(self._reshape(level.upsample, "pixels", self._product(level.upsample, rows), channels))
+        places = [level.places for level in backbone.levels]
+        outputs = self._product(HEAD, self._joined(maps, places, channels))
         sizes = self._constant(HEAD, "channels", np.array(backbone.head_channels, np.int64))
         self.nodes.append(
             helper.make_node("Split", [outputs, sizes], list(HeadMaps._fields), name="split_head", axis=1)
@@ -97,15 +99,37 @@ class _Graph:
         )
 
     def _gather(self, owner: str, rows: str, missing: NDArray[Any], table: str, taps: int) -> str:
-        """Rows by the table, the row `missing` behind the last: (M, taps * C); by places (M,) where taps is 0."""
-        shape: list[str | int] = [f"{table}_rows", taps] if taps else ["head_cells"]
-        self.inputs[table] = helper.make_tensor_value_info(table, TensorProto.INT32, shape)
+        """Rows by the table, the row `missing` behind the last: (M, taps * C)."""
+        self.inputs[table] = helper.make_tensor_value_info(table, TensorProto.INT32, [f"{table}_rows", taps])
         padded = self._node("Concat", owner, "padded", rows, self._constant(owner, "missing", missing[None]), axis=0)
         gathered = self._node("Gather", owner, "gathered", padded, table, axis=0)
-        return self._reshape(owner, gathered, taps * len(missing)) if taps else gathered
+        return self._reshape(owner, "rows", gathered, taps * len(missing))
 
-    def _reshape(self, owner: str, rows: str, width: int) -> str:
-        return self._node("Reshape", owner, "rows", rows, self._constant(owner, "shape", np.array([-1, width])))
+    def _joined(self, maps: Sequence[str], places: Sequence[str], channels: int) -> str:
+        """Rows of several maps, picked by places (H,) of each, side by side: (H, maps * channels).
+
+        By one gather from all maps, one after the other with a row of zeros behind each: with one from each of them,
+        what they give would have to be copied once more, row by row, to stand side by side.
+        """
+        rows, indices, first = [], [], ""
+        for number, (values, place) in enumerate(zip(maps, places, strict=True)):
+            owner = f"head{number}"
+            self.inputs[place] = helper.make_tensor_value_info(place, TensorProto.INT32, ["head_cells"])
+            rows += [values, self._constant(owner, "missing", np.zeros((1, channels), self.row_type))]
+            if number:
+                size = self._node("Shape", owner, "size", maps[number - 1], start=0, end=1)
+                count = self._node("Cast", owner, "count", size, to=TensorProto.INT32)
+                after = self._node("Add", owner, "after", count, self._constant(owner, "one", np.array([1], np.int32)))
+                first = self._node("Add", owner, "first", first, after) if first else after
+            indices.append(self._node("Add", owner, "places", place, first) if first else place)
+        by_map = self._reshape(HEAD, "by_map", self._node("Concat", HEAD, "places", *indices, axis=0), -1, len(maps))
+        by_cell = self._node("Transpose", HEAD, "by_cell", by_map)  # (H, maps)
+        gathered = self._node("Gather", HEAD, "gathered", self._node("Concat", HEAD, "maps", *rows, axis=0), by_cell)
+        return self._reshape(HEAD, "joined", gathered, len(maps) * channels)
+
+    def _reshape(self, owner: str, what: str, rows: str, width: int, count: int = -1) -> str:
+        shape = self._constant(owner, f"{what}_shape", np.array([count, width]))
+        return self._node("Reshape", owner, what, rows, shape)
 
     def _product(self, name: str, rows: str) -> str:
         """Gemm, and the ReLU unless it is the head's, whose results are always floating point."""

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from asca_deploy import sample_scan_path
 from asca_pillars.data.expected_input import ExpectedInput
-from asca_pillars.data.input_check import InputWarning, check_input
+from asca_pillars.data.input_check import InputWarning, _percentile, check_input
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
@@ -158,3 +160,12 @@ def test_too_few_points(count: int) -> None:
 
 def test_a_camera_view_crop_is_no_surprise_after_full_scans() -> None:
     assert check(street()[::6]) == []
+
+
+@given(
+    st.lists(st.floats(-100, 100, width=32), min_size=1, max_size=30),
+    st.sampled_from([0.0, 5.0, 10.0, 50.0, 80.0, 100.0]),
+)
+def test_percentiles_are_numpys(values: list[float], percent: float) -> None:
+    found = _percentile(np.sort(np.array(values, np.float32)), percent)
+    assert found == pytest.approx(np.percentile(np.array(values), percent), abs=1e-9)

@@ -23,6 +23,7 @@ CONVOLUTIONS = (
     map_convolution(3, stride=2, padding=1),
     map_convolution(3, padding=1),
     map_convolution(2, stride=2),
+    Convolution((1, 3, 3), (5, 1, 1), (0, 1, 1)),  # from a tall lattice to one that is one cell high
 )
 SHAPES = ((5, 8, 6), (1, 9, 4), (3, 3, 3), (63, 4, 3))
 
