@@ -1,8 +1,6 @@
 """The command `asca`: registers what `commands` holds. Each command imports what it needs when it runs."""
 
-import io
-import sys
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
@@ -17,9 +15,9 @@ from asca_pillars.commands.import_dataset import import_dataset
 from asca_pillars.commands.import_weights import import_weights
 from asca_pillars.commands.inspect import inspect
 from asca_pillars.commands.prepare import prepare
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.commands.simulate import simulate
 from asca_pillars.commands.train import train
-from asca_pillars.errors import AscaError, printable
 
 app = typer.Typer(
     help="LiDAR 3D detection: boxes from a point cloud on an ordinary CPU, and the pipeline that trains the model.",
@@ -43,23 +41,7 @@ app.command()(doctor)
 
 def main() -> None:
     """Run the command; what the user can mend is one line on stderr and exit code 2."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets `?` for `°`, not a traceback
-    try:
-        app()
-    except AscaError as error:
-        _fail(str(error))
-    except OSError as error:
-        _fail(f"{error.filename}: {error.strerror or error}" if error.filename else str(error.strerror or error))
-    except MemoryError as error:
-        _fail(f"not enough memory ({str(error) or 'no more is to be had'}); give it smaller input, or more memory")
-    except RecursionError:
-        _fail("the input is nested too deeply to be read; simplify the file or the option")
-
-
-def _fail(message: str) -> NoReturn:
-    print(f"asca: {printable(message)}", file=sys.stderr)
-    sys.exit(2)
+    run_command(app, "asca")
 
 
 @app.callback(invoke_without_command=True)

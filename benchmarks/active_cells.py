@@ -14,6 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.config import load_config, pillar_spec
 from asca_pillars.data.frames import read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
@@ -94,4 +95,4 @@ def _timed(builder: NeckTableBuilder, cells: NDArray[np.int64]) -> tuple[NeckTab
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

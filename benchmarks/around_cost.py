@@ -13,6 +13,7 @@ import numpy as np
 import typer
 
 from asca_deploy import Detector
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 
@@ -44,4 +45,4 @@ def _timed_ms(detector: Detector, points: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -17,6 +17,7 @@ import typer
 import asca_deploy
 import asca_pillars
 from asca_deploy import Detector, sample_scan_path
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.scans.scan_reader import read_scan
 
 ROOTS = [Path(package.__file__).parent for package in (asca_pillars, asca_deploy) if package.__file__]
@@ -55,4 +56,4 @@ def called_functions(detector: Detector, scan: Path) -> Counter[tuple[str, str]]
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

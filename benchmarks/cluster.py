@@ -34,6 +34,7 @@ from rich.console import Console
 from asca_pillars.cluster.shards import cut
 from asca_pillars.commands.detect_archive import DetectShard, bundle_digest
 from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import write_scan
 from tests.deploy.conftest import make_scan, write_bundle
@@ -271,4 +272,4 @@ def _left(folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -17,6 +17,8 @@ from typing import Annotated, NamedTuple
 
 import typer
 
+from asca_pillars.commands.run_command import run_command
+
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("asca_pillars", "deploy/asca_deploy", "export/asca_export")
 _ARRAY = re.compile(r"(np\.|npt\.)?(NDArray|ndarray|HeadMaps)\b")
@@ -114,4 +116,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

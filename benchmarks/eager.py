@@ -28,6 +28,7 @@ from asca_deploy.benchmark import compare
 from asca_deploy.providers import Precision, Provider
 from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.commands.bench_tables import comparison_table
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.config import pillar_spec
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
@@ -127,4 +128,4 @@ def map_difference(runtime: Detector, form: PaddedDetector, scans: Scans) -> tup
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

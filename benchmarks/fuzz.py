@@ -28,6 +28,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.errors import AscaError
 from benchmarks.fuzz_inputs import Kind, kinds
 
@@ -198,4 +199,4 @@ def _alarm() -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -14,6 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.score_threshold import MatchInput, match_class
 from asca_pillars.evaluation.kitti.states import is_type
@@ -65,4 +66,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

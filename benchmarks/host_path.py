@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import Bundle, default_bundle_path, load_bundle, sample_scan_path
 from asca_deploy.detector import usable_points
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.input_check import check_input
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
@@ -131,4 +132,4 @@ def in_numpy() -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

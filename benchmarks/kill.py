@@ -30,6 +30,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit
 
 POLL_S = 0.002
@@ -249,4 +250,4 @@ def _weights(out: Path) -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -17,6 +17,7 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, KittiResults, evaluate
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from tests.evaluation.kitti.brute_force import ReferenceCurve, brute_force
@@ -154,4 +155,4 @@ def _peak_mib() -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -16,6 +16,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.boxes.box_split import BoxSplit
 
 TOPIC, FRAME_ID = "/points", "lidar"
@@ -102,4 +103,4 @@ def point_cloud2(store: Any, time_ns: int, points: NDArray[np.float32]) -> Any:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -27,6 +27,7 @@ from rich.progress import Progress
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.resident_memory import peak_memory_mib, resident_mib
 from asca_deploy.providers import Precision, Provider
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.files import atomic_path
@@ -106,4 +107,4 @@ def _resident() -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

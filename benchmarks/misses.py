@@ -15,6 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.score_threshold import MatchInput, match_class
 from asca_pillars.evaluation.kitti.states import is_type
@@ -67,4 +68,4 @@ def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

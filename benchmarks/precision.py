@@ -21,6 +21,7 @@ from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.box_differences import box_difference
 from asca_deploy.providers import Precision, Provider
 from asca_export.parity import COMPARED_ANCHORS
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ProviderError
@@ -114,4 +115,4 @@ def _best_anchors(logits: NDArray[np.float32]) -> tuple[NDArray[np.int64], ...]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

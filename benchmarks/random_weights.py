@@ -20,6 +20,7 @@ from torch import nn
 
 from asca_deploy import Bundle, sample_scan_path
 from asca_export.exporter import MIN_SCANS, export_bundle
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.config import load_config
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError
@@ -85,4 +86,4 @@ def random_weights(config: str, points: NDArray[np.float32], neck: Neck | None =
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

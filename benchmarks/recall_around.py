@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from asca_deploy import Detector
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.evaluation.kitti.operating_point import wilson_interval
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
@@ -185,4 +186,4 @@ def _points(values: NDArray[np.float64]) -> str:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

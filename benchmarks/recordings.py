@@ -25,6 +25,7 @@ import typer
 from asca_deploy import Detections, Detector, ScanQueue, Tracker
 from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_bundle
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.evaluation.report import markdown_table
@@ -128,4 +129,4 @@ def _paced(data: Path, threads: int, count: int) -> str:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

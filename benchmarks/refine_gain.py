@@ -17,6 +17,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError
 from asca_pillars.evaluation.kitti.average_precision import evaluate
@@ -88,4 +89,4 @@ def moderate_ap(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

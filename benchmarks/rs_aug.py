@@ -32,6 +32,7 @@ from rich.progress import track
 from rich.table import Table
 from shapely.geometry import MultiPoint, Polygon
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.config import Config, InsertMethod, load_config
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.insertion.free_space import FreeSpace
@@ -275,4 +276,4 @@ def _draw(path: Path, split: KittiSplit, settings: Config, frame_id: str) -> Non
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -24,6 +24,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.kitti import in_image
 from asca_pillars.sim.annotation import label_camera_view
 from asca_pillars.sim.casting.raycast import cast
@@ -137,4 +138,4 @@ def _draw(config: SimulationConfig, seed: int, index: int) -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -25,6 +25,7 @@ from asca_deploy.benchmark import Comparison, compare
 from asca_deploy.benchmark.box_comparison import Run
 from asca_deploy.benchmark.timing import Track, silently
 from asca_pillars.commands.bench_tables import comparison_table
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.system import cpu_model, default_threads, package_versions
@@ -94,4 +95,4 @@ def compare_views(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

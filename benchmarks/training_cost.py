@@ -18,6 +18,7 @@ import torch
 import typer
 from rich.progress import track
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.config import load_config
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.models.build import build_model
@@ -68,4 +69,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

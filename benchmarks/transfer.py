@@ -15,6 +15,7 @@ from typing import Annotated
 
 import typer
 
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.operating_point import OperatingPoint, best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth
@@ -65,4 +66,4 @@ def read_evaluation(data: Path, out: Path) -> ScoredFrames:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -16,6 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from asca_deploy import sample_scan_path
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.points.ball_query import ball_query, three_nearest
@@ -86,4 +87,4 @@ def measure(step: Callable[[], Any], rounds: int) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

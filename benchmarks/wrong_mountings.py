@@ -20,6 +20,7 @@ from rich.progress import track
 from rich.table import Table
 
 from asca_deploy import Detections, Detector
+from asca_pillars.commands.run_command import run_command
 from asca_pillars.commands.scan_input import ScanInput
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scan_settings import ScanSettings
@@ -113,4 +114,4 @@ def _found(right: Detections, boxes: NDArray[np.float32], found: Detections) -> 
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)
