@@ -29,7 +29,8 @@ def ball_query(
     """`ball_query._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
     found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
     at = centers, cells_of(centers, columns)
-    ball = offsets, squared_radius, share
+    steps = offsets[:, 0] * np.int32(columns.shape[1]) + offsets[:, 1]
+    ball = offsets, steps, squared_radius, share
     _ball_query(xyz, columns.order, columns.starts, *columns.shape, *at, *ball, sorted_xyz, found)
     return found
 
@@ -71,6 +72,7 @@ def nearest_in_cubes(
         given(types.float32, 2),
         given(types.int64, 2),
         given(types.int32, 2),
+        given(types.int32),
         types.float32,
     ),
     *(types.int64, written(types.float32, 2), written(types.int32, 2)),
@@ -84,26 +86,33 @@ def _ball_query(
     centers: _Floats,
     cells: _Cells,
     offsets: _Integers,
+    steps: _Integers,
     squared_radius: float,
     share: int,
     sorted_xyz: _Floats,
     found: _Integers,
 ) -> None:
+    """`steps`: of the `offsets`, from a column to another in `starts`."""
     for k in range(len(order)):
         for axis in range(3):
             sorted_xyz[k, axis] = xyz[order[k], axis]
-    samples = found.shape[1]
+    samples, reach = found.shape[1], 0
+    for visit in range(len(offsets)):
+        reach = max(reach, offsets[visit, 0], offsets[visit, 1])
     for query in range(len(centers)):
         x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
         row, column = cells[query, 0], cells[query, 1]
+        surrounded = reach <= row < ny - reach and reach <= column < nx - reach
+        own = row * nx + column
         count, begin, end, more = 0, 0, share, True
         while more and count < samples:  # first the first `share` points of each column, then those after them
             more = False
             for visit in range(len(offsets)):
-                other_row, other_column = row + offsets[visit, 0], column + offsets[visit, 1]
-                if other_row < 0 or other_row >= ny or other_column < 0 or other_column >= nx:
-                    continue
-                cell, inside = other_row * nx + other_column, 0
+                if not surrounded:
+                    other_row, other_column = row + offsets[visit, 0], column + offsets[visit, 1]
+                    if other_row < 0 or other_row >= ny or other_column < 0 or other_column >= nx:
+                        continue
+                cell, inside = own + steps[visit], 0
                 for k in range(starts[cell], starts[cell + 1]):
                     dx, dy, dz = sorted_xyz[k, 0] - x, sorted_xyz[k, 1] - y, sorted_xyz[k, 2] - z
                     if dx * dx + dy * dy + dz * dz < squared_radius:

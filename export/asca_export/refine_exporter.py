@@ -66,7 +66,8 @@ def export_refine_bundle(
         _copy_first_stage(first, proposing, folder)
         progress("Exporting the second stage and proving parity")
         path, classes = graphs.graph_path(folder, REFINE), len(model.spec.classes)
-        export_refine(detector.refiner, model.refine.neighbors, model.bev_channels, classes, path)
+        section = RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors)
+        export_refine(detector.refiner, section, classes, path)
         draft = draft_bundle(
             checkpoint._replace(config=dataclasses.replace(config, model=model)),
             scans,
@@ -74,7 +75,7 @@ def export_refine_bundle(
             command,
             pillar=proposing.pillar,
             backbone_gmac=proposing.backbone_gmac,
-            refine=RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors),
+            refine=section,
         )
 
         def prove(signed: Bundle) -> Parity:
