@@ -11,7 +11,7 @@ from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.points.bilinear import bilinear_cells, read_map
-from asca_pillars.points.farthest_points import farthest_points, near_boxes
+from asca_pillars.points.farthest_points import farthest_points, points_near_boxes
 from asca_pillars.points.proposals import ProposalSettings, propose
 
 
@@ -104,7 +104,7 @@ def proposed_from(
 ) -> Proposed:
     """What the second stage sees of `found`, the first stage's answer to the finite points (N, 4) of one scan."""
     proposals = propose(found.maps, spec, settings.proposals, found.cells)
-    near = points[near_boxes(points, proposals.boxes, settings.keypoints.margin_m)]
+    near = points_near_boxes(points, proposals.boxes, settings.keypoints.margin_m)
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
     return Proposed(proposals, keypoints, _read_neck(found, keypoints, spec))
 
