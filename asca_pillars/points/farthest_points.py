@@ -62,7 +62,7 @@ def _near_circles(
 
 def _farthest_points(xyz: NDArray[np.float32], count: int) -> NDArray[np.int32]:
     chosen = [0]
-    x, y, z = np.ascontiguousarray(xyz.T)
+    x, y, z = np.ascontiguousarray(xyz[:, :3].T)
     nearest = np.full(len(xyz), np.inf, np.float32)
     while len(chosen) < count:
         dx, dy, dz = x - x[chosen[-1]], y - y[chosen[-1]], z - z[chosen[-1]]

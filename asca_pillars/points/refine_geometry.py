@@ -140,5 +140,6 @@ def _keypoint_margin_m(keypoints: NDArray[np.float32], boxes: NDArray[np.float32
     if not len(keypoints) or not len(boxes):
         return 0.0
     reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
-    away = np.hypot(*(keypoints[:, None, axis] - boxes[None, :, axis] for axis in range(2))) - reach
+    dx, dy = (keypoints[:, None, axis] - boxes[None, :, axis] for axis in range(2))
+    away = np.sqrt(dx * dx + dy * dy) - reach  # several times as fast as hypot
     return max(float(away.min(axis=1).max()), 0.0)

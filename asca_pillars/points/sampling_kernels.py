@@ -1,4 +1,4 @@
-"""The loops of sorting and sampling, compiled; what they compute is said in `columns` and `farthest_points`."""
+"""The loops of `columns`, `farthest_points` and `bilinear`, compiled; what they compute is said there, in NumPy."""
 
 import math
 from typing import Any
@@ -64,6 +64,13 @@ def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats
     near = np.empty(points.shape, np.float32)
     circles = np.ascontiguousarray(centers), squared
     return near[: _near_circles(points, *circles, low[0], low[1], cell_m, slack, heads, links, near)]
+
+
+def read_map(rows: _Floats, cells: _Integers, weights: _Floats) -> _Floats:
+    """`bilinear._read_map`: rows (H * W, C), cells and weights (K, 4) -> (K, C)."""
+    read = np.zeros((len(cells), rows.shape[1]), np.float32)
+    _read_map(rows, cells, weights, read)
+    return read
 
 
 def _flat(columns: Columns) -> tuple[Any, ...]:
@@ -219,14 +226,14 @@ def _near_circles(
     used = 0
     for circle in range(len(centers)):
         x, y, reach = centers[circle, 0], centers[circle, 1], math.sqrt(squared[circle])
-        outer, inner_reach = reach + slack, max(reach - slack, np.float32(0))
+        outer, inner_reach = reach + slack, max(reach - slack, 0.0)
         first_row, last_row = max(int((y - outer - y_low) / cell_m), 0), min(int((y + outer - y_low) / cell_m), ny - 1)
         first, last = max(int((x - outer - x_low) / cell_m), 0), min(int((x + outer - x_low) / cell_m), nx - 1)
         for row in range(first_row, last_row + 1):
-            low: float = y_low + row * cell_m - y
+            low = y_low + row * cell_m - y
             near_y, far_y = max(low, -low - cell_m, 0.0), max(-low, low + cell_m)
             for column in range(first, last + 1):
-                left: float = x_low + column * cell_m - x
+                left = x_low + column * cell_m - x
                 near_x, far_x = max(left, -left - cell_m, 0.0), max(-left, left + cell_m)
                 if far_x * far_x + far_y * far_y < inner_reach * inner_reach:
                     heads[row, column] = _COVERED
@@ -249,3 +256,15 @@ def _near_circles(
             near[count, 0], near[count, 1], near[count, 2], near[count, 3] = x, y, points[i, 2], points[i, 3]
             count += 1
     return count
+
+
+@compiled(
+    *(given(types.float32, 2), given(types.int32, 2), given(types.float32, 2)),
+    written(types.float32, 2),
+)
+def _read_map(rows: _Floats, cells: _Integers, weights: _Floats, read: _Floats) -> None:
+    for k in range(len(cells)):
+        for corner in range(cells.shape[1]):
+            cell, weight = cells[k, corner], weights[k, corner]
+            for channel in range(rows.shape[1]):
+                read[k, channel] += rows[cell, channel] * weight
