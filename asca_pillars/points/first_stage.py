@@ -1,7 +1,7 @@
 """What the second stage asks of the first: proposals, keypoints and what the first stage's map says there."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,9 @@ class FirstPass(NamedTuple):
 
     maps: HeadMaps[NDArray[np.float32]]
     """On the head's map, or in rows of its active cells."""
-    neck: NDArray[np.float32]
-    """(H, W, C) the head's input on its map, or (M, C) at M active cells; beside these the map is zero."""
+    neck: NDArray[Any]
+    """(H, W, C) the head's input on its map, or (M, C) at M active cells; beside these the map is zero. float32,
+    or the uint8 steps of an 8-bit bundle."""
     cells: NDArray[np.int32] | None = None
     """(M,) flat index of the head cell of each row; None of maps."""
 

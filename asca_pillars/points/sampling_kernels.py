@@ -66,10 +66,10 @@ def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats
     return near[: _near_circles(points, *circles, low[0], low[1], cell_m, slack, heads, links, near)]
 
 
-def read_map(rows: _Floats, cells: _Integers, weights: _Floats) -> _Floats:
-    """`bilinear._read_map`: rows (H * W, C), cells and weights (K, 4) -> (K, C)."""
+def read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats) -> _Floats:
+    """`bilinear._read_map`: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
     read = np.zeros((len(cells), rows.shape[1]), np.float32)
-    _read_map(rows, cells, weights, read)
+    (_read_steps if rows.dtype == np.uint8 else _read_floats)(rows, cells, weights, read)
     return read
 
 
@@ -258,13 +258,14 @@ def _near_circles(
     return count
 
 
-@compiled(
-    *(given(types.float32, 2), given(types.int32, 2), given(types.float32, 2)),
-    written(types.float32, 2),
-)
-def _read_map(rows: _Floats, cells: _Integers, weights: _Floats, read: _Floats) -> None:
+def _read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats, read: _Floats) -> None:
     for k in range(len(cells)):
         for corner in range(cells.shape[1]):
             cell, weight = cells[k, corner], weights[k, corner]
             for channel in range(rows.shape[1]):
-                read[k, channel] += rows[cell, channel] * weight
+                read[k, channel] += np.float32(rows[cell, channel]) * weight
+
+
+_PLACES = given(types.int32, 2), given(types.float32, 2), written(types.float32, 2)
+_read_floats = compiled(given(types.float32, 2), *_PLACES)(_read_map)
+_read_steps = compiled(given(types.uint8, 2), *_PLACES)(_read_map)

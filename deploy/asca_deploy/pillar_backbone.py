@@ -5,6 +5,8 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_deploy.bundle import NECK
+from asca_deploy.graph import Session, Tensor
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.points.first_stage import FirstPass
 
@@ -35,3 +37,9 @@ class PillarBackbone(Protocol):
 
     def infer_with_neck(self, placed: Any) -> FirstPass:
         """As `run`, and the head's input; for graphs that a second stage follows."""
+
+
+def neck_output(session: Session, shape: tuple[int | None, ...]) -> Tensor:
+    """The output NECK of a graph: float32, or the uint8 steps of an 8-bit neck, which refine.onnx scales."""
+    declared = session.outputs.get(NECK)
+    return Tensor("uint8" if declared is not None and declared.type == "uint8" else "float32", shape)

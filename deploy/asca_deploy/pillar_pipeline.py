@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, ENCODER, NECK, Bundle, CanvasFormat
 from asca_deploy.graph import Session, Tensor, check_interface
-from asca_deploy.pillar_backbone import HeadAnswer, Maps, PillarBackbone
+from asca_deploy.pillar_backbone import HeadAnswer, Maps, PillarBackbone, neck_output
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_deploy.table_backbone import TableBackbone
 from asca_pillars.errors import ProviderError
@@ -206,7 +206,7 @@ class CanvasBackbone:
             for name, channels in zip(HeadMaps._fields, (bundle.spec.scores_per_anchor, 7, 2), strict=True)
         }
         if neck_channels:
-            outputs[NECK] = Tensor("float32", (1, *grid.head_shape, neck_channels))
+            outputs[NECK] = neck_output(session, (1, *grid.head_shape, neck_channels))
         self._session = check_interface(path, session, inputs, outputs)
         self._free = [self.new_canvas()]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import NECK, Bundle
 from asca_deploy.graph import Session, Tensor, check_interface
-from asca_deploy.pillar_backbone import HeadAnswer
+from asca_deploy.pillar_backbone import HeadAnswer, neck_output
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.map_pooling import pool_pillars
 from asca_pillars.points.first_stage import FirstPass
@@ -56,6 +56,8 @@ class TableBackbone:
         if neck_channels:
             self._channels[NECK] = neck_channels
         outputs = {name: Tensor("float32", (None, channels)) for name, channels in self._channels.items()}
+        if neck_channels:
+            outputs[NECK] = neck_output(session, (None, neck_channels))
         self._session = check_interface(path, session, inputs, outputs)
         self._free = [self._new_builder()]
 
