@@ -46,8 +46,9 @@ def group_balls(indices: NDArray[np.int32], count: int) -> GroupedBalls[NDArray[
     """
     samples = indices.shape[1]
     widths = group_widths(samples)
-    different = samples + 1 - (indices == indices[:, :1]).sum(axis=1)  # a point is repeated or the only one
-    group = np.searchsorted(np.array(widths), different).astype(np.uint8)
+    # The first point, and what repeats it; as a product, because sums along so short an axis are slow.
+    first = (indices == indices[:, :1]).astype(np.float32) @ np.ones(samples, np.float32)
+    group = np.searchsorted(np.array(widths, np.float32), samples + 1 - first).astype(np.uint8)
     order = np.argsort(group, kind="stable").astype(np.int32)
     rows = np.empty_like(order)
     rows[order] = np.arange(len(order), dtype=np.int32)
@@ -76,6 +77,9 @@ def gather_balls(
     if not len(points):
         return np.zeros((*indices.shape, points.shape[1]), np.float32)
     balls = np.take(points, indices, axis=0, mode="clip")
-    balls[..., :3] -= centers[:, None]
+    # Row by row: NumPy is slow along an axis as short as the coordinates'.
+    away = np.zeros((len(centers), points.shape[1]), np.float32)
+    away[:, :3] = centers
+    balls -= np.tile(away, (1, indices.shape[1])).reshape(balls.shape)
     balls[indices[:, 0] == len(points)] = 0
     return balls
