@@ -21,7 +21,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.points.ball_query import ball_query, three_nearest
 from asca_pillars.points.cube_neighbors import nearest_in_cubes
-from asca_pillars.points.farthest_points import farthest_points, near_boxes
+from asca_pillars.points.farthest_points import farthest_points, points_near_boxes
 from asca_pillars.points.roi_grid import roi_grid_points
 from asca_pillars.system import cpu_model
 from benchmarks.host_path import camera_view
@@ -53,7 +53,7 @@ def steps(points: NDArray[np.float32]) -> dict[str, Callable[[], Any]]:
     centers = points[rng.choice(len(points), BOXES), :3]
     sizes = np.tile(np.array([3.9, 1.6, 1.56], np.float32), (BOXES, 1))
     boxes = np.concatenate([centers, sizes, rng.uniform(-3, 3, (BOXES, 1)).astype(np.float32)], axis=1)
-    close = points[near_boxes(points, boxes, 2.0)]
+    close = points_near_boxes(points, boxes, 2.0)
     keypoints = points[farthest_points(points, 1024), :3]
     grid = roi_grid_points(boxes, GRID).reshape(-1, 3)
 
@@ -63,7 +63,7 @@ def steps(points: NDArray[np.float32]) -> dict[str, Callable[[], Any]]:
     return {
         "farthest points, 2048": lambda: farthest_points(points, 2048),
         "farthest points, 1024": lambda: farthest_points(points, 1024),
-        f"points near {BOXES} boxes": lambda: near_boxes(points, boxes, 2.0),
+        f"points near {BOXES} boxes": lambda: points_near_boxes(points, boxes, 2.0),
         f"farthest points, 1024 of {len(close)} near boxes": lambda: farthest_points(close, 1024),
         "balls of 1024 keypoints, 0.4 m": balls(points, keypoints, 0.4),
         "balls of 1024 keypoints, 0.8 m": balls(points, keypoints, 0.8),

@@ -143,13 +143,19 @@ def decode_candidates(
     )
 
 
-def suppress(candidates: Candidates, classes: tuple[ClassSpec, ...], post: PostProcess) -> Detections:
-    """The second half of `decode`: (n, 7) candidates -> those that the rotated NMS of their class keeps, best first."""
+def suppress(
+    candidates: Candidates, classes: tuple[ClassSpec, ...], post: PostProcess, most: int | None = None
+) -> Detections:
+    """The second half of `decode`: (n, 7) candidates -> those that the rotated NMS of their class keeps, best first.
+
+    Of each class no more than `most`.
+    """
     boxes, logits, labels, non_finite = candidates
+    limit = post.max_detections if most is None else min(most, post.max_detections)
     kept = []
     for label in range(len(classes)):
         own = np.flatnonzero(labels == label)
-        kept.append(own[rotated_nms(boxes[own], logits[own], post.nms_iou, post.max_detections)])
+        kept.append(own[rotated_nms(boxes[own], logits[own], post.nms_iou, limit)])
     survivors = np.concatenate(kept)
     best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
     return Detections(

@@ -14,6 +14,8 @@ _Integers = NDArray[np.int32]
 _Cells = NDArray[np.int64]
 _Three: TypeAlias = tuple[Any, Any, Any]
 
+_CROWDED = 4  # times the samples stand in the columns around a query: its ball is probably full
+
 _COLUMNS = given(types.int32), given(types.int32), types.int64, types.int64
 
 
@@ -29,7 +31,9 @@ def ball_query(
     """`ball_query._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
     found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
     at = centers, cells_of(centers, columns)
-    ball = offsets, squared_radius, share
+    widths = np.zeros(2 * int(offsets.max()) + 1, np.int32)
+    np.maximum.at(widths, offsets[:, 0] - offsets.min(), offsets[:, 1])
+    ball = offsets, widths, squared_radius, share
     _ball_query(xyz, columns.order, columns.starts, *columns.shape, *at, *ball, sorted_xyz, found)
     return found
 
@@ -71,6 +75,7 @@ def nearest_in_cubes(
         given(types.float32, 2),
         given(types.int64, 2),
         given(types.int32, 2),
+        given(types.int32),
         types.float32,
     ),
     *(types.int64, written(types.float32, 2), written(types.int32, 2)),
@@ -84,19 +89,38 @@ def _ball_query(
     centers: _Floats,
     cells: _Cells,
     offsets: _Integers,
+    widths: _Integers,
     squared_radius: float,
     share: int,
     sorted_xyz: _Floats,
     found: _Integers,
 ) -> None:
+    """`widths`: of each row of `offsets`, how many columns a ball can reach to either side."""
     for k in range(len(order)):
         for axis in range(3):
             sorted_xyz[k, axis] = xyz[order[k], axis]
-    samples = found.shape[1]
+    samples, reach = found.shape[1], len(widths) // 2
     for query in range(len(centers)):
         x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
         row, column = cells[query, 0], cells[query, 1]
-        count, begin, end, more = 0, 0, share, True
+        # Columns beside each other are one run of points: a ball that is not full is found in a few runs.
+        count, seen = 0, 0
+        for other_row in range(max(row - reach, 0), min(row + reach, ny - 1) + 1):
+            width = widths[other_row - row + reach]
+            first, last = max(column - width, 0), min(column + width, nx - 1)
+            if first > last:
+                continue
+            run, run_end = starts[other_row * nx + first], starts[other_row * nx + last + 1]
+            seen += run_end - run
+            if seen > _CROWDED * samples:
+                break
+            for k in range(run, run_end):
+                dx, dy, dz = sorted_xyz[k, 0] - x, sorted_xyz[k, 1] - y, sorted_xyz[k, 2] - z
+                found[query, min(count, samples - 1)] = order[k]  # stays if it is inside
+                count += dx * dx + dy * dy + dz * dz < squared_radius
+        begin, end, more = 0, share, seen > _CROWDED * samples or count >= samples
+        if more:
+            count = 0
         while more and count < samples:  # first the first `share` points of each column, then those after them
             more = False
             for visit in range(len(offsets)):
@@ -119,6 +143,14 @@ def _ball_query(
                 if count == samples:
                     break
             begin, end = share, len(order)
+        if count == samples:
+            continue
+        for place in range(1, count):
+            moved, other = found[query, place], place
+            while other and found[query, other - 1] > moved:
+                found[query, other] = found[query, other - 1]
+                other -= 1
+            found[query, other] = moved
         for rest in range(count, samples):
             found[query, rest] = found[query, 0] if count else len(xyz)
 

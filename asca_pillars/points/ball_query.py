@@ -27,10 +27,12 @@ _PAIRS_AT_ONCE = 1 << 22
 def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, samples: int) -> NDArray[np.int32]:
     """For each query the indices of up to `samples` points nearer than the radius: (N, 3), (Q, 3) -> (Q, samples).
 
-    The columns of a ball are visited in a pseudo-random order that depends on their number alone, the points of a
+    A ball of fewer points has them as they are stored, then its first one again and again; one without any has N.
+
+    The columns of a full ball are visited in a pseudo-random order that depends on their number alone, the points of a
     column as they are stored, and the first `samples` found are taken: at first no more than an eighth of them from one
     column, then, if that is not enough, the others. PointNet++ takes the first in the order of storage, which in a scan
-    are all of one ring. A query with fewer points repeats its first; one without any gets N.
+    are all of one ring.
 
     Args:
         points: (N, >=3) finite x, y, z in metres; N may be 0.
@@ -114,6 +116,7 @@ def _ball_query(
         np.add.at(counts, query, 1)
         taken = rank < samples
         found[query[taken], rank[taken]] = point[taken]
+    found[counts < samples] = np.sort(found[counts < samples], axis=1)
     return np.where(np.arange(samples) < counts[:, None], found, found[:, :1])
 
 

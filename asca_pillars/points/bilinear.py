@@ -5,6 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.kernels import load_kernels
+from asca_pillars.points.columns import KERNELS
+
 
 def bilinear_cells(
     points: NDArray[np.floating[Any]], x_m: NDArray[np.floating[Any]], y_m: NDArray[np.floating[Any]]
@@ -24,8 +27,17 @@ def bilinear_cells(
     return np.stack(cells, axis=1).astype(np.int32), np.stack(weights, axis=1).astype(np.float32)
 
 
-def read_map(rows: NDArray[np.float32], cells: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A map's features at K positions, (K, C), from its cells (H * W, C) and what `bilinear_cells` gave, (K, 4)."""
+def read_map(rows: NDArray[Any], cells: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A map's features at K positions, (K, C), from its cells (H * W, C) and what `bilinear_cells` gave, (K, 4).
+
+    Cells are float32, or uint8 steps, of which the result is in steps too.
+    """
+    kernels = load_kernels(KERNELS)
+    read = _read_map if kernels is None else kernels.read_map
+    return np.asarray(read(np.ascontiguousarray(rows), np.ascontiguousarray(cells), np.ascontiguousarray(weights)))
+
+
+def _read_map(rows: NDArray[Any], cells: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
     read = np.zeros((len(cells), rows.shape[1]), np.float32)
     for corner in range(cells.shape[1]):
         read += rows[cells[:, corner]] * weights[:, corner, None]

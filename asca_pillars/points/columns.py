@@ -27,21 +27,22 @@ class Columns(NamedTuple):
 
 
 def require_points(points: NDArray[Any]) -> NDArray[np.float32]:
-    """The positions (N, 3) of points (N, >=3), metres, as contiguous float32.
+    """Points (N, >=3), x, y, z in metres first, as contiguous float32; themselves if they are.
 
     Raises:
         ValueError: another shape, or a coordinate that is not finite, which has no column.
     """
     if points.ndim != 2 or points.shape[1] < 3:
         raise ValueError(f"points must have shape (N, 3 or more), not {points.shape}")
-    xyz = np.ascontiguousarray(points[:, :3], np.float32)
-    if not np.isfinite(xyz).all():
+    rows = np.ascontiguousarray(points, np.float32)
+    # Where every value is finite, looking at the coordinates alone would take longer.
+    if not np.isfinite(rows).all() and not np.isfinite(rows[:, :3]).all():
         raise ValueError("points must be finite; drop the others first")
-    return xyz
+    return rows
 
 
 def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
-    """Columns of points (N, 3), about `column_m` wide; N may be 0."""
+    """Columns of points (N, >=3), about `column_m` wide; N may be 0."""
     if not len(xyz):
         return Columns(
             np.empty(0, np.int32), np.zeros(2, np.int32), (np.float32(0), np.float32(0)), np.float32(1), (1, 1)

@@ -44,7 +44,7 @@ def nearest_in_cubes(
     offsets, reach_m = cube_cells_m(half_length_m, cells), np.float32(2 * half_length_m)
     kernels = load_kernels(KERNELS)
     if kernels is None:
-        return _nearest_in_cubes(xyz, centers, offsets, reach_m)
+        return _nearest_in_cubes(xyz[:, :3], centers[:, :3], offsets, reach_m)
     columns = sort_into_columns(xyz, float(reach_m))
     around = (centers[:, 1::-1].astype(np.float64) - columns.origin_m[::-1]) * float(columns.per_m)  # row, column
     reach = float(reach_m) * float(columns.per_m) + _ROUNDING

@@ -34,28 +34,35 @@ def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
     return np.asarray(kernels.farthest_points(xyz, count, sort_into_columns(xyz, _COLUMN_M)))
 
 
-def near_boxes(points: NDArray[Any], boxes: NDArray[np.floating[Any]], margin_m: float) -> NDArray[np.bool_]:
-    """Which points stand within `margin_m` of the circles around boxes seen from above: (N, >= 3), (R, 7) -> (N,).
+def points_near_boxes(
+    points: NDArray[np.float32], boxes: NDArray[np.floating[Any]], margin_m: float
+) -> NDArray[np.float32]:
+    """The points within `margin_m` of the circles around boxes seen from above: (N, 4), (R, 7) -> (M, 4).
 
     Keypoints are worth more where proposals are (PV-RCNN++, arXiv 2102.00463, section 4.1).
     """
-    x, y = (np.ascontiguousarray(points[:, axis], np.float32) for axis in range(2))
+    points = np.ascontiguousarray(points, np.float32)
     centers = boxes[:, :2].astype(np.float32)
     reach = (np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + margin_m).astype(np.float32)
-    squared = reach * reach
     kernels = load_kernels(KERNELS)
-    if kernels is not None:
-        return np.asarray(kernels.near_circles(x, y, centers, squared))
+    near = _near_circles if kernels is None else kernels.near_circles
+    return np.asarray(near(points, centers, reach * reach))
+
+
+def _near_circles(
+    points: NDArray[np.float32], centers: NDArray[np.float32], squared: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    x, y = (np.ascontiguousarray(points[:, axis]) for axis in range(2))
     near = np.zeros(len(points), bool)
     for (center_x, center_y), limit in zip(centers, squared, strict=True):
         dx, dy = x - center_x, y - center_y
         near |= dx * dx + dy * dy < limit
-    return near
+    return points[near]
 
 
 def _farthest_points(xyz: NDArray[np.float32], count: int) -> NDArray[np.int32]:
     chosen = [0]
-    x, y, z = np.ascontiguousarray(xyz.T)
+    x, y, z = np.ascontiguousarray(xyz[:, :3].T)
     nearest = np.full(len(xyz), np.inf, np.float32)
     while len(chosen) < count:
         dx, dy, dz = x - x[chosen[-1]], y - y[chosen[-1]], z - z[chosen[-1]]

@@ -1,7 +1,7 @@
 """What the second stage asks of the first: proposals, keypoints and what the first stage's map says there."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.points.bilinear import bilinear_cells, read_map
-from asca_pillars.points.farthest_points import farthest_points, near_boxes
+from asca_pillars.points.farthest_points import farthest_points, points_near_boxes
 from asca_pillars.points.proposals import ProposalSettings, propose
 
 
@@ -20,8 +20,9 @@ class FirstPass(NamedTuple):
 
     maps: HeadMaps[NDArray[np.float32]]
     """On the head's map, or in rows of its active cells."""
-    neck: NDArray[np.float32]
-    """(H, W, C) the head's input on its map, or (M, C) at M active cells; beside these the map is zero."""
+    neck: NDArray[Any]
+    """(H, W, C) the head's input on its map, or (M, C) at M active cells; beside these the map is zero. float32,
+    or the uint8 steps of an 8-bit bundle."""
     cells: NDArray[np.int32] | None = None
     """(M,) flat index of the head cell of each row; None of maps."""
 
@@ -104,7 +105,7 @@ def proposed_from(
 ) -> Proposed:
     """What the second stage sees of `found`, the first stage's answer to the finite points (N, 4) of one scan."""
     proposals = propose(found.maps, spec, settings.proposals, found.cells)
-    near = points[near_boxes(points, proposals.boxes, settings.keypoints.margin_m)]
+    near = points_near_boxes(points, proposals.boxes, settings.keypoints.margin_m)
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
     return Proposed(proposals, keypoints, _read_neck(found, keypoints, spec))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
+from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode_candidates, suppress
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
 
@@ -56,7 +56,8 @@ def propose(
     classes = tuple(replace(item, score_threshold=settings.score_threshold) for item in spec.classes)
     # Room for every candidate: the quotas choose, not a common limit.
     post = PostProcess(settings.nms_iou, settings.candidates, settings.candidates * len(classes))
-    return best_of_each_class(decode(maps, spec.anchors, classes, post, cells), settings.quotas)
+    candidates = decode_candidates(maps, spec.anchors, classes, post, cells)
+    return best_of_each_class(suppress(candidates, classes, post, max(settings.quotas)), settings.quotas)
 
 
 def best_of_each_class(detections: Detections, quotas: Sequence[int]) -> Detections:

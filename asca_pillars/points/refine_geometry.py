@@ -10,7 +10,7 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.points.ball_query import ball_query
 from asca_pillars.points.cube_neighbors import nearest_in_cubes
-from asca_pillars.points.farthest_points import near_boxes
+from asca_pillars.points.farthest_points import points_near_boxes
 from asca_pillars.points.first_stage import Proposed
 from asca_pillars.points.roi_grid import roi_grid_points
 
@@ -93,7 +93,7 @@ def refine_scan(
     # Points that no ball around a keypoint can reach are not worth sorting.
     all_boxes = proposed.proposals.boxes
     margin_m = max(settings.ball_radii_m) + _keypoint_margin_m(keypoints, all_boxes)
-    near = np.ascontiguousarray(points[near_boxes(points, all_boxes, margin_m)])
+    near = points_near_boxes(points, all_boxes, margin_m)
     grid = grid_neighbors(keypoints, proposals.boxes, settings)
     return RefineScan(
         points=near,
@@ -140,5 +140,6 @@ def _keypoint_margin_m(keypoints: NDArray[np.float32], boxes: NDArray[np.float32
     if not len(keypoints) or not len(boxes):
         return 0.0
     reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
-    away = np.hypot(*(keypoints[:, None, axis] - boxes[None, :, axis] for axis in range(2))) - reach
+    dx, dy = (keypoints[:, None, axis] - boxes[None, :, axis] for axis in range(2))
+    away = np.sqrt(dx * dx + dy * dy) - reach  # several times as fast as hypot
     return max(float(away.min(axis=1).max()), 0.0)

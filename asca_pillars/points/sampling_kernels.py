@@ -1,4 +1,4 @@
-"""The loops of sorting and sampling, compiled; what they compute is said in `columns` and `farthest_points`."""
+"""The loops of `columns`, `farthest_points` and `bilinear`, compiled; what they compute is said there, in NumPy."""
 
 import math
 from typing import Any
@@ -13,6 +13,9 @@ from asca_pillars.points.columns import Columns
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int32]
 _Bools = NDArray[np.bool_]
+
+_MAX_CELLS = 256  # along each axis, of those that tell which points are near circles
+_NO_CIRCLE, _COVERED = -1, -2
 
 _COLUMNS = (
     given(types.int32),
@@ -46,11 +49,28 @@ def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
     return chosen[:found]
 
 
-def near_circles(x: _Floats, y: _Floats, centers: _Floats, squared: _Floats) -> _Bools:
-    """Which points lie inside any of the circles: (N,), (N,), (R, 2) in metres, (R,) in m² -> (N,)."""
-    near = np.zeros(len(x), np.bool_)
-    _near_circles(x, y, np.ascontiguousarray(centers), squared, near)
-    return near
+def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats:
+    """`farthest_points._near_circles`: rows (N, 4), circles (R, 2) in metres, (R,) in m² -> rows (M, 4)."""
+    if not len(centers):
+        return points[:0]
+    reach = np.sqrt(squared)[:, None]
+    # By which float32 may misplace a point.
+    slack = np.float32(1e-3 + 1e-5 * (float(np.abs(centers).max()) + float(reach.max())))
+    low, high = (centers - reach - slack).min(axis=0), (centers + reach + slack).max(axis=0)
+    cell_m = np.float32(max(1.0, float((high - low).max()) / _MAX_CELLS))
+    nx, ny = (int(cells) + 1 for cells in (high - low) / cell_m)
+    room = int((np.square(2 * (reach + slack) / cell_m + 4)).sum())  # a circle's cells in either direction, or more
+    heads, links = np.full((ny, nx), _NO_CIRCLE, np.int32), np.empty((room, 2), np.int32)
+    near = np.empty(points.shape, np.float32)
+    circles = np.ascontiguousarray(centers), squared
+    return near[: _near_circles(points, *circles, low[0], low[1], cell_m, slack, heads, links, near)]
+
+
+def read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats) -> _Floats:
+    """`bilinear._read_map`: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
+    read = np.zeros((len(cells), rows.shape[1]), np.float32)
+    (_read_steps if rows.dtype == np.uint8 else _read_floats)(rows, cells, weights, read)
+    return read
 
 
 def _flat(columns: Columns) -> tuple[Any, ...]:
@@ -182,12 +202,70 @@ def _farthest_points(
 
 
 @compiled(
-    *(given(types.float32), given(types.float32), given(types.float32, 2), given(types.float32)),
-    written(types.boolean),
+    *(given(types.float32, 2), given(types.float32, 2), given(types.float32)),
+    *(types.float32, types.float32, types.float32, types.float32),
+    *(written(types.int32, 2), written(types.int32, 2), written(types.float32, 2)),
 )
-def _near_circles(x: _Floats, y: _Floats, centers: _Floats, squared: _Floats, near: _Bools) -> None:
+def _near_circles(
+    points: _Floats,
+    centers: _Floats,
+    squared: _Floats,
+    x_low: float,
+    y_low: float,
+    cell_m: float,
+    slack: float,
+    heads: _Integers,
+    links: _Integers,
+    near: _Floats,
+) -> int:
+    """`heads`: of each cell, whether a circle covers it or none is near, or where its list begins in `links`.
+
+    `links`: a circle whose border may run through the cell, and where the list goes on.
+    """
+    ny, nx = heads.shape
+    used = 0
     for circle in range(len(centers)):
-        center_x, center_y, limit = centers[circle, 0], centers[circle, 1], squared[circle]
-        for i in range(len(x)):
-            dx, dy = x[i] - center_x, y[i] - center_y
-            near[i] |= dx * dx + dy * dy < limit
+        x, y, reach = centers[circle, 0], centers[circle, 1], math.sqrt(squared[circle])
+        outer, inner_reach = reach + slack, max(reach - slack, 0.0)
+        first_row, last_row = max(int((y - outer - y_low) / cell_m), 0), min(int((y + outer - y_low) / cell_m), ny - 1)
+        first, last = max(int((x - outer - x_low) / cell_m), 0), min(int((x + outer - x_low) / cell_m), nx - 1)
+        for row in range(first_row, last_row + 1):
+            low = y_low + row * cell_m - y
+            near_y, far_y = max(low, -low - cell_m, 0.0), max(-low, low + cell_m)
+            for column in range(first, last + 1):
+                left = x_low + column * cell_m - x
+                near_x, far_x = max(left, -left - cell_m, 0.0), max(-left, left + cell_m)
+                if far_x * far_x + far_y * far_y < inner_reach * inner_reach:
+                    heads[row, column] = _COVERED
+                elif heads[row, column] != _COVERED and near_x * near_x + near_y * near_y < outer * outer:
+                    links[used, 0], links[used, 1] = circle, heads[row, column]
+                    heads[row, column] = used
+                    used += 1
+    per_m = np.float32(1) / cell_m
+    count = 0
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        along_x, along_y = (x - x_low) * per_m, (y - y_low) * per_m
+        if not (0 <= along_x < nx and 0 <= along_y < ny):
+            continue
+        link = heads[int(along_y), int(along_x)]
+        while link >= 0:
+            dx, dy = x - centers[links[link, 0], 0], y - centers[links[link, 0], 1]
+            link = _COVERED if dx * dx + dy * dy < squared[links[link, 0]] else links[link, 1]
+        if link == _COVERED:
+            near[count, 0], near[count, 1], near[count, 2], near[count, 3] = x, y, points[i, 2], points[i, 3]
+            count += 1
+    return count
+
+
+def _read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats, read: _Floats) -> None:
+    for k in range(len(cells)):
+        for corner in range(cells.shape[1]):
+            cell, weight = cells[k, corner], weights[k, corner]
+            for channel in range(rows.shape[1]):
+                read[k, channel] += np.float32(rows[cell, channel]) * weight
+
+
+_PLACES = given(types.int32, 2), given(types.float32, 2), written(types.float32, 2)
+_read_floats = compiled(given(types.float32, 2), *_PLACES)(_read_map)
+_read_steps = compiled(given(types.uint8, 2), *_PLACES)(_read_map)

@@ -104,12 +104,13 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
 def _second_stage(pipeline: RefinePipeline, first: FirstPass, points: NDArray[np.float32]) -> Stages:
     proposed = proposed_from(first, points, pipeline.spec, pipeline.section.seen)
     scan = refine_scan(points, proposed, proposed.proposals, pipeline.section.neighbors)
-    confidence, residuals = pipeline.refine(scan)
+    inputs = refine_inputs(scan)
+    confidence, residuals = pipeline.refine(inputs)
     found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec)
     return {
         "neck+head": {**_answered(HeadAnswer(first.maps, first.cells)), "neck": first.neck},
         "propose": _detections(proposed.proposals),
-        "neighbors": refine_inputs(scan),
+        "neighbors": inputs,
         "refine": {"confidence": confidence, "residuals": residuals},
         "suppress": _detections(found),
     }

@@ -37,20 +37,24 @@ def output_channels(bundle: Bundle, neck_channels: int = 0) -> dict[str, int]:
     return {**channels, NECK: neck_channels} if neck_channels else channels
 
 
-def backbone_interface(bundle: Bundle, neck_channels: int = 0) -> Interface:
-    """Of backbone.onnx: a pseudo-image -> maps, channels last; with a sparse neck rows and tables -> rows."""
+def backbone_interface(bundle: Bundle, neck_channels: int = 0, neck_type: str = "float32") -> Interface:
+    """Of backbone.onnx: a pseudo-image -> maps, channels last; with a sparse neck rows and tables -> rows.
+
+    NECK is float32, or the uint8 steps of an 8-bit neck, which refine.onnx scales: `neck_type`.
+    """
     section, channels = bundle.pillar, output_channels(bundle, neck_channels)
+    types = dict.fromkeys(channels, "float32") | {NECK: neck_type}
     if section.neck == "dense":
         rows, columns = bundle.spec.grid.map_shape
         canvas = Tensor(section.canvas.type, (1, rows + 1, columns + 1, section.channels))
         height, width = bundle.spec.grid.head_shape
-        outputs = {name: Tensor("float32", (1, height, width, count)) for name, count in channels.items()}
+        outputs = {name: Tensor(types[name], (1, height, width, count)) for name, count in channels.items()}
         return {"canvas": canvas}, outputs
     inputs = {PILLAR_FEATURES: Tensor(section.canvas.type, (None, section.channels))}
     for level in range(LEVELS):
         inputs |= {f"{kind}_{level}": Tensor("int32", (None, 9)) for kind in ("strided", "first", "same")}
         inputs[f"places_{level}"] = Tensor("int32", (None,))
-    return inputs, {name: Tensor("float32", (None, count)) for name, count in channels.items()}
+    return inputs, {name: Tensor(types[name], (None, count)) for name, count in channels.items()}
 
 
 def open_encoder(folder: Path, bundle: Bundle) -> Session:

@@ -114,7 +114,8 @@ def open_backbone(
     """
     check_neck(bundle, provider)
     session = providers.open_session(path, provider, precision, threads)
-    check_interface(path, session, *backbone_interface(bundle, neck_channels))
+    in_steps = NECK in session.outputs and session.outputs[NECK].type == "uint8"
+    check_interface(path, session, *backbone_interface(bundle, neck_channels, "uint8" if in_steps else "float32"))
     return (
         CanvasBackbone(session, bundle)
         if bundle.pillar.neck == "dense"

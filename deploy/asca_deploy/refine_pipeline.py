@@ -1,5 +1,6 @@
 """The pipeline of kind pillar_refine: a pillar detector proposes, a second graph refines (PV-RCNN, section 3)."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import PillarCounts
 from asca_pillars.points import ball_query, columns
+from asca_pillars.points.ball_layouts import BallGroup, GroupedBalls, gather_balls, group_balls, group_widths
 from asca_pillars.points.first_stage import FirstPass, proposed_from
 from asca_pillars.points.refine_geometry import ROI_FEATURES, RefineScan, refine_scan
 from asca_pillars.points.refined_detections import reported_detections
@@ -99,49 +101,55 @@ class RefinePipeline:
         proposed = proposed_from(raw.found, raw.points, self.spec, self.section.seen)
         laps.append(("propose", perf_counter()))
         scan = refine_scan(raw.points, proposed, proposed.proposals, self.section.neighbors)
+        inputs = refine_inputs(scan)
         laps.append(("neighbors", perf_counter()))
-        confidence, residuals = self.refine(scan)
+        confidence, residuals = self.refine(inputs)
         laps.append(("refine", perf_counter()))
         detections = reported_detections(proposed.proposals, confidence, residuals, self.spec)
         laps.append(("decode", perf_counter()))
         return detections
 
-    def refine(self, scan: RefineScan) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Confidence logits (R,) and residuals (R, 7) of the proposals of a scan."""
-        if not len(scan.roi_features):
+    def refine(self, inputs: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Confidence logits (R,) and residuals (R, 7) of the proposals of a scan, from its `refine_inputs`."""
+        if not len(inputs["roi_features"]):
             return np.empty(0, np.float32), np.empty((0, 7), np.float32)
-        feed = refine_inputs(scan)
-        confidence, residuals = self._second.run(OUTPUTS, {name: feed[name] for name in self._second.inputs})
+        confidence, residuals = self._second.run(OUTPUTS, {name: inputs[name] for name in self._second.inputs})
         return confidence, residuals
 
 
 def refine_inputs(scan: RefineScan) -> dict[str, NDArray[Any]]:
-    """What refine.onnx takes, by name, in the order in which the graph declares it."""
-    return {
-        "points": scan.points,
-        "keypoints": scan.keypoints,
-        "bev": scan.bev,
-        **{f"ball_{number}": indices for number, indices in enumerate(scan.ball_indices)},
-        "grid_points": scan.grid_points,
-        **{f"grid_{number}": indices for number, indices in enumerate(scan.grid_indices)},
-        "roi_features": scan.roi_features,
-    }
+    """What refine.onnx takes, by name, see `refine_interface`."""
+    inputs: dict[str, NDArray[Any]] = {"keypoints": scan.keypoints, "bev": scan.bev}
+    for number, indices in enumerate(scan.ball_indices):
+        inputs[f"ball_{number}"] = gather_balls(scan.points, scan.keypoints, indices)
+    inputs |= {"grid_points": scan.grid_points, "roi_features": scan.roi_features}
+    for number, indices in enumerate(scan.grid_indices):
+        names, balls = grid_names(number, indices.shape[1]), group_balls(indices, len(scan.keypoints))
+        inputs[names.rows] = balls.rows
+        for group, ball in zip(names.groups, balls.groups, strict=True):
+            inputs |= zip(group, ball, strict=True)
+    return inputs
+
+
+def grid_names(number: int, samples: int) -> GroupedBalls[str]:
+    """Names of the inputs for the balls around grid points, of one radius."""
+    groups = [(f"grid_{number}_queries_{width}", f"grid_{number}_members_{width}") for width in group_widths(samples)]
+    return GroupedBalls(tuple(BallGroup(*group) for group in groups), f"grid_{number}_rows")
 
 
 def refine_interface(section: RefineSection, classes: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Inputs and outputs of refine.onnx."""
     neighbors = section.neighbors
-    inputs = {
-        "points": Tensor("float32", (None, 4)),
-        "keypoints": Tensor("float32", (None, 3)),
-        "bev": Tensor("float32", (None, section.bev_channels)),
-        "grid_points": Tensor("float32", (None, 3)),
-        "roi_features": Tensor("float32", (None, classes + ROI_FEATURES)),
-    }
+    inputs = {"keypoints": Tensor("float32", (None, 3)), "bev": Tensor("float32", (None, section.bev_channels))}
     for number in range(len(neighbors.ball_radii_m)):
-        inputs[f"ball_{number}"] = Tensor("int32", (None, neighbors.ball_samples))
+        inputs[f"ball_{number}"] = Tensor("float32", (None, neighbors.ball_samples, 4))
+    inputs["grid_points"] = Tensor("float32", (None, 3))
+    inputs["roi_features"] = Tensor("float32", (None, classes + ROI_FEATURES))
     for number in range(len(neighbors.grid_radii_m)):
-        inputs[f"grid_{number}"] = Tensor("int32", (None, neighbors.grid_samples))
+        names = grid_names(number, neighbors.grid_samples)
+        inputs[names.rows] = Tensor("int32", (None,))
+        for group, width in zip(names.groups, group_widths(neighbors.grid_samples), strict=True):
+            inputs |= {group.queries: Tensor("int32", (None,)), group.members: Tensor("int32", (None, width))}
     return inputs, {"confidence": Tensor("float32", (None,)), "residuals": Tensor("float32", (None, 7))}
 
 

@@ -10,19 +10,59 @@ from asca_export.sparse_graphs import JOINED
 from asca_pillars.errors import ExportError
 
 
-def add_neck_output(backbone: onnx.ModelProto, gains: NDArray[np.float32] | None = None) -> onnx.ModelProto:
+def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
     """A copy of a backbone that also returns its head's input in float32, named NECK; the rest stays as it is.
 
-    It is (1, H, W, C) of a dense neck, (M, C) at the active head cells of a sparse one.
-
-    Args:
-        backbone: in floating point, or in 8 bits.
-        gains: (C,) factors of its channels: those of an 8-bit backbone are scaled so that all have steps of one size,
-            and this brings them back. None leaves them as they are.
+    It is (1, H, W, C) of a dense neck, (M, C) at the active head cells of a sparse one. Channels of an 8-bit backbone
+    are scaled so that all have steps of one size.
 
     Raises:
         ExportError: the graph has no such tensor.
     """
+    model, values, is_float = _with_output(backbone, TensorProto.FLOAT)
+    if not is_float:
+        model.graph.node.append(_in_float(model, values))
+        values = model.graph.node[-1].output[0]
+    model.graph.node.append(helper.make_node("Identity", [values], [NECK], name="neck"))
+    onnx.checker.check_model(model)
+    return model
+
+
+def add_neck_steps(backbone: onnx.ModelProto) -> tuple[onnx.ModelProto, float]:
+    """As `add_neck_output` of an 8-bit backbone, but in uint8 steps, with the size of a step.
+
+    That is a quarter of the memory, and nothing is computed for cells that no keypoint lies on. Where the head's input
+    is in floating point, or step 0 is not zero, it is `add_neck_output`, of which a step is 1.
+
+    Raises:
+        ExportError: the graph has no such tensor.
+    """
+    model, values, is_float = _with_output(backbone, TensorProto.UINT8)
+    if is_float:
+        return add_neck_output(backbone), 1.0
+    stored = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    step, zero = (stored[name] for name in _in_float(model, values).input[1:])
+    if zero.any() or zero.dtype != np.uint8:
+        return add_neck_output(backbone), 1.0
+    model.graph.node.append(helper.make_node("Identity", [values], [NECK], name="neck"))
+    onnx.checker.check_model(model)
+    return model, float(step)
+
+
+def scale_bev(refine: onnx.ModelProto, factors: NDArray[np.float32]) -> onnx.ModelProto:
+    """A copy of the second stage's graph whose input `bev` is multiplied by `factors` (C,) first."""
+    model = onnx.ModelProto()
+    model.CopyFrom(refine)
+    for node in model.graph.node:
+        node.input[:] = ["bev.values" if name == "bev" else name for name in node.input]
+    model.graph.initializer.append(numpy_helper.from_array(factors, "bev.factors"))
+    model.graph.node.insert(0, helper.make_node("Mul", ["bev", "bev.factors"], ["bev.values"], name="bev.values"))
+    onnx.checker.check_model(model)
+    return model
+
+
+def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelProto, str, bool]:
+    """A copy with a declared output NECK, the name of the head's input, and whether that is in floating point."""
     model = onnx.ModelProto()
     model.CopyFrom(backbone)
     joined = [node for node in model.graph.node if node.op_type == "Concat" or node.output[0] == JOINED]
@@ -32,17 +72,9 @@ def add_neck_output(backbone: onnx.ModelProto, gains: NDArray[np.float32] | None
         raise ExportError("the backbone's graph joins no maps; export the first stage again")
     output = onnx.ValueInfoProto(name=NECK)
     output.type.tensor_type.CopyFrom(kind)
-    output.type.tensor_type.elem_type = TensorProto.FLOAT
+    output.type.tensor_type.elem_type = elem_type
     model.graph.output.append(output)
-    values = joined[-1].output[0]
-    if kind.elem_type != TensorProto.FLOAT:
-        model.graph.node.append(_in_float(model, values))
-        values = model.graph.node[-1].output[0]
-    gains = np.ones(kind.shape.dim[-1].dim_value, np.float32) if gains is None else gains
-    model.graph.initializer.append(numpy_helper.from_array(gains, "neck.gains"))
-    model.graph.node.append(helper.make_node("Mul", [values, "neck.gains"], [NECK], name="neck"))
-    onnx.checker.check_model(model)
-    return model
+    return model, joined[-1].output[0], kind.elem_type == TensorProto.FLOAT
 
 
 def _in_float(model: onnx.ModelProto, steps: str) -> onnx.NodeProto:

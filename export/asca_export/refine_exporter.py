@@ -19,7 +19,7 @@ from asca_export import graphs
 from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import draft_bundle, export_bundle, require_parity_scans, write_proven
 from asca_export.int8 import MAX_LOGIT_ERROR, count_boxes, logit_error
-from asca_export.neck_output import add_neck_output
+from asca_export.neck_output import add_neck_output, add_neck_steps, scale_bev
 from asca_export.refine_graph import export_refine
 from asca_export.refine_parity import prove_refine_parity
 from asca_pillars.config import pillar_spec
@@ -66,7 +66,8 @@ def export_refine_bundle(
         _copy_first_stage(first, proposing, folder)
         progress("Exporting the second stage and proving parity")
         path, classes = graphs.graph_path(folder, REFINE), len(model.spec.classes)
-        export_refine(detector.refiner, model.refine.neighbors, model.bev_channels, classes, path)
+        section = RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors)
+        export_refine(detector.refiner, section, classes, path)
         draft = draft_bundle(
             checkpoint._replace(config=dataclasses.replace(config, model=model)),
             scans,
@@ -74,7 +75,7 @@ def export_refine_bundle(
             command,
             pillar=proposing.pillar,
             backbone_gmac=proposing.backbone_gmac,
-            refine=RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors),
+            refine=section,
         )
 
         def prove(signed: Bundle) -> Parity:
@@ -89,10 +90,9 @@ def export_refine_bundle(
         return _in_eight_bits(folder, bundle, first, eight_bit, scans, calibration)
 
 
-def _copy_first_stage(first: Path, proposing: Bundle, folder: Path, gains: NDArray[np.float32] | None = None) -> None:
+def _copy_first_stage(first: Path, proposing: Bundle, folder: Path) -> None:
     shutil.copyfile(first / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
-    backbone = add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file), gains)
-    onnx.save(backbone, graphs.graph_path(folder, BACKBONE))
+    onnx.save(add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file)), graphs.graph_path(folder, BACKBONE))
 
 
 def _in_eight_bits(
@@ -117,7 +117,11 @@ def _in_eight_bits(
             "not its 8-bit form: export that again"
         )
     expected = _detect(folder, scans)
-    _copy_first_stage(eight_bit, proposing, folder, _neck_gains(*stages, calibration))
+    shutil.copyfile(eight_bit / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
+    backbone, step = add_neck_steps(onnx.load(eight_bit / proposing.graphs[BACKBONE].file))
+    onnx.save(backbone, graphs.graph_path(folder, BACKBONE))
+    refine = graphs.graph_path(folder, REFINE)
+    onnx.save(scale_bev(onnx.load(refine), _neck_gains(*stages, calibration) * np.float32(step)), refine)
     report = dataclasses.replace(
         proposing.quantization, compared_scans=len(scans), logit_rms_error=error, boxes=sum(map(len, expected))
     )

@@ -2,18 +2,24 @@
 
 import copy
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from asca_deploy.refine_pipeline import OUTPUTS
+from asca_deploy.bundle import RefineSection
+from asca_deploy.refine_pipeline import grid_names, refine_interface
 from asca_export.graphs import export_graph
-from asca_pillars.models.refine.pillar_refiner import PillarRefiner, RefineInputs
+from asca_export.point_forms import GatheredSetAbstraction, GroupedSetAbstraction
+from asca_pillars.models.refine.keypoint_encoder import SourceRows
+from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.refine.set_abstraction import SetAbstraction
 from asca_pillars.models.refine.vector_pool import VectorPool
-from asca_pillars.points.refine_geometry import ROI_FEATURES, RefineSettings
+from asca_pillars.points.ball_layouts import BallGroup, GroupedBalls
+from asca_pillars.points.refine_geometry import RefineSettings
+
+_EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -43,7 +49,8 @@ def fold_norms(network: M) -> M:
             elif isinstance(module, nn.Sequential):
                 for index in range(1, len(module)):
                     if isinstance(norm := module[index], nn.BatchNorm1d):
-                        module[index] = _fold(module[index - 1], norm)  # type: ignore[arg-type]
+                        module[index - 1] = fuse_linear_bn_eval(module[index - 1], norm)  # type: ignore[type-var]
+                        module[index] = nn.Identity()
     return folded
 
 
@@ -67,51 +74,64 @@ def _scale_and_shift(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
 
 
 class _Flat(nn.Module):
-    """The second stage with one argument for each input of the graph."""
+    """The second stage in fast forms, with one argument for each of `inputs`, the names of the graph's."""
 
-    def __init__(self, refiner: PillarRefiner, balls: int) -> None:
+    def __init__(self, refiner: PillarRefiner, settings: RefineSettings, inputs: list[str]) -> None:
         super().__init__()
-        self.refiner, self.balls = refiner, balls
+        fast = fold_norms(refiner)
+        fast.encode.balls = nn.ModuleList(map(GatheredSetAbstraction, _set_abstractions(refiner.encode.balls)))
+        fast.head.pools = nn.ModuleList(map(GroupedSetAbstraction, _set_abstractions(refiner.head.pools)))
+        self.refiner, self.settings, self.inputs = fast, settings, inputs
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """(R,) confidence logits and (R, 7) residuals."""
-        points, keypoints, bev, *indices, roi_features = inputs
-        balls, grid_points, grids = indices[: self.balls], indices[self.balls], indices[self.balls + 1 :]
-        found = self.refiner(
-            RefineInputs(points, keypoints, bev, tuple(balls), grid_points, tuple(grids), roi_features)
+        named: Any = dict(zip(self.inputs, inputs, strict=True))
+        keypoints = named["keypoints"]
+        balls = [named[f"ball_{number}"] for number in range(len(self.settings.ball_radii_m))]
+        gathered: Any = SourceRows(None, None)  # type: ignore[arg-type]
+        features, _ = self.refiner.encode([gathered], keypoints, named["bev"], balls)
+        grids = [
+            GroupedBalls(
+                tuple(BallGroup(*(named[name] for name in group)) for group in names.groups), named[names.rows]
+            )
+            for names in _grids(self.settings)
+        ]
+        confidence, residuals = self.refiner.head(
+            keypoints, features, named["grid_points"], grids, named["roi_features"]
         )
-        return found.confidence, found.residuals
+        return confidence, residuals
 
 
-def export_refine(
-    refiner: PillarRefiner, settings: RefineSettings, bev_channels: int, classes: int, path: Path
-) -> None:
+def _grids(settings: RefineSettings) -> list[GroupedBalls[str]]:
+    return [grid_names(number, settings.grid_samples) for number in range(len(settings.grid_radii_m))]
+
+
+def _set_abstractions(modules: nn.ModuleList) -> list[SetAbstraction]:
+    found = [module for module in modules if isinstance(module, SetAbstraction)]
+    assert len(found) == len(modules)
+    return found
+
+
+def export_refine(refiner: PillarRefiner, section: RefineSection, classes: int, path: Path) -> None:
     """Write refine.onnx: see `asca_deploy.refine_pipeline.refine_interface`; every number of rows is dynamic."""
-    points, keypoints, rois = 24, 6, 3  # sizes of the example that the tracer sees; none is kept
-    cells = settings.grid_size**3
-    rng = np.random.default_rng(0)
-
-    def indices(rows: int, samples: int, among: int) -> Tensor:
-        return torch.from_numpy(rng.integers(0, among + 1, (rows, samples)).astype(np.int32))
-
-    balls, grids = len(settings.ball_radii_m), len(settings.grid_radii_m)
-    example = (
-        torch.rand(points, 4),
-        torch.rand(keypoints, 3),
-        torch.rand(keypoints, bev_channels),
-        *(indices(keypoints, settings.ball_samples, points) for _ in range(balls)),
-        torch.rand(rois * cells, 3),
-        *(indices(rois * cells, settings.grid_samples, keypoints) for _ in range(grids)),
-        torch.rand(rois, classes + ROI_FEATURES),
-    )
-    n, k, r = (torch.export.Dim(name) for name in ("point_rows", "keypoint_rows", "proposal_rows"))
-    rows = [n, k, k, *[k] * balls, cells * r, *[cells * r] * grids, r]
-    names = ["points", "keypoints", "bev", *(f"ball_{i}" for i in range(balls)), "grid_points"]
+    settings, (inputs, outputs) = section.neighbors, refine_interface(section, classes)
+    proposals, cells = torch.export.Dim("proposals"), settings.grid_size**3
+    sizes = dict.fromkeys(inputs, torch.export.Dim("keypoints")) | {"roi_features": proposals}
+    for names in _grids(settings):
+        for group in names.groups:
+            sizes |= dict.fromkeys(group, torch.export.Dim(group.queries))
+    of_cells = {"grid_points", *(names.rows for names in _grids(settings))}
+    sizes |= dict.fromkeys(of_cells, cells * proposals)
+    example = []
+    for name, (kind, shape) in inputs.items():
+        rows = _EXAMPLE_ROWS * (cells if name in of_cells else 1)
+        size = [rows if extent is None else extent for extent in shape]
+        example.append(torch.zeros(size, dtype=torch.int32) if kind == "int32" else torch.rand(size))
     export_graph(
-        _Flat(fold_norms(refiner), balls),
+        _Flat(refiner, settings, list(inputs)),
         example,
         path,
-        input_names=[*names, *(f"grid_{i}" for i in range(grids)), "roi_features"],
-        output_names=list(OUTPUTS),
-        dynamic_shapes=(tuple({0: size} for size in rows),),
+        input_names=list(inputs),
+        output_names=list(outputs),
+        dynamic_shapes=(tuple({0: sizes[name]} for name in inputs),),
     )

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
-from asca_deploy.refine_pipeline import RefinePipeline
+from asca_deploy.refine_pipeline import RefinePipeline, refine_inputs
 from asca_export.parity import MAP_TOLERANCE, YAW_TOLERANCE_RAD, nearest_partners, require_close
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
@@ -52,10 +52,11 @@ def prove_refine_parity(
         allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max()))
         worst = max(worst, require_close("neck", expected.neck, found.neck, allowed, number))
         proposed = proposed_from(found, points, model.spec, model.refine.seen)
-        inputs = refine_scan(points, proposed, proposed.proposals, model.refine.neighbors)
+        asked = refine_scan(points, proposed, proposed.proposals, model.refine.neighbors)
         with torch.inference_mode():
-            wanted = refiner(collate_scans([inputs]))
-        ours, theirs = (wanted.confidence.numpy(), wanted.residuals.numpy()), runtime.refine(inputs)
+            wanted = refiner(collate_scans([asked]))
+        ours = wanted.confidence.numpy(), wanted.residuals.numpy()
+        theirs = runtime.refine(refine_inputs(asked))
         for name, one, other in zip(("confidence", "residuals"), ours, theirs, strict=True):
             worst = max(worst, require_close(f"refine `{name}`", one, other, MAP_TOLERANCE, number))
         boxes, partners = (reported_detections(proposed.proposals, c, r, spec) for c, r in (ours, theirs))

@@ -8,7 +8,7 @@ from unittest.mock import patch
 import numpy as np
 from hypothesis import strategies as st
 
-_MODULES = ("columns", "farthest_points", "ball_query", "cube_neighbors")
+_MODULES = ("columns", "farthest_points", "ball_query", "bilinear", "cube_neighbors")
 
 
 def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:

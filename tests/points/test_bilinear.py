@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.points.bilinear import bilinear_cells
+from asca_pillars.points.bilinear import bilinear_cells, read_map
+from tests.points.clouds import both_forms
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -33,3 +34,14 @@ def test_cells_need_not_be_evenly_spaced() -> None:
     cells, weights = bilinear_cells(np.array([[2.5, 0.0]]), np.array([0.0, 1.0, 4.0]), np.array([0.0, 1.0]))
     assert cells.tolist() == [[1, 2, 4, 5]]
     assert weights[0] == pytest.approx([0.5, 0.5, 0, 0])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 20), st.sampled_from([np.float32, np.uint8]))
+def test_both_forms_read_the_same(seed: int, count: int, dtype: type[np.generic]) -> None:
+    rng = np.random.default_rng(seed)
+    rows = rng.uniform(0, 255, (30, 9)).astype(dtype)
+    cells = rng.integers(0, 30, (count, 4)).astype(np.int32)
+    weights = rng.random((count, 4), np.float32)
+    compiled, in_numpy = both_forms(read_map, rows, cells, weights)
+    assert compiled.shape == in_numpy.shape and compiled.tobytes() == in_numpy.tobytes()
+    np.testing.assert_allclose(compiled, (rows[cells] * weights[..., None]).sum(axis=1), rtol=1e-5)

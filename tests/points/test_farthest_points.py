@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.points.farthest_points import farthest_points, near_boxes
+from asca_pillars.points.farthest_points import farthest_points, points_near_boxes
 from tests.points.clouds import CLOUDS, both_forms, by_numpy, cloud
 
 
@@ -65,16 +65,33 @@ def test_a_stray_point_costs_no_memory() -> None:
     assert farthest_points(points, 20).tolist() == by_numpy(farthest_points, points, 20).tolist()
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(0, 6), st.floats(0, 5))
-def test_near_boxes(seed: int, count: int, margin_m: float) -> None:
+@given(st.integers(0, 2**32 - 1), st.integers(0, 6), st.floats(0, 5), st.sampled_from([0.0, 60.0, 3e4, 1e7]))
+def test_points_near_boxes(seed: int, count: int, margin_m: float, offset_m: float) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-20, 20, (200, 4)).astype(np.float32)
     boxes = rng.uniform([-20, -20, 0, 0.5, 0.5, 1, -3], [20, 20, 1, 5, 2, 2, 3], (count, 7)).astype(np.float32)
-    compiled, in_numpy = both_forms(near_boxes, points, boxes, margin_m)
-    assert (compiled == in_numpy).all()
+    points[:, :2] += offset_m
+    boxes[:, :2] += offset_m
+    points[0, :2] = -3e7  # a stray one
+    compiled, in_numpy = both_forms(points_near_boxes, points, boxes, margin_m)
+    assert compiled.tobytes() == in_numpy.tobytes() and compiled.shape == in_numpy.shape
+    if offset_m > 60:  # float32 rounds too much for shapely's answer
+        return
     reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + margin_m
     disks = [(shapely.Point(box[:2]), r) for box, r in zip(boxes, reach, strict=True)]
-    for near, point in zip(compiled, points, strict=True):
+    found = {row.tobytes() for row in compiled}
+    for point in points:
         away = [center.distance(shapely.Point(point[:2])) - r for center, r in disks]
         if not any(abs(gap) < 1e-4 for gap in away):
-            assert near == any(gap < 0 for gap in away)
+            assert (point.tobytes() in found) == any(gap < 0 for gap in away)
+
+
+def test_points_near_circles_of_any_size() -> None:
+    """Cells that a circle covers, reaches or leaves out, and points on their borders."""
+    rng = np.random.default_rng(0)
+    points = (rng.integers(-400, 400, (20000, 4)) / 8).astype(np.float32)
+    sizes = [0.01, 0.5, 3.0, 40.0]
+    boxes = np.array([[x, 10 - x, 0, size, size, 1, 0] for x, size in zip((-30, 20, 3, 5), sizes, strict=True)])
+    for some in (boxes[:2], boxes[1:3], boxes):
+        compiled, in_numpy = both_forms(points_near_boxes, points, some, 0.25)
+        assert 0 < len(compiled) < len(points) and compiled.tobytes() == in_numpy.tobytes()
