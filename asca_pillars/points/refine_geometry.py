@@ -1,5 +1,6 @@
 """What the host computes for the second stage of one scan: neighbours of keypoints and of the grids of proposals."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -36,7 +37,8 @@ class RefineSettings:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if min(value if isinstance(value, tuple) else (value,), default=0) <= 0:
+            values = value if isinstance(value, tuple) else (value,)
+            if not values or not all(0 < each < math.inf for each in values):
                 raise ConfigError(f"{field.name} {value} of the second stage must be positive")
 
 

@@ -1,5 +1,7 @@
 """What the host computes for PV-RCNN of one scan: voxels, tables, keypoints and their neighbors (sections 3.1, 3.2)."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -24,6 +26,10 @@ MOST_VECTOR_CELLS = 7
 """Along an axis of a cube: more are more weights than keypoints to teach them."""
 
 
+def _are_radii(radii_m: Sequence[float]) -> bool:
+    return all(0 < radius < math.inf for radius in radii_m)
+
+
 @dataclass(frozen=True)
 class SourceBalls:
     """What voxel set abstraction aggregates of one source around a keypoint.
@@ -43,7 +49,7 @@ class SourceBalls:
     def __post_init__(self) -> None:
         if not self.radii_m or len(self.radii_m) != len(self.samples):
             raise ConfigError(f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must go in pairs")
-        if not min(self.radii_m) > 0 or min(self.samples) < 1:
+        if not _are_radii(self.radii_m) or min(self.samples) < 1:
             raise ConfigError(f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must be positive")
 
 
@@ -92,11 +98,11 @@ class VoxelSetSettings:
             value = getattr(self, item.name)
             if item.name in ("keypoints", "grid_size", "grid_samples") and value < 1:
                 raise ConfigError(f"{item.name} {value} must be at least 1")
-        if not self.grid_radii_m or not min(self.grid_radii_m) > 0:
+        if not self.grid_radii_m or not _are_radii(self.grid_radii_m):
             raise ConfigError(f"grid_radii_m {list(self.grid_radii_m)} must be positive, one at least")
         if not 0 <= self.vector_cells <= MOST_VECTOR_CELLS:
             raise ConfigError(f"vector_cells {self.vector_cells} must lie between 0 and {MOST_VECTOR_CELLS}")
-        if not min(self.scale_radii_m, default=1) > 0 or self.scale_samples < 2:
+        if not _are_radii(self.scale_radii_m) or self.scale_samples < 2:
             raise ConfigError(
                 f"scale_radii_m {list(self.scale_radii_m)} must be positive, scale_samples {self.scale_samples} at "
                 "least 2"

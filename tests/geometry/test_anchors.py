@@ -1,6 +1,8 @@
 """Anchors in metres, and encoding and decoding as an inverse pair."""
 
+import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,3 +79,12 @@ def test_impossible_classes_are_refused(settings: dict[str, object], named: str)
     ClassSpec(**possible)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=named):
         ClassSpec(**(possible | settings))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("height_m", 1e308), ("height_m", 0.0), ("z_m", 1e308), ("z_m", math.nan)]
+)
+def test_sizes_that_no_object_has(field: str, value: float) -> None:
+    changed: dict[str, Any] = {field: value}
+    with pytest.raises(ConfigError, match=field):
+        dataclasses.replace(KITTI_CLASSES[0], **changed)

@@ -42,7 +42,8 @@ def test_scans_without_anything_in_range(points: np.ndarray) -> None:
 def test_settings_that_cannot_be() -> None:
     with pytest.raises(ConfigError, match="must go in pairs"):
         SourceBalls("points", (0.4, 0.8), (16,))
-    with pytest.raises(ConfigError, match="must be positive"):
-        SourceBalls("points", (0.0,), (16,))
+    for radius in (0.0, float("inf"), float("nan")):
+        with pytest.raises(ConfigError, match="must be positive"):
+            SourceBalls("points", (0.4, radius), (16, 16))
     with pytest.raises(ConfigError, match="must be different"):
         VoxelSetSettings(sources=(SourceBalls("conv1", (0.4,), (4,)), SourceBalls("conv1", (0.8,), (4,))))
