@@ -11,7 +11,7 @@ from asca_pillars.errors import ConfigError
 
 ANCHOR_YAWS_RAD = (0.0, math.pi / 2)
 
-MOST_M = 1000.0  # no LiDAR sees farther, and float32 holds what is computed of it
+_MOST_M = 1000.0  # no LiDAR sees farther, and float32 holds what is computed of it
 
 IGNORED = -1  # label of a box that is neither to be found nor to be missed; others are indices into the classes
 
@@ -39,12 +39,12 @@ class ClassSpec:
         if not self.name:
             raise ConfigError("a class needs a name")
         for field in ("length_m", "width_m", "height_m"):
-            if not 0 < getattr(self, field) <= MOST_M:
+            if not 0 < getattr(self, field) <= _MOST_M:
                 raise ConfigError(
-                    f"{field} {getattr(self, field):g} of class {self.name} must be positive, at most {MOST_M:g}"
+                    f"{field} {getattr(self, field):g} of class {self.name} must be positive, at most {_MOST_M:g} m"
                 )
-        if not abs(self.z_m) <= MOST_M:
-            raise ConfigError(f"z_m {self.z_m:g} of class {self.name} must lie within {MOST_M:g} m of the LiDAR")
+        if not abs(self.z_m) <= _MOST_M:
+            raise ConfigError(f"z_m {self.z_m:g} of class {self.name} must lie within {_MOST_M:g} m of the LiDAR")
         if not 0 <= self.negative_iou <= self.positive_iou <= 1 or self.positive_iou == 0:
             raise ConfigError(
                 f"negative_iou {self.negative_iou:g} and positive_iou {self.positive_iou:g} of class "

@@ -39,7 +39,7 @@ class RefineSettings:
             value = getattr(self, field.name)
             values = value if isinstance(value, tuple) else (value,)
             if not values or not all(0 < each < math.inf for each in values):
-                raise ConfigError(f"{field.name} {value} of the second stage must be positive")
+                raise ConfigError(f"{field.name} {value} of the second stage must be positive and finite")
 
 
 class GridSettings(Protocol):

@@ -50,7 +50,9 @@ class SourceBalls:
         if not self.radii_m or len(self.radii_m) != len(self.samples):
             raise ConfigError(f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must go in pairs")
         if not _are_radii(self.radii_m) or min(self.samples) < 1:
-            raise ConfigError(f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must be positive")
+            raise ConfigError(
+                f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must be positive and finite"
+            )
 
 
 @dataclass(frozen=True)
@@ -99,13 +101,13 @@ class VoxelSetSettings:
             if item.name in ("keypoints", "grid_size", "grid_samples") and value < 1:
                 raise ConfigError(f"{item.name} {value} must be at least 1")
         if not self.grid_radii_m or not _are_radii(self.grid_radii_m):
-            raise ConfigError(f"grid_radii_m {list(self.grid_radii_m)} must be positive, one at least")
+            raise ConfigError(f"grid_radii_m {list(self.grid_radii_m)} must be positive and finite, one at least")
         if not 0 <= self.vector_cells <= MOST_VECTOR_CELLS:
             raise ConfigError(f"vector_cells {self.vector_cells} must lie between 0 and {MOST_VECTOR_CELLS}")
         if not _are_radii(self.scale_radii_m) or self.scale_samples < 2:
             raise ConfigError(
-                f"scale_radii_m {list(self.scale_radii_m)} must be positive, scale_samples {self.scale_samples} at "
-                "least 2"
+                f"scale_radii_m {list(self.scale_radii_m)} must be positive and finite, "
+                f"scale_samples {self.scale_samples} at least 2"
             )
         names = [each.source for each in self.sources]
         if len(set(names)) < len(names):

@@ -27,7 +27,7 @@ MaskRule = Literal["sub", "fine"]
 LEVELS = 3
 STRIDED = map_convolution(3, stride=2, padding=1)
 SAME = map_convolution(3, padding=1)
-_NO_TABLE = np.empty((0, 9), np.int32)
+_NO_TABLE = np.empty((0, SAME.taps), np.int32)
 
 Array = TypeVar("Array")
 

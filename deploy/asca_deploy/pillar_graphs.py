@@ -8,7 +8,7 @@ from asca_deploy.graph import Interface, Session, Tensor, check_interface
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.pillarize import FEATURES
-from asca_pillars.tables.neck_tables import LEVELS
+from asca_pillars.tables.neck_tables import LEVELS, SAME
 
 PILLAR_FEATURES = "pillar_features"
 """What encoder.onnx gives; the backbone of a sparse neck takes it under the same name."""
@@ -52,7 +52,7 @@ def backbone_interface(bundle: Bundle, neck_channels: int = 0, neck_type: str = 
         return {"canvas": canvas}, outputs
     inputs = {PILLAR_FEATURES: Tensor(section.canvas.type, (None, section.channels))}
     for level in range(LEVELS):
-        inputs |= {f"{kind}_{level}": Tensor("int32", (None, 9)) for kind in ("strided", "first", "same")}
+        inputs |= {f"{kind}_{level}": Tensor("int32", (None, SAME.taps)) for kind in ("strided", "first", "same")}
         inputs[f"places_{level}"] = Tensor("int32", (None,))
     return inputs, {name: Tensor(types[name], (None, count)) for name, count in channels.items()}
 

@@ -1,9 +1,9 @@
 """The pillar family's pipeline: pillarize, encode, scatter or tables, neck and head, decode (paper section 3)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.points.first_stage import FirstPass
 from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables, table_inputs
+
+T = TypeVar("T")
 
 
 class PreparedPillars(NamedTuple):
@@ -179,10 +181,7 @@ class CanvasBackbone:
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
         """Pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
-        try:
-            canvas = self._free.pop()  # atomic, as append is: two threads never get the same one
-        except IndexError:
-            canvas = self.new_canvas()
+        canvas = _take(self._free, self.new_canvas)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
         canvas.scatter(pillar_features, cells)
@@ -238,10 +237,7 @@ class TableBackbone:
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
         """Pillar features (P, C) with the tables that their cells, flat indices (P,), make."""
-        try:
-            builder = self._free.pop()  # atomic, as append is: two threads never get the same one
-        except IndexError:
-            builder = self._new_builder()
+        builder = _take(self._free, self._new_builder)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
         tables = builder.build(cells)
@@ -268,6 +264,14 @@ class TableBackbone:
         rule = self._bundle.pillar.active_cells
         assert rule is not None
         return NeckTableBuilder(*self._bundle.spec.grid.map_shape, rule)
+
+
+def _take(free: list[T], make: Callable[[], T]) -> T:
+    """One that is free, or a new one."""
+    try:
+        return free.pop()  # atomic, as append is: two threads never get the same one
+    except IndexError:
+        return make()
 
 
 def _channels_first(channels_last: Sequence[NDArray[Any]]) -> Maps:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import REFINE, Bundle, RefineSection
-from asca_deploy.graph import Session, Tensor, check_interface
+from asca_deploy.graph import Interface, Session, Tensor, check_interface
 from asca_deploy.pillar_pipeline import PillarPipeline, PreparedPillars
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.errors import BundleError
@@ -137,7 +137,7 @@ def grid_names(number: int, samples: int) -> GroupedBalls[str]:
     return GroupedBalls(tuple(BallGroup(*group) for group in groups), f"grid_{number}_rows")
 
 
-def refine_interface(section: RefineSection, classes: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def refine_interface(section: RefineSection, classes: int) -> Interface:
     """Inputs and outputs of refine.onnx."""
     neighbors = section.neighbors
     inputs = {"keypoints": Tensor("float32", (None, 3)), "bev": Tensor("float32", (None, section.bev_channels))}

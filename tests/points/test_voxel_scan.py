@@ -43,7 +43,7 @@ def test_settings_that_cannot_be() -> None:
     with pytest.raises(ConfigError, match="must go in pairs"):
         SourceBalls("points", (0.4, 0.8), (16,))
     for radius in (0.0, float("inf"), float("nan")):
-        with pytest.raises(ConfigError, match="must be positive"):
+        with pytest.raises(ConfigError, match="must be positive and finite"):
             SourceBalls("points", (0.4, radius), (16, 16))
     with pytest.raises(ConfigError, match="must be different"):
         VoxelSetSettings(sources=(SourceBalls("conv1", (0.4,), (4,)), SourceBalls("conv1", (0.8,), (4,))))
