@@ -109,7 +109,6 @@ def fill_pillars(
     cells: _Integers,
     counts: _Integers,
     kept: _Bools,
-    shuffled: _Integers,
     max_points: int,
     grid: PillarGrid,
 ) -> tuple[_Floats, _Integers, _Integers]:
@@ -117,44 +116,14 @@ def fill_pillars(
     point_counts = np.minimum(counts[kept], max_points)
     features = np.empty((point_counts.sum(), 9), np.float32)
     pillar_index = np.empty(len(features), np.int64)
-    stays, crowd, taken = np.ones(len(order), bool), np.empty((2, len(shuffled)), np.int64), np.zeros_like(counts)
-    _keep_first(counts, kept, shuffled, max_points, crowd, taken, stays)
     centers_m = grid.column_centers_m, grid.row_centers_m
-    _fill_pillars(points, order, cells, counts, kept, stays, *centers_m, features, pillar_index)
+    _fill_pillars(points, order, cells, counts, kept, max_points, *centers_m, features, pillar_index)
     return features, pillar_index, point_counts
 
 
 @compiled(
-    *(given(types.int64), given(types.boolean), given(types.int64), types.int64),
-    *(written(types.int64, 2), written(types.int64), written(types.boolean)),
-)
-def _keep_first(
-    counts: _Integers,
-    kept: _Bools,
-    shuffled: _Integers,
-    max_points: int,
-    crowd: _Integers,
-    taken: _Integers,
-    stays: _Bools,
-) -> None:
-    start = crowded = 0
-    for pillar in range(len(counts)):
-        end = start + counts[pillar]
-        if kept[pillar] and end - start > max_points:
-            for position in range(start, end):
-                crowd[0, crowded] = position
-                crowd[1, crowded] = pillar
-                crowded += 1
-        start = end
-    for k in range(len(shuffled)):
-        position, pillar = crowd[0, shuffled[k]], crowd[1, shuffled[k]]
-        stays[position] = taken[pillar] < max_points
-        taken[pillar] += 1
-
-
-@compiled(
     *(given(types.float32, 2), given(types.uint32), given(types.int64), given(types.int64)),
-    *(given(types.boolean), given(types.boolean), given(types.float32), given(types.float32)),
+    *(given(types.boolean), types.int64, given(types.float32), given(types.float32)),
     *(written(types.float32, 2), written(types.int64)),
 )
 def _fill_pillars(
@@ -163,7 +132,7 @@ def _fill_pillars(
     cells: _Integers,
     counts: _Integers,
     kept: _Bools,
-    stays: _Bools,
+    max_points: int,
     column_centers_m: _Floats,
     row_centers_m: _Floats,
     features: _Floats,
@@ -175,10 +144,12 @@ def _fill_pillars(
         end += counts[pillar]
         if not kept[pillar]:
             continue
-        row = first
+        row, share, most = first, 0, min(max_points, end - start)
         x_sum = y_sum = z_sum = 0.0
         for position in range(start, end):
-            if stays[position]:
+            share += most
+            if share >= end - start:
+                share -= end - start
                 i = order[position]
                 for channel in range(4):
                     features[row, channel] = points[i, channel]

@@ -51,6 +51,6 @@ class PillarSpec(DetectorSpec):
         """How many scores each anchor has."""
         return len(self.classes) if self.anchor_scores == "every" else 1
 
-    def pillarize(self, points: NDArray[np.float32], rng: np.random.Generator | None = None) -> Pillars:
+    def pillarize(self, points: NDArray[np.float32]) -> Pillars:
         """Pillars of a scan (N, 4) in the LiDAR frame on this detector's grid, see `pillarize`."""
-        return pillarize(points, self.grid, self.limits, rng)
+        return pillarize(points, self.grid, self.limits)

@@ -4,7 +4,6 @@ Pillars are flat: the kept points of all pillars stand one after another, and `p
 is. Nothing is padded, so nothing needs to be masked later.
 """
 
-import zlib
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,7 +24,7 @@ to the mean of the pillar's kept points and to the pillar's center."""
 
 @dataclass(frozen=True)
 class PillarLimits:
-    """Upper bounds of one scan's input; a random subset is kept beyond them (P and N of the paper)."""
+    """Upper bounds of one scan's input; beyond them an even subset is kept (P and N of the paper), see `evenly`."""
 
     max_pillars: int = 12000
     max_points: int = 64
@@ -71,14 +70,11 @@ def pillarize(
     points: NDArray[np.float32],
     grid: PillarGrid,
     limits: PillarLimits,
-    rng: np.random.Generator | None = None,
 ) -> Pillars:
     """Sort a scan's points into pillars and compute their nine features (paper section 3.2).
 
     Args:
         points: (N, 4) float32 x, y, z in metres (LiDAR frame) and reflectance in [0, 1]; N may be 0.
-        rng: draws the subset kept beyond the limits. None seeds the draw by the points themselves, so that a
-            scan always gives the same pillars; training passes a generator.
 
     Raises:
         ValueError: if `points` is not (N, 4).
@@ -89,8 +85,8 @@ def pillarize(
     kernels = load_kernels(KERNELS)
     sort, fill = (_sort_points, _fill_pillars) if kernels is None else (kernels.sort_points, kernels.fill_pillars)
     order, cells, counts = sort(points, grid)
-    kept, shuffled = _draw(points, counts, limits, rng)
-    features, pillar_index, point_counts = fill(points, order, cells, counts, kept, shuffled, limits.max_points, grid)
+    kept = evenly(np.arange(len(cells)), len(cells), limits.max_pillars)
+    features, pillar_index, point_counts = fill(points, order, cells, counts, kept, limits.max_points, grid)
     return Pillars(
         features=features,
         pillar_index=pillar_index,
@@ -106,18 +102,14 @@ def pillarize(
     )
 
 
-def _draw(
-    points: NDArray[np.float32], counts: NDArray[np.int64], limits: PillarLimits, rng: np.random.Generator | None
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which pillars stay, (Q,) bool, and in which order the points of the crowded ones among them are taken, (K,)."""
-    kept = np.ones(len(counts), bool)
-    if len(counts) <= limits.max_pillars and counts.max(initial=0) <= limits.max_points:
-        return kept, np.empty(0, np.int64)
-    if rng is None:
-        rng = np.random.default_rng(zlib.crc32(points.data))
-    kept[rng.permutation(len(counts))[limits.max_pillars :]] = False
-    crowded = kept & (counts > limits.max_points)
-    return kept, rng.permutation(counts[crowded].sum())
+def evenly(places: NDArray[np.int64], counts: NDArray[np.int64] | int, most: int) -> NDArray[np.bool_]:
+    """Whether what stands at these places, from 0, of rows of these counts stays, if `most` of a row may.
+
+    What stays are even steps along the row: the share that random sampling would keep (paper section 3.2), of every
+    part of the row alike, and a scan always gives the same.
+    """
+    stay = np.minimum(most, counts)
+    return (places + 1) * stay // counts > places * stay // counts
 
 
 def _sort_points(
@@ -144,13 +136,12 @@ def _stable_argsort(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return order
 
 
-def _fill_pillars(  # noqa: PLR0917  (called with the arguments of its compiled form)
+def _fill_pillars(
     points: NDArray[np.float32],
     order: NDArray[np.int64],
     cells: NDArray[np.int64],
     counts: NDArray[np.int64],
     kept: NDArray[np.bool_],
-    shuffled: NDArray[np.int64],
     max_points: int,
     grid: PillarGrid,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
@@ -159,15 +150,11 @@ def _fill_pillars(  # noqa: PLR0917  (called with the arguments of its compiled 
     Args:
         order: the points inside, sorted by pillar; `cells` (Q,) and `counts` (Q,) describe the pillars.
         kept: (Q,) which pillars stay.
-        shuffled: 0..K-1 in any order, one for each point of the crowded pillars that stay: of these points, taken in
-            this order, the first `max_points` of each pillar stay.
     """
     pillar_of_point = np.repeat(np.arange(len(cells)), counts)
     stays = kept[pillar_of_point]
-    crowd = np.flatnonzero(stays & (counts > max_points)[pillar_of_point])[shuffled]
-    crowd = crowd[_stable_argsort(pillar_of_point[crowd])]
-    first = np.searchsorted(pillar_of_point[crowd], pillar_of_point[crowd])
-    stays[crowd[np.arange(len(crowd)) - first >= max_points]] = False
+    starts = np.cumsum(counts) - counts
+    stays &= evenly(np.arange(len(order)) - starts[pillar_of_point], counts[pillar_of_point], max_points)
 
     point_counts = np.minimum(counts[kept], max_points)
     features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centers_m(cells[kept]))

@@ -89,10 +89,10 @@ class PillarPreparation:
     active_cells: MaskRule | None = None
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedPillars:
-        """Pillars of a frame and the targets of its anchors; `rng` draws what the limits drop."""
+        """Pillars of a frame and the targets of its anchors; nothing is drawn."""
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
-        pillars = spec.pillarize(frame.points, rng)
+        pillars = spec.pillarize(frame.points)
         targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
         return PreparedPillars(pillars, self.place(pillars), targets)
 

@@ -1,7 +1,6 @@
 /** Points -> pillars -> pseudo-image (asca_pillars/pillars/pillarize.py, docs/BUNDLE.md). */
 
 import { cellOf } from "./grid.js";
-import { Generator, crc32 } from "./numpy_random.js";
 
 const FEATURES = 9;
 
@@ -14,7 +13,7 @@ const FEATURES = 9;
  */
 export function pillarize(points, grid, limits) {
   const { order, cells, counts } = sortByCell(points, grid);
-  const { kept, stays } = draw(points, counts, limits);
+  const { kept, stays } = chosen(counts, limits);
   const rows = stays.reduce((sum, stay) => sum + stay, 0);
   const pillars = kept.reduce((sum, keep) => sum + keep, 0);
   const found = {
@@ -87,33 +86,24 @@ function sortByCell(points, grid) {
   return { order, cells, counts };
 }
 
-/** Which pillars stay, and which of the sorted points; beyond the limits a random subset, the same for the same scan. */
-function draw(points, counts, limits) {
+/** Whether each of `count` things in a row stays, if `most` may: at even steps. */
+function evenly(count, most) {
+  const share = Math.min(most, count);
+  return Uint8Array.from({ length: count }, (_, k) =>
+    Math.floor(((k + 1) * share) / count) > Math.floor((k * share) / count) ? 1 : 0,
+  );
+}
+
+/** Which pillars stay, and which of the sorted points. */
+function chosen(counts, limits) {
   const total = counts.reduce((sum, count) => sum + count, 0);
-  const kept = new Uint8Array(counts.length).fill(1);
-  const stays = new Uint8Array(total).fill(1);
-  if (counts.length <= limits.max_pillars && counts.every((count) => count <= limits.max_points)) {
-    return { kept, stays };
-  }
-  const random = new Generator(crc32(new Uint8Array(points.buffer, points.byteOffset, points.byteLength)));
-  for (const pillar of random.permutation(counts.length).subarray(limits.max_pillars)) kept[pillar] = 0;
-  const crowd = [];
-  const pillarOfCrowd = [];
+  const kept = evenly(counts.length, limits.max_pillars);
+  const stays = new Uint8Array(total);
   let start = 0;
   counts.forEach((count, pillar) => {
-    if (!kept[pillar]) stays.fill(0, start, start + count);
-    else if (count > limits.max_points) {
-      for (let place = start; place < start + count; place++) {
-        crowd.push(place);
-        pillarOfCrowd.push(pillar);
-      }
-    }
+    if (kept[pillar]) stays.set(evenly(count, limits.max_points), start);
     start += count;
   });
-  const taken = new Int32Array(counts.length);
-  for (const index of random.permutation(crowd.length)) {
-    stays[crowd[index]] = taken[pillarOfCrowd[index]]++ < limits.max_points ? 1 : 0;
-  }
   return { kept, stays };
 }
 

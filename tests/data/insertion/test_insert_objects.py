@@ -202,7 +202,7 @@ def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -
     plain = dataclasses.replace(plain, data=dataclasses.replace(plain.data, prepared=str(folder)))
     rng = np.random.default_rng((plain.train.seed, 2, 4))
     frame = within_ranges(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid.ranges)
-    pillars = SPEC.pillarize(frame.points, rng)
+    pillars = SPEC.pillarize(frame.points)
     for settings_ in (plain, config("rs_aug", objects=0), config("gt_aug", objects=0)):
         sample = open_dataset(root, settings_, training=True).sample(2, 4)
         assert np.array_equal(sample.frame.points, frame.points) and np.array_equal(sample.frame.boxes, frame.boxes)
