@@ -79,7 +79,8 @@ class ChannelAttention(nn.Module):
         logits = products / (query_norm[:, None] * key_norm[None, :]) * self.temperature
         attention = torch.softmax(logits, dim=-1)  # (C, C)
         mixing = self.restore.weight @ attention @ self.value.weight  # (C, C)
-        return features + F.linear(features, mixing, self.restore.bias)
+        residual = torch.eye(len(mixing), device=mixing.device)  # as part of the product it takes no pass of its own
+        return F.linear(features, mixing + residual, self.restore.bias)
 
 
 def _norm(squared: Tensor) -> Tensor:
