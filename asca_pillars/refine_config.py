@@ -65,7 +65,7 @@ class RefineModel(Strict):
     Attributes:
         kind: tells the families of detectors apart.
         first_stage: a float32 bundle (folder, or name of one that ships) or a checkpoint of a pillar detector.
-        first_stage_identity: differs for different weights; `asca train` fills it in.
+        first_stage_identity: of its trained weights; `asca train` fills it in.
         bev_channels: of the first stage's map; `asca train` fills it in.
         spec: the first stage's, which `asca train` fills in; its score thresholds and suppression are those of the
             refined boxes.

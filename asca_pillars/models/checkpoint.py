@@ -1,9 +1,12 @@
 """Trained weights together with the configuration that they belong to."""
 
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from asca_pillars.config import Config
 from asca_pillars.data.expected_input import ExpectedInput
@@ -58,3 +61,16 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({reason})") from error
     return Checkpoint(config, detector.eval(), int(content["global_step"]), expected)
+
+
+def weights_sha256(weights: Mapping[str, Tensor]) -> str:
+    """SHA-256 of a network's trained arrays (its `state_dict`, on the CPU): names, shapes, values, sorted by name.
+
+    It is that of the weights as they are computed with: last.ckpt and weights.ckpt of one run may differ, because the
+    latter's were rounded to 16 bits.
+    """
+    digest = hashlib.sha256()
+    for name, array in sorted(weights.items()):
+        digest.update(f"{name} {tuple(array.shape)}\n".encode())
+        digest.update(array.numpy().tobytes())
+    return digest.hexdigest()

@@ -36,7 +36,7 @@ class FirstStage(Protocol):
 
     @property
     def identity(self) -> str:
-        """Differs for different weights."""
+        """Of its trained weights, whichever file they come from; differs for different ones."""
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
         """Run on one scan (N, 4)."""

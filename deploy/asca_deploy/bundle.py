@@ -60,8 +60,7 @@ class GraphFile(Strict):
         name = self.file
         if name in ("", ".", "..") or len(name) > _LONGEST_NAME or not name.isprintable() or set(name) & set("/\\:"):
             raise ConfigError(f"graph {name[:_LONGEST_NAME]!r} is not a file name")
-        if not re.fullmatch("[0-9a-f]{64}", self.sha256):
-            raise ConfigError(f"sha256 {self.sha256[:_LONGEST_NAME]!r} of graph {name} is no SHA-256")
+        _require_sha256(self.sha256, f"graph {name}")
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,11 @@ class Quantization(Strict):
 
 @dataclass(frozen=True)
 class Provenance(Strict):
-    """Where the weights come from, enough to make them again."""
+    """Where the weights come from, enough to make them again.
+
+    Raises:
+        ConfigError: the weights' hash is none.
+    """
 
     command: str
     """The command that trained the weights."""
@@ -194,6 +197,13 @@ class Provenance(Strict):
     versions: dict[str, str]
     """Python, torch, onnx and the like at export."""
     machine: str
+    weights_sha256: str | None = None
+    """Of the trained arrays, the same for every export of a checkpoint, see `asca_pillars.models.checkpoint`; None in
+    bundles made before it was recorded."""
+
+    def __post_init__(self) -> None:
+        if self.weights_sha256 is not None:
+            _require_sha256(self.weights_sha256, "the weights")
 
 
 @dataclass(frozen=True)
@@ -272,3 +282,8 @@ class PvRcnnBundle(AnyBundle):
         """With DEFORM where keypoints are shifted."""
         shifts = (DEFORM,) if self.pv_rcnn.settings.deformed else ()
         return (*GRAPHS[self.kind], *shifts)
+
+
+def _require_sha256(text: str, of: str) -> None:
+    if not re.fullmatch("[0-9a-f]{64}", text):
+        raise ConfigError(f"sha256 {text[:_LONGEST_NAME]!r} of {of} is no SHA-256")

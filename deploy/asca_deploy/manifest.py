@@ -33,7 +33,7 @@ _ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTI
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
 # Of `pillar`, `spec` and `spec.grid`, and what they are where they are not written: in bundles made before there were
 # sparse necks, other anchors and pooled maps. The graphs' metadata tells whether they were taken out.
-_LATER_KEYS = {"neck": "dense", "active_cells": None}
+_LATER_KEYS = {"neck": "dense"}
 _LATER_SPEC_KEYS = {"anchor_places": "cells", "anchor_scores": "own"}
 _LATER_GRID_KEYS = {"map": "warped"}
 _LARGEST_BYTES = 1 << 20
@@ -98,10 +98,8 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
 
 def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
     """The layout that a pillar detector's manifest writes down; keys that came later get their first meaning."""
-    if data.get("kind") == "pillar":
-        if "refine" in data:
-            raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {_EXPORT_AGAIN}")
-        data["refine"] = None
+    if data.get("kind") == "pillar" and "refine" in data:
+        raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {_EXPORT_AGAIN}")
     layout = None
     if isinstance(section := data.get("pillar"), dict):
         data["pillar"] = _LATER_KEYS | section
@@ -230,11 +228,16 @@ def _cut(reason: str) -> str:
 
 
 def _first_difference(written: Any, understood: Any) -> str | None:
-    """Path of the first value that was not taken as it is written, such as true for 1 or a default; or None."""
+    """Path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
+
+    A key that is understood as None need not be written: bundles made before there was such a key lack it.
+    """
     if isinstance(understood, dict):
         if not isinstance(written, dict):
             return "*"
         for key, value in understood.items():
+            if key not in written and value is None:
+                continue
             if key not in written:
                 return str(key)
             if inner := _first_difference(written[key], value):

@@ -47,7 +47,8 @@ class BundleFirstStage:
             onnx.save(model, path)
             channels = model.graph.output[-1].type.tensor_type.shape.dim[-1].dim_value
             self._backbone = open_backbone(path, manifest, "cpu", "float32", threads, channels)
-        self.identity = " ".join(graph.sha256 for graph in manifest.graphs.values())
+        graphs = " ".join(graph.sha256 for graph in manifest.graphs.values())
+        self.identity = manifest.provenance.weights_sha256 or graphs
 
     @property
     def spec(self) -> DetectorSpec:

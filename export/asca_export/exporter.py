@@ -33,7 +33,7 @@ from asca_pillars.config import pillar_spec
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.checkpoint import Checkpoint, weights_sha256
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.system import cpu_model, default_threads, git_revision, package_versions
@@ -171,6 +171,7 @@ def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provena
         steps=checkpoint.steps,
         versions=package_versions(),
         machine=cpu_model(),
+        weights_sha256=weights_sha256(checkpoint.detector.state_dict()),
     )
 
 

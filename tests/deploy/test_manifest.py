@@ -127,12 +127,19 @@ def test_no_layout(bundle_copy: Path, change: Callable[[dict[str, Any]], object]
         (lambda data: data["spec"].pop("post"), r"`spec\.post` is missing"),
         (lambda data: data["graphs"].pop("encoder"), "graphs encoder and backbone, not backbone"),
         (lambda data: data["graphs"]["encoder"].update(sha256="0\x1b[31m"), r"sha256 .* is no SHA-256"),
+        (lambda data: data["provenance"].update(weights_sha256="0" * 63), "sha256 .* of the weights is no SHA-256"),
         (lambda data: data["expected_input"].update(ground_z_m=[1.0]), r"expected_input\.ground_z_m"),
     ],
 )
 def test_wrong_keys_and_values(bundle_copy: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
     edit(bundle_copy, change)
     assert_refused(bundle_copy, f"{message}.*export the bundle again")
+
+
+def test_provenance_need_not_say_which_weights(bundle_copy: Path) -> None:
+    before = load_bundle(bundle_copy)
+    edit(bundle_copy, lambda data: data["provenance"].pop("weights_sha256"))
+    assert load_bundle(bundle_copy) == before
 
 
 @pytest.mark.parametrize("version", [None, "1", 1.0, True, [1]])

@@ -1,6 +1,5 @@
 """A checkpoint as the first stage of two."""
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.checkpoint import load_checkpoint, weights_sha256
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.pillar.pillar_preparation import batch_pillars
 from asca_pillars.pillar_config import PillarModel
@@ -33,8 +32,7 @@ class CheckpointFirstStage:
         assert isinstance(model, PillarModel) and isinstance(detector, PillarDetector), "it is of kind pillar"
         self._network = detector
         self.spec = model.spec
-        with Path(path).open("rb") as file:
-            self.identity = hashlib.file_digest(file, "sha256").hexdigest()
+        self.identity = weights_sha256(detector.state_dict())
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
         """See `FirstStage`."""

@@ -62,7 +62,8 @@ class ProposalCache:
         self, prepared: Path, stage: FirstStage, settings: FirstStageSettings, *, camera_view: bool = True
     ) -> None:
         self.stage, self.settings, self.camera_view = stage, settings, camera_view
-        about = {"format": _FORMAT, "stage": stage.identity, "camera_view": camera_view, **to_dict(settings)}
+        about = {"format": _FORMAT, "stage": stage.identity, "spec": to_dict(stage.spec), "camera_view": camera_view}
+        about |= to_dict(settings)
         key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
         self.files = ProposalFiles(prepared / f"proposals-{key}", stage.spec.class_names)
 

@@ -17,13 +17,9 @@ CHANNELS = 5
 class RandomStage:
     """See `points.first_stage.FirstStage`."""
 
-    def __init__(self, identity: str = "noise") -> None:
-        self.identity = identity
+    def __init__(self, identity: str = "noise", spec: DetectorSpec = SPEC) -> None:
+        self.identity, self.spec = identity, spec
         self.calls = 0
-
-    @property
-    def spec(self) -> DetectorSpec:
-        return SPEC
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
         self.calls += 1

@@ -1,19 +1,25 @@
 """What can be the first stage of two, as a checkpoint and as a bundle, and what is refused."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from asca_deploy import load_bundle
+from asca_deploy.bundle import MANIFEST
+from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import export_bundle
 from asca_pillars.errors import ConfigError, ExportError
-from asca_pillars.models.second_stage.open_first_stage import open_first_stage
+from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.second_stage.open_first_stage import open_first_stage, with_first_stage
 from asca_pillars.points.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
 from asca_pillars.points.proposals import ProposalSettings
-from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
-from tests.models.second_stage.tiny_refine import save_checkpoint
+from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
+from tests.models.second_stage.tiny_refine import save_checkpoint, tiny_refine_model
 from tests.scenes import SPEC
 
 POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled"))
@@ -30,7 +36,7 @@ def test_checkpoint_and_bundle_say_the_same(tmp_path: Path, network: dict[str, A
     export_bundle(checkpoint, tmp_path / "bundle", SCANS)
     in_torch, in_onnx = (open_first_stage(str(tmp_path / source)) for source in ("first.ckpt", "bundle"))
     assert in_torch.spec == in_onnx.spec == spec
-    assert in_torch.identity != in_onnx.identity
+    assert in_torch.identity == in_onnx.identity
     for points in (SCANS[0], np.empty((0, 4), np.float32)):
         wanted, found = in_torch(points), in_onnx(points)
         assert found.neck.shape[-1] == 3 * NETWORK.upsample_channels
@@ -41,6 +47,35 @@ def test_checkpoint_and_bundle_say_the_same(tmp_path: Path, network: dict[str, A
             np.testing.assert_array_equal(found.cells, wanted.cells)
         else:
             assert found.cells is None and wanted.cells is None
+
+
+def test_the_same_weights_are_taken_from_any_file_and_others_are_refused(tmp_path: Path) -> None:
+    """A checkpoint, its copy, two exports of it; a bundle that does not record its weights goes by its graphs."""
+    first, copy, other = (tmp_path / name for name in ("first.ckpt", "copy.ckpt", "other.ckpt"))
+    checkpoint = tiny_checkpoint("channel")
+    save_checkpoint(first, checkpoint)
+    save_checkpoint(copy, checkpoint._replace(config=dataclasses.replace(checkpoint.config, name="copy")))
+    bundles = [tmp_path / name for name in ("bundle", "again")]
+    for folder, calibration in zip(bundles, (None, CALIBRATION), strict=True):
+        export_bundle(checkpoint, folder, SCANS, calibration=calibration)
+    one, eight_bit = (load_bundle(folder) for folder in bundles)
+    assert one.provenance.weights_sha256 == eight_bit.provenance.weights_sha256 and one.graphs != eight_bit.graphs
+    model = with_first_stage(tiny_refine_model(first))
+    assert model.first_stage_identity == one.provenance.weights_sha256
+    export_bundle(checkpoint, bundles[1], SCANS, trained_on="the same, exported again")
+    for source in (copy, *bundles):
+        moved = dataclasses.replace(model, first_stage=str(source))
+        assert with_first_stage(moved) == moved
+    assert isinstance(checkpoint.detector, PillarDetector)
+    with torch.no_grad():
+        checkpoint.detector.head.scores.weight[0] += 1e-6
+    save_checkpoint(other, checkpoint)
+    with pytest.raises(ConfigError, match=r"other\.ckpt: other weights are there"):
+        with_first_stage(dataclasses.replace(model, first_stage=str(other)))
+    manifest = json.loads((bundles[0] / MANIFEST).read_text())
+    del manifest["provenance"]["weights_sha256"]
+    (bundles[0] / MANIFEST).write_text(json.dumps(manifest))
+    assert BundleFirstStage(bundles[0]).identity == " ".join(graph.sha256 for graph in one.graphs.values())
 
 
 def test_rows_of_active_cells_are_a_map_with_zeros_beside_them(tmp_path: Path) -> None:

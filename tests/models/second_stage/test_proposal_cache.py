@@ -1,5 +1,6 @@
 """Proposals on disk: computed once, whole or not at all, and never of another first stage."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.models.second_stage.proposal_cache import ProposalCache
 from asca_pillars.points.first_stage import FirstStageSettings, propose_on
 from tests.models.second_stage.random_stage import SETTINGS, RandomStage
-from tests.scenes import write_dataset
+from tests.scenes import SPEC, write_dataset
 
 
 @pytest.fixture
@@ -64,7 +65,9 @@ def test_another_stage_or_setting_is_another_folder(tmp_path: Path) -> None:
             ("a", SETTINGS, False),
         )
     }
-    assert len(folders) == 4
+    limited = dataclasses.replace(SPEC, limits=dataclasses.replace(SPEC.limits, max_points=8))
+    folders.add(ProposalCache(tmp_path, RandomStage("a", limited), SETTINGS).files.folder)
+    assert len(folders) == 5
     assert ProposalCache(tmp_path, RandomStage("a"), SETTINGS).files.folder in folders
 
 
