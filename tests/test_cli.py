@@ -196,8 +196,12 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
 
     assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
     assert "such as Car=0.35" in refusal(run_here(*export, "--score", "0.2"))
-    exported = run_here(*export, "--score", "Pedestrian=0.21")
+    exported = run_here(*export, "--score", "Pedestrian=0.21", "--with-weights")
     assert exported.returncode == 0, exported.stderr
+    assert (bundle / "weights.ckpt").read_bytes() == (run / "checkpoints" / "weights.ckpt").read_bytes()
+    golden = ("export", bundle, "--golden", "-o", tmp_path / "golden")
+    assert run_here(*golden).returncode == 0
+    assert "--with-weights is for a checkpoint" in refusal(run_here(*golden, "--with-weights"))
     assert "parity on 8 scans" in exported.stdout
     manifest = json.loads((bundle / "bundle.json").read_text())
     assert manifest["provenance"]["command"].startswith("asca train")
@@ -213,6 +217,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     assert "1 calibration scans left out" in quantized.stdout
     assert "calibrated on 8 scans" in quantized.stdout and "logit error" in quantized.stdout.lower()
     assert json.loads((bundle / "bundle.json").read_text())["precision"] == "int8"
+    assert not (bundle / "weights.ckpt").exists()
     detected = asca("detect", scans, "--bundle", bundle, "--out", tmp_path / "out")
     assert detected.returncode == 0, detected.stderr
     assert len(list((tmp_path / "out").glob("*.json"))) == 8

@@ -42,6 +42,9 @@ def export(
             help="Scans like those trained on, to calibrate with; 96 of the folder, evenly spaced. Default: simulated.",
         ),
     ] = None,
+    with_weights: Annotated[
+        bool, typer.Option("--with-weights", help="Add the weights, in 16 bits, for `asca train --init`.")
+    ] = False,
     golden: Annotated[
         bool, typer.Option("--golden", help="Write every stage's arrays for one scan, to check other runtimes by.")
     ] = False,
@@ -73,7 +76,7 @@ def export(
     if golden or browser or ort_web is not None:
         from asca_pillars.commands.export_runtime import export_for_runtime
 
-        of_a_checkpoint = {"--score": score, "--int8": int8, "--calibrate": calibrate}
+        of_a_checkpoint = {"--score": score, "--int8": int8, "--calibrate": calibrate, "--with-weights": with_weights}
         export_for_runtime(checkpoint, out, scans, of_a_checkpoint, golden=golden, browser=browser, ort_web=ort_web)
         return
     require("train")
@@ -122,11 +125,12 @@ def export(
     # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
     view: View = "camera" if loaded.config.data.camera_view else "full"
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
+    weights = checkpoint if with_weights else None
     with console.status("Exporting") as status:
         bundle: AnyBundle
         if kind == "pv_rcnn":
             bundle = export_pv_rcnn_bundle(
-                loaded, out, points, trained_on=trained_on, command=command, progress=status.update
+                loaded, out, points, trained_on=trained_on, command=command, weights=weights, progress=status.update
             )
         else:
             export_kind = export_refine_bundle if kind == "pillar_refine" else export_bundle
@@ -137,6 +141,7 @@ def export(
                 trained_on=trained_on,
                 command=command,
                 calibration=calibration,
+                weights=weights,
                 progress=status.update,
             )
     parity = bundle.parity

@@ -23,7 +23,11 @@ def train(
     ] = 1,
     init: Annotated[
         Path | None,
-        typer.Option("--init", help="Checkpoint whose weights a new run starts from, to go on with other data."),
+        typer.Option(
+            "--init",
+            help="Weights that a new run starts from, to go on with other data: a checkpoint, or a bundle that holds "
+            "its own (folder, or name of one that ships).",
+        ),
     ] = None,
 ) -> None:
     """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder.

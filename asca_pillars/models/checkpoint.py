@@ -11,6 +11,7 @@ from torch import Tensor
 from asca_pillars.config import Config
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.files import atomic_path
 from asca_pillars.models.build import build_model
 from asca_pillars.models.trainable import Trainable
 from asca_pillars.schema import parse
@@ -61,6 +62,26 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({reason})") from error
     return Checkpoint(config, detector.eval(), int(content["global_step"]), expected)
+
+
+def save_weights(checkpoint: Path, path: Path) -> None:
+    """Write what detecting, exporting and --init need of a checkpoint to `path`, in half the digits.
+
+    Matrices and kernels are float16; what is added or divided by (biases, statistics of the normalization) stays
+    float32. Optimizer and averaging are left out: a run cannot be resumed from it.
+    """
+    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    content = {
+        "hyper_parameters": content["hyper_parameters"],
+        "global_step": content["global_step"],
+        "state_dict": {
+            name: value.half() if value.is_floating_point() and value.ndim > 1 else value
+            for name, value in content["state_dict"].items()
+        },
+    }
+    # Opened here: torch writes the name of a file that it opens into it, and these are temporary.
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)
 
 
 def weights_sha256(weights: Mapping[str, Tensor]) -> str:

@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import Checkpoint
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
 
-LAST, PREVIOUS, BEST, WEIGHTS = "last.ckpt", "previous.ckpt", "best.ckpt", "weights.ckpt"
+LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -86,27 +86,6 @@ def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
             f"with the weights of this one if {folder / BEST} is there: --init {folder / BEST}"
         )
     return None, None
-
-
-def save_weights(checkpoint: Path) -> Path:
-    """Write weights.ckpt beside a checkpoint: what detecting, exporting and --init need, in half the digits.
-
-    Matrices and kernels are float16; what is added or divided by (biases, statistics of the normalization) stays
-    float32. Optimizer and averaging are left out: a run cannot be resumed from it.
-    """
-    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    content = {
-        "hyper_parameters": content["hyper_parameters"],
-        "global_step": content["global_step"],
-        "state_dict": {
-            name: value.half() if value.is_floating_point() and value.ndim > 1 else value
-            for name, value in content["state_dict"].items()
-        },
-    }
-    path = checkpoint.with_name(WEIGHTS)
-    with atomic_path(path) as temporary:
-        torch.save(content, temporary)
-    return path
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -15,11 +15,13 @@ from lightning.pytorch.callbacks import Checkpoint, LearningRateMonitor, ModelCh
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
+from asca_deploy.bundle import WEIGHTS
+from asca_deploy.shipped import find_weights
 from asca_pillars.config import Config, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
-from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.second_stage.open_first_stage import with_first_stage
+from asca_pillars.models.checkpoint import load_checkpoint, save_weights
+from asca_pillars.models.second_stage.open_first_stage import CHECKPOINT_SUFFIX, with_first_stage
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (
@@ -28,7 +30,6 @@ from asca_pillars.training.checkpoints import (
     LastCheckpoint,
     checkpoint_to_resume,
     remove_leftovers,
-    save_weights,
 )
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule
@@ -58,7 +59,8 @@ def train(
             may be made longer by more `train.epochs`, and is then what the longer run would have been.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
-        init: checkpoint whose weights a new run starts from, instead of random ones.
+        init: weights that a new run starts from, instead of random ones: a checkpoint, or a bundle that holds its
+            own (folder, or name of one that ships).
 
     Returns:
         The last checkpoint.
@@ -68,7 +70,8 @@ def train(
             the devices are not there, or a loss became infinite or NaN.
         TrainingInterruptedError: Ctrl-C; the run is saved.
         DatasetError, ScanError: the data cannot be read.
-        BundleError, ExportError, ConfigError: the first stage of two cannot be used.
+        BundleError, ExportError, ConfigError: the first stage of two cannot be used, or `init` is a bundle without
+            weights.
     """
     if isinstance(config.model, RefineModel):
         config = replace(config, model=with_first_stage(config.model))
@@ -108,7 +111,7 @@ def train(
             trainer.fit(module, data, ckpt_path=None if resumed is None else str(resumed), weights_only=True)
         finally:  # a run that was stopped has weights to take elsewhere, too
             if trainer.is_global_zero and (checkpoints / LAST).is_file():
-                save_weights(checkpoints / LAST)
+                save_weights(checkpoints / LAST, checkpoints / WEIGHTS)
     return checkpoints / LAST
 
 
@@ -150,8 +153,16 @@ def _trainer(
         raise TrainingError(f"devices {devices} x {num_nodes} nodes: {' '.join(str(error).split())}") from None
 
 
-def _start_from(module: DetectionModule, path: str | Path) -> None:
-    try:
-        module.detector.load_state_dict(load_checkpoint(path).detector.state_dict())
-    except RuntimeError as error:
-        raise TrainingError(f"{path}: weights of another network ({str(error).splitlines()[1].strip()})") from None
+def _start_from(module: DetectionModule, init: str | Path) -> None:
+    path = Path(init)
+    if not path.is_file() and path.suffix != CHECKPOINT_SUFFIX:
+        path = find_weights(init)
+    theirs, ours = load_checkpoint(path).detector.state_dict(), module.detector.state_dict()
+    for name in ours | theirs:
+        found, wanted = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
+        if found != wanted:
+            raise TrainingError(
+                f"{path}: weights of another network: {name} is {found} there and {wanted} in this configuration; "
+                "model.spec and model.network have to be like those that it was trained with"
+            )
+    module.detector.load_state_dict(theirs)

@@ -2,6 +2,7 @@
 
     *.onnx          the family's graphs
     bundle.json     everything that must agree with the graphs, and where they come from
+    weights.ckpt    if it was asked for: what they were exported from, for training to go on from; nothing runs it
 
 docs/BUNDLE.md describes the files for readers in other languages; `manifest` reads, verifies and writes bundle.json.
 """
@@ -24,6 +25,7 @@ from asca_pillars.tables.voxel_spec import VoxelSpec
 
 SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
+WEIGHTS: Literal["weights.ckpt"] = "weights.ckpt"
 ENCODER = "encoder"
 BACKBONE = "backbone"
 REFINE = "refine"
@@ -200,6 +202,8 @@ class Provenance(Strict):
     weights_sha256: str | None = None
     """Of the trained arrays, the same for every export of a checkpoint, see `asca_pillars.models.checkpoint`; None in
     bundles made before it was recorded."""
+    weights_file: Literal["weights.ckpt"] | None = None
+    """Checkpoint beside the graphs that holds the trained arrays in 16 bits; None where it was not asked for."""
 
     def __post_init__(self) -> None:
         if self.weights_sha256 is not None:

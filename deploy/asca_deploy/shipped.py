@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from asca_deploy.bundle import MANIFEST
+from asca_deploy.bundle import MANIFEST, WEIGHTS
 from asca_pillars.errors import BundleError
 
 
@@ -35,6 +35,22 @@ def find_bundle(bundle: str | Path | None) -> Path:
             " make one with `asca export`"
         )
     return shipped[str(bundle)]
+
+
+def find_weights(bundle: str | Path) -> Path:
+    """The checkpoint that a bundle (folder, or name of one that ships) holds beside its graphs.
+
+    Raises:
+        BundleError: there is no such bundle, or it holds none.
+    """
+    path = find_bundle(bundle) / WEIGHTS
+    if not path.is_file():
+        having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS).is_file()]
+        raise BundleError(
+            f"{bundle}: holds no {WEIGHTS}, which `asca export --with-weights` adds to a bundle; of those that ship "
+            f"{', '.join(having) or 'none'} has one"
+        )
+    return path
 
 
 def sample_scan_path() -> Path:

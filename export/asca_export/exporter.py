@@ -13,6 +13,7 @@ from asca_deploy.bundle import (
     BACKBONE,
     ENCODER,
     MANIFEST,
+    WEIGHTS,
     AnyBundle,
     Bundle,
     CanvasFormat,
@@ -33,7 +34,7 @@ from asca_pillars.config import pillar_spec
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
-from asca_pillars.models.checkpoint import Checkpoint, weights_sha256
+from asca_pillars.models.checkpoint import Checkpoint, save_weights, weights_sha256
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.system import cpu_model, default_threads, git_revision, package_versions
@@ -52,6 +53,7 @@ def export_bundle(
     trained_on: str = "not stated",
     command: str = "not stated",
     calibration: Sequence[NDArray[np.float32]] | None = None,
+    weights: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
     """Write the two graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
@@ -68,6 +70,7 @@ def export_bundle(
         command: the command that trained them.
         calibration: scans (N, 4) that set the ranges of an 8-bit bundle; those that are among `scans` are left out
             and counted.
+        weights: the checkpoint's file, whose weights are to lie beside the graphs in 16 bits; None leaves them out.
         progress: told what is being done.
 
     Raises:
@@ -93,7 +96,7 @@ def export_bundle(
         def prove(signed: Bundle) -> Parity:
             return prove_parity(detector, PillarPipeline(folder, signed, threads=default_threads()), scans)
 
-        bundle = write_proven(folder, draft, prove)
+        bundle = write_proven(folder, draft, prove, weights)
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, progress)
     return bundle
@@ -145,12 +148,19 @@ def draft_bundle(
     )
 
 
-def write_proven(folder: Path, draft: Described, prove: Callable[[Described], Parity]) -> Described:
+def write_proven(
+    folder: Path, draft: Described, prove: Callable[[Described], Parity], weights: Path | None
+) -> Described:
     """Sign the graphs in `folder`, and write their manifest with the parity that `prove` finds as the runtime opens it.
+
+    `weights` as in `export_bundle`.
 
     Raises:
         ExportError: there is none.
     """
+    if weights is not None:
+        save_weights(weights, folder / WEIGHTS)
+        draft = dataclasses.replace(draft, provenance=dataclasses.replace(draft.provenance, weights_file=WEIGHTS))
     signed = graphs.sign(folder, draft)
     write_bundle_manifest(folder, signed)
     opened = load_any_bundle(folder)

@@ -29,6 +29,7 @@ def export_pv_rcnn_bundle(
     *,
     trained_on: str = "not stated",
     command: str = "not stated",
+    weights: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> PvRcnnBundle:
     """Write the four graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
@@ -67,4 +68,4 @@ def export_pv_rcnn_bundle(
             pipeline = PvRcnnPipeline(folder, opened, threads=default_threads())
             return prove_pv_rcnn_parity(detector.network, pipeline, scans)
 
-        return write_proven(folder, dataclasses.replace(draft, backbone_gmac=gmac), prove)
+        return write_proven(folder, dataclasses.replace(draft, backbone_gmac=gmac), prove, weights)

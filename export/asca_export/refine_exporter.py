@@ -41,6 +41,7 @@ def export_refine_bundle(
     trained_on: str = "not stated",
     command: str = "not stated",
     calibration: Sequence[NDArray[np.float32]] | None = None,
+    weights: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
     """Write the first stage's graphs, refine.onnx and bundle.json, and prove on `scans` that they are the checkpoint's.
@@ -82,7 +83,7 @@ def export_refine_bundle(
             pipeline = RefinePipeline(folder, signed, threads=default_threads())
             return prove_refine_parity(detector.refiner, stage, pipeline, model, scans)
 
-        bundle = write_proven(folder, draft, prove)
+        bundle = write_proven(folder, draft, prove, weights)
         if calibration is None:
             return bundle
         progress("Putting the first stage in 8 bits")

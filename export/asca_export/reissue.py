@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from asca_deploy.bundle import MANIFEST
+from asca_deploy.bundle import MANIFEST, WEIGHTS
 from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
@@ -42,6 +42,8 @@ def main(
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         for name, graph in loaded.graphs.items():
             shutil.copyfile(source / graph.file, graphs.graph_path(folder, name))
+        if loaded.provenance.weights_file:
+            shutil.copyfile(source / WEIGHTS, folder / WEIGHTS)
         known = replace(loaded, expected_input=expected, expected_input_from="training" if training else "export")
         signed = graphs.sign(folder, known)
         write_bundle_manifest(folder, signed)

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from asca_deploy import load_bundle
+from asca_deploy import load_bundle, shipped
 from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
 from asca_pillars.errors import BundleError, ConfigError
@@ -16,6 +16,20 @@ def test_a_bundle_is_found_by_folder_and_by_shipped_name(tiny_bundle: Path) -> N
         BundleError, match=r"asca_smal: no such folder, and no bundle .* asca_refine_sim, .*asca_small_sparse_sim_int8"
     ):
         find_bundle("asca_smal")
+
+
+def test_weights_lie_in_some_bundles(tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with_weights = tmp_path / "with_weights"
+    with_weights.mkdir()
+    (with_weights / "weights.ckpt").touch()
+    ships = {"plain": tiny_bundle}
+    monkeypatch.setattr(shipped, "shipped_bundles", lambda: ships)
+    with pytest.raises(BundleError, match=r"plain: holds no weights\.ckpt, .*--with-weights.* ship none has one"):
+        shipped.find_weights("plain")
+    ships["heavy"] = with_weights
+    with pytest.raises(BundleError, match=r"tiny: holds no weights\.ckpt, .* of those that ship heavy has one"):
+        shipped.find_weights(tiny_bundle)
+    assert shipped.find_weights("heavy") == shipped.find_weights(with_weights) == with_weights / "weights.ckpt"
 
 
 def test_shipped_files_lie_in_the_package() -> None:

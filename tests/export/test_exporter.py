@@ -15,6 +15,7 @@ import torch
 import typer
 
 from asca_deploy import Detector, load_bundle
+from asca_deploy.manifest import write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs, reissue
 from asca_export.exporter import export_bundle
@@ -116,12 +117,17 @@ def test_the_expected_input_is_the_checkpoints_own(exported: Exports, tmp_path: 
 
 
 def test_a_bundle_issued_again_runs_the_same_networks(exported: Exports, tmp_path: Path) -> None:
-    folder = exported("none")
+    folder = shutil.copytree(exported("none"), tmp_path / "old")
+    described = load_bundle(folder)
+    provenance = replace(described.provenance, weights_file="weights.ckpt")
+    write_bundle_manifest(folder, replace(described, provenance=provenance))
+    (folder / "weights.ckpt").write_bytes(b"weights")
     (tmp_path / "scans").mkdir()
     for number, points in enumerate(SCANS[:2]):
         write_scan(tmp_path / "scans" / f"{number}.bin", points)
     reissue.main(folder, tmp_path / "scans", tmp_path / "new", camera_view=True, training=True)
     old, new = load_bundle(folder), load_bundle(tmp_path / "new")
+    assert (tmp_path / "new" / "weights.ckpt").read_bytes() == b"weights"
     assert new.expected_input == measure_expected_input(SCANS[:2], camera_view=True)
     assert new == replace(old, expected_input=new.expected_input, expected_input_from="training", graphs=new.graphs)
     with pytest.raises(typer.BadParameter, match="exists"):

@@ -92,7 +92,9 @@ def test_a_sparse_neck_on_a_pooled_map_proposes(tmp_path: Path) -> None:
 
 
 def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Path) -> None:
-    quantized = export_refine_bundle(load_checkpoint(trained[0]), tmp_path / "a", SCANS, calibration=CALIBRATION)
+    checkpoint = load_checkpoint(trained[0])
+    quantized = export_refine_bundle(checkpoint, tmp_path / "a", SCANS, calibration=CALIBRATION, weights=trained[0])
+    assert load_checkpoint(tmp_path / "a" / "weights.ckpt").config == checkpoint.config
     assert (quantized.name, quantized.precision, quantized.kind) == ("tiny_refine_int8", "int8", "pillar_refine")
     assert load_bundle(tmp_path / "a") == quantized
     report = quantized.quantization

@@ -1,4 +1,4 @@
-"""Checkpoints of a run: two generations, the one to go on from, the small one; and whose run a folder holds."""
+"""Checkpoints of a run: two generations, the one to go on from; and whose run a folder holds."""
 
 import dataclasses
 from pathlib import Path
@@ -10,11 +10,7 @@ import torch
 from asca_pillars.config import Config, DataConfig, TrainConfig
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.schema import to_dict
-from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume, remove_leftovers, save_weights
+from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume, remove_leftovers
 from asca_pillars.training.run_folder import claim, measure_input
 from tests.training.test_loop import CONFIG
 
@@ -82,22 +78,6 @@ def test_leftovers_may_be_gone_already(tmp_path: Path) -> None:
     remove_leftovers(tmp_path)
     remove_leftovers(tmp_path / "nowhere")
     assert not list(tmp_path.iterdir())
-
-
-def test_weights_at_the_paper_s_width_are_small_and_are_the_same_to_three_digits(tmp_path: Path) -> None:
-    config = Config(model=PillarModel())
-    torch.manual_seed(0)
-    network = build_model(config.model)
-    state = {f"detector.{name}": value for name, value in network.state_dict().items()}
-    content = {"hyper_parameters": {"config": to_dict(config)}, "global_step": 7, "state_dict": state, "optimizer": 1}
-    torch.save(content, tmp_path / "last.ckpt")
-    path = save_weights(tmp_path / "last.ckpt")
-    assert path.name == "weights.ckpt" and path.stat().st_size < 8 * 2**20
-    loaded = load_checkpoint(path)
-    assert loaded.steps == 7 and loaded.config == config and loaded.expected_input is None
-    for name, value in loaded.detector.state_dict().items():
-        assert value.dtype == state[f"detector.{name}"].dtype
-        torch.testing.assert_close(value, state[f"detector.{name}"], rtol=1e-3, atol=1e-7, msg=name)
 
 
 def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:

@@ -121,20 +121,6 @@ def test_a_run_of_an_older_version_goes_on(tmp_path: Path) -> None:
     assert load_checkpoint(train(CONFIG, data, tmp_path / "run")).steps == steps
 
 
-def test_a_run_can_start_from_other_weights(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "data", 3)
-    first = train(CONFIG, data, tmp_path / "first")
-    still = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1, learning_rate=1e-12))
-    second = load_checkpoint(train(still, data, tmp_path / "second", init=first))
-    for number, (expected, found) in enumerate(
-        zip(load_checkpoint(first).detector.parameters(), second.detector.parameters(), strict=True)
-    ):
-        torch.testing.assert_close(found, expected, msg=f"parameter {number}")
-    other = dataclasses.replace(CONFIG, model=PillarModel(network=dataclasses.replace(NETWORK, pillar_channels=8)))
-    with pytest.raises(TrainingError, match="weights of another network"):
-        train(other, data, tmp_path / "third", init=first)
-
-
 def test_devices_that_do_not_exist_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="devices many x 1 nodes"):
         train(CONFIG, write_dataset(tmp_path / "data", 3), tmp_path / "run", devices="many")

@@ -1,0 +1,42 @@
+"""The small form of a checkpoint, and what its weights are known by."""
+
+from pathlib import Path
+
+import torch
+
+from asca_pillars.config import Config
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import load_checkpoint, save_weights, weights_sha256
+from asca_pillars.pillar_config import PillarModel
+from asca_pillars.schema import to_dict
+
+
+def test_weights_at_the_paper_s_width_are_small_and_are_the_same_to_three_digits(tmp_path: Path) -> None:
+    config = Config(model=PillarModel())
+    torch.manual_seed(0)
+    network = build_model(config.model)
+    state = {f"detector.{name}": value for name, value in network.state_dict().items()}
+    content = {"hyper_parameters": {"config": to_dict(config)}, "global_step": 7, "state_dict": state, "optimizer": 1}
+    torch.save(content, tmp_path / "last.ckpt")
+    path = tmp_path / "weights.ckpt"
+    save_weights(tmp_path / "last.ckpt", path)
+    assert path.stat().st_size < 8 * 2**20
+    loaded = load_checkpoint(path)
+    assert loaded.steps == 7 and loaded.config == config and loaded.expected_input is None
+    for name, value in loaded.detector.state_dict().items():
+        assert value.dtype == state[f"detector.{name}"].dtype
+        torch.testing.assert_close(value, state[f"detector.{name}"], rtol=1e-3, atol=1e-7, msg=name)
+    assert weights_sha256(loaded.detector.state_dict()) != weights_sha256(network.state_dict())
+
+
+def test_weights_are_known_by_names_shapes_and_values() -> None:
+    weights = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor(1)}
+    known = weights_sha256(weights)
+    assert weights_sha256({"b": weights["b"], "a": weights["a"].clone()}) == known
+    others = (
+        {"a": weights["a"].reshape(3, 2), "b": weights["b"]},
+        {"a": weights["a"], "c": weights["b"]},
+        {"a": weights["a"] + 1, "b": weights["b"]},
+        {"a": weights["a"]},
+    )
+    assert len({known, *map(weights_sha256, others)}) == 5
