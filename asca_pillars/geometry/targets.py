@@ -21,6 +21,7 @@ class Targets:
     Attributes:
         state: (H, W, A) int8: 1 positive, 0 negative, -1 takes no part in the loss.
         positives: (n,) flat indices into (H, W, A) of the positive anchors, ascending.
+        anchors: (n, 7) float32 the positive anchors themselves, LiDAR frame.
         residuals: (n, 7) float32 box residuals of the positive anchors.
         directions: (n,) int64 direction bin of the positive anchors.
         matched: (n,) int64 the box, by its row, that each positive anchor is to find.
@@ -28,6 +29,7 @@ class Targets:
 
     state: NDArray[np.int8]
     positives: NDArray[np.int64]
+    anchors: NDArray[np.float32]
     residuals: NDArray[np.float32]
     directions: NDArray[np.int64]
     matched: NDArray[np.int64]
@@ -85,8 +87,9 @@ def assign_targets(
         best_box[tuple(places.T)] = box_index
     positives = np.flatnonzero(state == 1)
     matched = best_box.reshape(-1)[positives]
-    residuals, directions = encode_boxes(boxes[matched], anchors.reshape(-1, 7)[positives])
-    return Targets(state, positives, residuals, directions, matched)
+    found = anchors.reshape(-1, 7)[positives]
+    residuals, directions = encode_boxes(boxes[matched], found)
+    return Targets(state, positives, found, residuals, directions, matched)
 
 
 def _anchors_of(class_index: int) -> slice:

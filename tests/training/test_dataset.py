@@ -222,6 +222,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
 
         own_positives = slice(first_positive, first_positive + len(targets.positives))
         assert np.array_equal(target_batch.state[i], targets.state)
+        assert np.array_equal(target_batch.anchors[own_positives], targets.anchors)
         assert np.array_equal(target_batch.residuals[own_positives], targets.residuals)
         assert np.array_equal(target_batch.directions[own_positives], targets.directions)
         first_positive = own_positives.stop

@@ -169,6 +169,7 @@ def batch_targets(frames: Sequence[Targets]) -> TargetBatch:
         positives=torch.from_numpy(
             np.concatenate([frame.positives + i * anchors_per_frame for i, frame in enumerate(frames)])
         ),
+        anchors=torch.from_numpy(np.concatenate([frame.anchors for frame in frames])),
         residuals=torch.from_numpy(np.concatenate([frame.residuals for frame in frames])),
         directions=torch.from_numpy(np.concatenate([frame.directions for frame in frames])),
     )
