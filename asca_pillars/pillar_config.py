@@ -5,6 +5,7 @@ from typing import Literal
 
 from asca_pillars.bounds import require_bounds
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.targets import Assigner
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import Strict
 from asca_pillars.tables.neck_tables import MaskRule
@@ -56,6 +57,8 @@ class LossConfig(Strict):
     Attributes:
         score_target: what the class score of a positive anchor is to be: `one`, or the `iou` in 3D of the box that it
             predicts with the labelled one (quality focal loss, arXiv 2006.04388).
+        assigner: which anchors are positive: by `overlap` with the thresholds of `model.spec.classes`, or by `atss`
+            (arXiv 1912.02424), see `geometry.targets.assign_targets`.
     """
 
     box_weight: float = 2.0
@@ -65,6 +68,7 @@ class LossConfig(Strict):
     focal_gamma: float = 2.0
     smooth_l1_beta: float = 1 / 9
     score_target: Literal["one", "iou"] = "one"
+    assigner: Assigner = "overlap"
 
     def __post_init__(self) -> None:
         weights = ("box_weight", "class_weight", "direction_weight")
