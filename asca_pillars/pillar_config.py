@@ -5,6 +5,7 @@ from typing import Literal
 
 from asca_pillars.bounds import require_bounds
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.targets import Assigner
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import Strict
 from asca_pillars.tables.neck_tables import MaskRule
@@ -51,7 +52,14 @@ class NetworkConfig(Strict):
 
 @dataclass(frozen=True)
 class LossConfig(Strict):
-    """Eq. (13)-(15) with the residuals of PointPillars; `smooth_l1_beta` is SECOND's 1/9."""
+    """Eq. (13)-(15) with the residuals of PointPillars; `smooth_l1_beta` is SECOND's 1/9.
+
+    Attributes:
+        score_target: what the class score of a positive anchor is to be: `one`, or the `iou` in 3D of the box that it
+            predicts with the labelled one (quality focal loss, arXiv 2006.04388).
+        assigner: which anchors are positive: by `overlap` with the thresholds of `model.spec.classes`, or by `atss`
+            (arXiv 1912.02424), see `geometry.targets.assign_targets`.
+    """
 
     box_weight: float = 2.0
     class_weight: float = 1.0
@@ -59,11 +67,18 @@ class LossConfig(Strict):
     focal_alpha: float = 0.25
     focal_gamma: float = 2.0
     smooth_l1_beta: float = 1 / 9
+    score_target: Literal["one", "iou"] = "one"
+    assigner: Assigner = "overlap"
 
     def __post_init__(self) -> None:
         weights = ("box_weight", "class_weight", "direction_weight")
         require_bounds("model.loss", self, (*weights, "focal_gamma", "smooth_l1_beta"), low=0)
         require_bounds("model.loss", self, ("focal_alpha",), low=0, high=1)
+        if self.score_target == "iou" and 0 < self.focal_gamma < 1:
+            raise ConfigError(
+                f"model.loss.focal_gamma = {self.focal_gamma:g}: with model.loss.score_target iou the gradient of a "
+                "score that is right is not finite; give 0, or at least 1"
+            )
 
 
 @dataclass(frozen=True)

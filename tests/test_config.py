@@ -168,6 +168,23 @@ def test_a_file_holds_what_differs(tmp_path: Path) -> None:
     assert load_config(write(tmp_path, "# only a comment\n")) == Config()
 
 
+def test_a_loss_of_an_older_version_learns_what_it_did(tmp_path: Path) -> None:
+    older = to_dict(LossConfig())
+    del older["score_target"], older["assigner"]
+    config = load_config(write(tmp_path, yaml.safe_dump({"model": {"loss": older}})))
+    assert isinstance(config.model, PillarModel) and config.model.loss == LossConfig()
+    assert (config.model.loss.score_target, config.model.loss.assigner) == ("one", "overlap")
+
+
+def test_a_focus_without_a_finite_gradient_is_refused(tmp_path: Path) -> None:
+    text = "model: {{loss: {{score_target: iou, focal_gamma: {}}}}}"
+    for gamma in (0, 1, 2):
+        load_config(write(tmp_path, text.format(gamma)))
+    assert "model.loss.focal_gamma = 0.5: with model.loss.score_target iou" in refusal(
+        write(tmp_path, text.format(0.5))
+    )
+
+
 def test_classes_of_one_s_own(tmp_path: Path) -> None:
     text = """
 model:
@@ -191,6 +208,8 @@ model:
         ("model.loss.box_weight", "-1", "must be at least 0"),
         ("model.loss.focal_alpha", "1.5", "must lie between 0 and 1"),
         ("model.loss.smooth_l1_beta", "-0.1", "must be at least 0"),
+        ("model.loss.score_target", "giou", "input should be 'one' or 'iou'"),
+        ("model.loss.assigner", "max_iou", "input should be 'overlap' or 'atss'"),
         ("augment.flip_probability", "2", "must lie between 0 and 1"),
         ("augment.point_dropout", "-0.1", "must lie between 0 and 1"),
         ("augment.insert.objects", "-1", "must be at least 0"),

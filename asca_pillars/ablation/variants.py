@@ -1,4 +1,4 @@
-"""The ablation: the paper's Table 5, zones and their map, readings of CPA, necks, matching, trained on equal terms.
+"""The ablation: the paper's Table 5, zones and their map, readings of CPA, necks, matching, scores, on equal terms.
 
 Every run is `asca train` with one base configuration and a few overrides, in a process of its own; finished runs are
 kept, so that an interrupted ablation goes on where it stopped.
@@ -69,6 +69,10 @@ class Variant:
     person_ious: tuple[float, float] | None = None
     """Overlap from which an anchor is positive and below which it is negative, of every class but cars; None for the
     base configuration's."""
+    assigner: str | None = None
+    """What matches anchors with boxes, see `model.loss`; None for the base configuration's."""
+    score_target: str | None = None
+    """What scores are to be, likewise."""
 
     @property
     def overrides(self) -> tuple[str, ...]:
@@ -77,7 +81,7 @@ class Variant:
             f"model.spec.grid.map={self.map}",
             f"model.network.neck={self.neck}",
             f"model.network.active_cells={self.active_cells}",
-            *self._matching,
+            *self._learnt,
             f"model.spec.grid.zones={self.zones}",
             f"model.spec.grid.v_max_m={0.16 if self.zones == 1 else 0.32}",
             f"model.network.cpa={self.cpa}",
@@ -92,19 +96,25 @@ class Variant:
             zones += f" {self.map}"
         cpa = "-" if self.cpa == "none" else self.cpa
         neck = "-" if self.neck == "dense" else self.active_cells
-        matching = "-" if self.person_ious is None else " / ".join(f"{iou:g}" for iou in self.person_ious)
-        return zones, cpa, {"none": "-", "gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}[self.insert], neck, matching
+        insert = {"none": "-", "gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}[self.insert]
+        matching = self.assigner or "-"
+        if self.person_ious is not None:
+            matching = " / ".join(f"{iou:g}" for iou in self.person_ious)
+        return zones, cpa, insert, neck, matching, self.score_target or "-"
 
     @property
-    def _matching(self) -> tuple[str, ...]:
+    def _learnt(self) -> tuple[str, ...]:
+        """Which anchors learn, and what."""
+        choices = {"assigner": self.assigner, "score_target": self.score_target}
+        chosen = tuple(f"model.loss.{name}={choice}" for name, choice in choices.items() if choice is not None)
         if self.person_ious is None:
-            return ()
+            return chosen
         positive, negative = self.person_ious
         classes = [
             spec if spec.name == "Car" else replace(spec, positive_iou=positive, negative_iou=negative)
             for spec in KITTI_CLASSES
         ]
-        return (f"model.spec.classes={json.dumps([to_dict(spec) for spec in classes])}",)
+        return (*chosen, f"model.spec.classes={json.dumps([to_dict(spec) for spec in classes])}")
 
 
 VARIANTS = {
@@ -128,6 +138,9 @@ VARIANTS = {
         Variant("asp_k3_pooled_cpa_channel_fine", zones=3, cpa="channel", map="pooled", neck="sparse"),
         Variant("cpa_channel_lower_ious", cpa="channel", person_ious=(0.35, 0.2)),
         Variant("cpa_channel_fine_lower_ious", cpa="channel", neck="sparse", person_ious=(0.35, 0.2)),
+        Variant("cpa_channel_fine_atss", cpa="channel", neck="sparse", assigner="atss"),
+        Variant("cpa_channel_fine_iou_score", cpa="channel", neck="sparse", score_target="iou"),
+        Variant("cpa_channel_fine_atss_iou_score", cpa="channel", neck="sparse", assigner="atss", score_target="iou"),
     )
 }
 
@@ -146,11 +159,12 @@ PILLARS = Family(
             *("cpa_channel", "asp_k3_cpa_channel", "asp_k3_pooled_cpa_channel"),
             *("cpa_channel_sub", "cpa_channel_fine", "asp_k3_cpa_channel_fine", "asp_k3_pooled_cpa_channel_fine"),
         ),
-        "Matching of pedestrians and cyclists": (
+        "Matching, and what scores are to be": (
             *("cpa_channel", "cpa_channel_lower_ious", "cpa_channel_fine", "cpa_channel_fine_lower_ious"),
+            *("cpa_channel_fine_atss", "cpa_channel_fine_iou_score", "cpa_channel_fine_atss_iou_score"),
         ),
     },
-    components=("ASP", "CPA", "Aug", "neck", "persons' IoU"),
+    components=("ASP", "CPA", "Aug", "neck", "matching", "score"),
 )
 
 

@@ -79,7 +79,8 @@ def inspect(
         settings = propose_config(frames_of, settings, propose, frames, console)
     spec, min_points = pillar_spec(settings), settings.data.min_points
     view = settings.data.camera_view and frames_of.has_camera
-    inspection = inspect_dataset(frames_of, spec, settings.data, frames=frames, progress=True)
+    assigner = settings.model.loss.assigner if settings.model.kind == "pillar" else "overlap"
+    inspection = inspect_dataset(frames_of, spec, settings.data, assigner=assigner, frames=frames, progress=True)
     found = findings(inspection, spec, min_points)
     if json is not None:
         report = {"config": settings.name} | dataclasses.asdict(inspection)

@@ -72,14 +72,20 @@ def _relative(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles, _Doubles, _
 def bev_iou(a: _Boxes, b: _Boxes) -> _Doubles:
     """IoU of footprints: boxes (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
     a, b = a.astype(np.float64), b.astype(np.float64)
-    return _over_union(bev_intersection(a, b), a[:, 3] * a[:, 4], b[:, 3] * b[:, 4])
+    return _over_union(bev_intersection(a, b), (a[:, 3] * a[:, 4])[:, None], b[:, 3] * b[:, 4])
 
 
 def iou_3d(a: _Boxes, b: _Boxes) -> _Doubles:
     """IoU of volumes: boxes (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
     a, b = a.astype(np.float64), b.astype(np.float64)
-    shared = bev_intersection(a, b) * _shared_length(a[:, 2], a[:, 5], b[:, 2], b[:, 5])
-    return _over_union(shared, a[:, 3] * a[:, 4] * a[:, 5], b[:, 3] * b[:, 4] * b[:, 5])
+    shared = bev_intersection(a, b) * _shared_length(a[:, 2, None], a[:, 5, None], b[:, 2], b[:, 5])
+    return _over_union(shared, _volumes(a)[:, None], _volumes(b))
+
+
+def paired_iou_3d(a: _Doubles, b: _Doubles) -> _Doubles:
+    """IoU of the volumes of a[k] and b[k]: boxes (K, 7), (K, 7) float64 -> (K,) in [0, 1]; exactly 1 for equal ones."""
+    shared = paired_bev_intersection(a, b) * _shared_length(a[:, 2], a[:, 5], b[:, 2], b[:, 5])
+    return _over_union(shared, _volumes(a), _volumes(b))
 
 
 def aligned_bev_iou(a: _Boxes, b: _Boxes) -> NDArray[np.float32]:
@@ -87,7 +93,7 @@ def aligned_bev_iou(a: _Boxes, b: _Boxes) -> NDArray[np.float32]:
 
     What anchors are matched by (PointPillars): cheap enough for every anchor of a map.
     """
-    ax, ay, al, aw = _aligned(a)
+    ax, ay, al, aw = (part[:, None] for part in _aligned(a))
     bx, by, bl, bw = _aligned(b)
     shared = _shared_length(ax, al, bx, bl) * _shared_length(ay, aw, by, bw)
     return _over_union(shared, al * aw, bl * bw)
@@ -121,21 +127,26 @@ def _share(part: _Doubles, whole: _Doubles) -> _Doubles:
 
 
 def _shared_length(a: _Boxes, a_size: _Boxes, b: _Boxes, b_size: _Boxes) -> NDArray[Any]:
-    """Length shared by intervals given by center and size: (N,), (N,), (M,), (M,) -> (N, M).
+    """Length shared by intervals given by center and size: any shapes that broadcast.
 
     Written so that equal intervals share exactly their size, whatever the center's rounding.
     """
-    shared = np.abs(a[:, None] - b[None, :])
-    np.subtract((a_size[:, None] + b_size[None, :]) / 2, shared, out=shared)
-    np.minimum(shared, np.minimum(a_size[:, None], b_size[None, :]), out=shared)
+    shared = np.abs(a - b)
+    np.subtract((a_size + b_size) / 2, shared, out=shared)
+    np.minimum(shared, np.minimum(a_size, b_size), out=shared)
     return np.maximum(shared, 0, out=shared)
 
 
 def _over_union(shared: NDArray[Any], a_size: NDArray[Any], b_size: NDArray[Any]) -> NDArray[Any]:
-    union = a_size[:, None] + b_size[None, :]
+    union = a_size + b_size
     union -= shared
     ratio: NDArray[Any] = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
     return ratio
+
+
+def _volumes(boxes: _Boxes) -> NDArray[Any]:
+    volumes: NDArray[Any] = boxes[:, 3] * boxes[:, 4] * boxes[:, 5]
+    return volumes
 
 
 def _aligned(boxes: _Boxes) -> tuple[NDArray[np.float32], ...]:

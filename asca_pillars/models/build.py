@@ -42,7 +42,8 @@ def build_preparation(model: ModelConfig, split: LabeledSplit, data: DataConfig)
     match model:
         case PillarModel():
             network = model.network
-            return PillarPreparation(model.spec, network.active_cells if network.neck == "sparse" else None)
+            rule = network.active_cells if network.neck == "sparse" else None
+            return PillarPreparation(model.spec, rule, model.loss.assigner)
         case RefineModel():
             return cached_preparation(model, split, data)
         case PvRcnnModel():

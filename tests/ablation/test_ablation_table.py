@@ -16,9 +16,9 @@ def _result(car: float, pedestrian: float, cyclist: float | None) -> dict:
 
 def test_means_and_spreads_over_the_seeds() -> None:
     text = tables(PILLARS, {"baseline": [_result(60, 20, 10), _result(64, 26, 12)]}, {})
-    row = next(line for line in text.splitlines() if line.startswith("| - | - | - | - | - | 62.00"))
+    row = next(line for line in text.splitlines() if line.startswith("| - | - | - | - | - | - | 62.00"))
     # The mean over classes is 30 and 34, so 32 with half their distance.
-    assert row.strip("| ").split(" | ")[5:11] == [
+    assert row.strip("| ").split(" | ")[6:12] == [
         "62.00 ± 2.00",
         "23.00 ± 3.00",
         "11.00 ± 1.00",
@@ -31,21 +31,25 @@ def test_means_and_spreads_over_the_seeds() -> None:
 def test_a_class_that_was_never_detected_counts_as_nothing_found() -> None:
     text = tables(PILLARS, {"rs_aug": [_result(60, 20, None)]}, {"rs_aug": Speed(12.34, 1.05, (1.0, 1.1), 1234567)})
     row = next(line for line in text.splitlines() if "1,234,567" in line)
-    assert row.startswith("| - | - | RS-Aug | - | - | 60.00 | 20.00 | 0.00 | 26.67 |")
+    assert row.startswith("| - | - | RS-Aug | - | - | - | 60.00 | 20.00 | 0.00 | 26.67 |")
     assert row.endswith("| 1,234,567 | 12.3 | 1.05 (1.00-1.10) |")
 
 
 def test_easy_moderate_and_hard_stand_in_their_columns() -> None:
     text = tables(PILLARS, {"asp_k3_cpa_channel": [_result(60, 20, 10)]}, {})
     row = next(line for line in text.splitlines() if "70.00 | 60.00 | 59.00" in line)
-    assert row == "| K=3 | channel | - | - | - | 70.00 | 60.00 | 59.00 | 30.00 | 20.00 | 19.00 | 20.00 | 10.00 | 9.00 |"
+    assert (
+        row
+        == "| K=3 | channel | - | - | - | - | 70.00 | 60.00 | 59.00 | 30.00 | 20.00 | 19.00 | 20.00 | 10.00 | 9.00 |"
+    )
 
 
-def test_map_neck_and_matching_are_named() -> None:
-    results = {name: [_result(60, 20, 10)] for name in ("asp_k3_pooled_cpa_channel_fine", "cpa_channel_lower_ious")}
-    text = tables(PILLARS, results, {})
-    assert "| K=3 pooled | channel | - | fine | - | 60.00" in text
-    assert "| - | channel | - | - | 0.35 / 0.2 | 60.00" in text
+def test_map_neck_matching_and_scores_are_named() -> None:
+    names = ("asp_k3_pooled_cpa_channel_fine", "cpa_channel_lower_ious", "cpa_channel_fine_atss_iou_score")
+    text = tables(PILLARS, {name: [_result(60, 20, 10)] for name in names}, {})
+    assert "| K=3 pooled | channel | - | fine | - | - | 60.00" in text
+    assert "| - | channel | - | - | 0.35 / 0.2 | - | 60.00" in text
+    assert "| - | channel | - | fine | atss | iou | 60.00" in text
 
 
 def test_only_tables_with_results_are_written() -> None:

@@ -42,6 +42,13 @@ def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
     car, *persons = config.model.spec.classes
     assert (car.positive_iou, car.negative_iou) == (0.6, 0.45)
     assert {(spec.positive_iou, spec.negative_iou) for spec in persons} == {variant.person_ious or (0.5, 0.35)}
+    assert config.model.loss.assigner == ("atss" if "atss" in variant.name else "overlap")
+    assert config.model.loss.score_target == ("iou" if "iou_score" in variant.name else "one")
+
+
+def test_a_row_that_says_nothing_of_the_loss_keeps_the_base_configuration_s() -> None:
+    config = load_config("ablation_small", ("model.loss.assigner=atss", *VARIANTS["cpa_channel"].overrides))
+    assert isinstance(config.model, PillarModel) and config.model.loss.assigner == "atss"
 
 
 @pytest.mark.usefixtures("in_turn")
@@ -52,7 +59,7 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: py
     ablate(config, data=data, out=out, jobs=2, **options)
     text = (out / "results.md").read_text()
     assert "6 frames for training, 8 for validation" in text and "2 runs" in text
-    assert sum(line.startswith("| K=2 | - | - | - | - |") for line in text.splitlines()) == 2
+    assert sum(line.startswith("| K=2 | - | - | - | - | - |") for line in text.splitlines()) == 2
     trained = load_config(out / "baseline" / "seed0" / "config.yaml")
     assert (trained.train.learning_rate, pillar_spec(trained).grid.zones) == (2e-3, 1)
     weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
@@ -72,7 +79,7 @@ def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(tmp_path: Path, config:
     data, names = write_dataset(tmp_path / "data", 14, val_frames=8), "asp_k3_pooled_cpa_channel_fine"
     any_zones = ["model.spec.grid.x_range_m=[4.8, 20.16]"]
     ablate(config, data=data, out=tmp_path / "out", override=any_zones, seeds="0", variants=names)
-    assert "| K=3 pooled | channel | - | fine | - |" in (tmp_path / "out" / "results.md").read_text()
+    assert "| K=3 pooled | channel | - | fine | - | - |" in (tmp_path / "out" / "results.md").read_text()
 
 
 def test_as_many_at_a_time_as_asked_for_share_the_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,4 +119,4 @@ def test_what_does_not_exist_is_one_line(tmp_path: Path, config: str, seeds: str
 
 def _accuracies(text: str) -> list[str]:
     """The tables without parameters, speed and time, which depend on the machine's mood."""
-    return [" | ".join(line.split(" | ")[:9]) for line in text.splitlines() if line.startswith("|")]
+    return [" | ".join(line.split(" | ")[:10]) for line in text.splitlines() if line.startswith("|")]

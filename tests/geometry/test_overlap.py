@@ -16,6 +16,7 @@ from asca_pillars.geometry.overlap import (
     iou_3d,
     paired_bev_intersection,
     paired_bev_touch,
+    paired_iou_3d,
 )
 
 # Places up to 70 m away, sizes from a thin plate to a lorry.
@@ -153,6 +154,8 @@ def test_rows_are_a_and_columns_are_b() -> None:
 def test_pairs_are_the_diagonal() -> None:
     a, b = random_boxes(0, 40, 3.0).astype(np.float64), random_boxes(1, 40, 3.0).astype(np.float64)
     np.testing.assert_array_equal(paired_bev_intersection(a, b), np.diag(bev_intersection(a, b)))
+    np.testing.assert_array_equal(paired_iou_3d(a, b), np.diag(iou_3d(a, b)))
+    assert paired_iou_3d(a[:0], b[:0]).shape == (0,)
 
 
 def test_footprints_apart_do_not_touch() -> None:

@@ -7,7 +7,7 @@ import torch
 from asca_pillars.config import Config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint, save_weights, weights_sha256
-from asca_pillars.pillar_config import PillarModel
+from asca_pillars.pillar_config import NetworkConfig, PillarModel
 from asca_pillars.schema import to_dict
 
 
@@ -27,6 +27,16 @@ def test_weights_at_the_paper_s_width_are_small_and_are_the_same_to_three_digits
         assert value.dtype == state[f"detector.{name}"].dtype
         torch.testing.assert_close(value, state[f"detector.{name}"], rtol=1e-3, atol=1e-7, msg=name)
     assert weights_sha256(loaded.detector.state_dict()) != weights_sha256(network.state_dict())
+
+
+def test_a_checkpoint_without_younger_settings_has_their_defaults(tmp_path: Path) -> None:
+    config = Config(model=PillarModel(network=NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)))
+    state = {f"detector.{name}": value for name, value in build_model(config.model).state_dict().items()}
+    older = to_dict(config)
+    del older["model"]["loss"]["score_target"], older["model"]["loss"]["assigner"]
+    content = {"hyper_parameters": {"config": older}, "global_step": 7, "state_dict": state}
+    torch.save(content, tmp_path / "last.ckpt")
+    assert load_checkpoint(tmp_path / "last.ckpt").config == config
 
 
 def test_weights_are_known_by_names_shapes_and_values() -> None:

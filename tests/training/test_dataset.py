@@ -17,8 +17,9 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.targets import assign_targets
+from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, Placement, PreparedPillars
-from asca_pillars.pillar_config import NetworkConfig, PillarModel
+from asca_pillars.pillar_config import LossConfig, NetworkConfig, PillarModel
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
@@ -162,6 +163,16 @@ def test_training_samples_change_with_seed_and_epoch_together_with_their_targets
         assert sample.prepared.pillars.stats.points_outside == (~inside).sum()
 
 
+def test_the_assigner_of_the_configuration_makes_the_targets(tmp_path: Path) -> None:
+    model = PillarModel(spec=SPEC, loss=LossConfig(assigner="atss"))
+    frames = open_dataset(write_dataset(tmp_path, 3), dataclasses.replace(CONFIG, model=model), training=True)
+    sample = frames.sample(0, 0)
+    labelled = (SPEC.anchors, SPEC.classes, sample.frame.boxes, sample.frame.labels)
+    assert np.array_equal(sample.prepared.targets.state, assign_targets(*labelled, "atss").state)
+    assert not np.array_equal(sample.prepared.targets.state, assign_targets(*labelled, "overlap").state)
+    assert frames.preparation == build_pillar_detector(model).preparation
+
+
 def test_pillars_are_drawn_anew_where_the_limits_bite(tmp_path: Path) -> None:
     """In training another subset each epoch, even of a frame that nothing else changes."""
     tight = dataclasses.replace(SPEC, limits=dataclasses.replace(SPEC.limits, max_pillars=50))
@@ -222,6 +233,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
 
         own_positives = slice(first_positive, first_positive + len(targets.positives))
         assert np.array_equal(target_batch.state[i], targets.state)
+        assert np.array_equal(target_batch.anchors[own_positives], targets.anchors)
         assert np.array_equal(target_batch.residuals[own_positives], targets.residuals)
         assert np.array_equal(target_batch.directions[own_positives], targets.directions)
         first_positive = own_positives.stop

@@ -19,6 +19,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError, ScanError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.geometry.overlap import aligned_bev_iou
+from asca_pillars.geometry.targets import Assigner
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
@@ -133,7 +134,13 @@ class Inspection:
 
 
 def inspect_dataset(
-    split: LabeledSplit, spec: PillarSpec, data: DataConfig, *, frames: int = 500, progress: bool = False
+    split: LabeledSplit,
+    spec: PillarSpec,
+    data: DataConfig,
+    *,
+    assigner: Assigner = "overlap",
+    frames: int = 500,
+    progress: bool = False,
 ) -> Inspection:
     """Measure `frames` evenly spaced frames of a split, or all of them if there are fewer.
 
@@ -141,6 +148,7 @@ def inspect_dataset(
         split: a list of a dataset.
         spec: grid, limits and classes that are to be trained on it.
         data: how its frames are to be read.
+        assigner: what matches anchors with boxes.
         frames: how many are looked at.
         progress: show a bar.
 
@@ -155,7 +163,8 @@ def inspect_dataset(
     damaged: list[DatasetError | ScanError] = []
     for number in track(range(wanted), "Inspecting", disable=not progress, transient=True):
         try:
-            measured.append(measure_frame(split, split.frame_ids[number * in_split // wanted], spec, data))
+            frame_id = split.frame_ids[number * in_split // wanted]
+            measured.append(measure_frame(split, frame_id, spec, data, assigner))
         except (DatasetError, ScanError) as error:
             damaged.append(error)
     if not measured:

@@ -15,7 +15,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.geometry.targets import assign_targets
+from asca_pillars.geometry.targets import Assigner, assign_targets
 from asca_pillars.pillars.pillar_spec import PillarSpec
 
 DOUBT_POINTS = 8_192
@@ -28,7 +28,7 @@ class MatchOutcome(IntEnum):
     LEFT_OUT = 0
     """Too few points, or its center beside the grid."""
     OVERLAPPED = 1
-    """An anchor overlaps it by positive_iou."""
+    """An anchor that is to find it overlaps it by positive_iou; with the assigner `atss`, at all."""
     FORCED = 2
     """None does; the nearest ones are matched to it nevertheless, and fit it badly."""
     MISSED = 3
@@ -73,7 +73,9 @@ class FrameMeasure(NamedTuple):
     doubt: FrameDoubt | None
 
 
-def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: DataConfig) -> FrameMeasure:
+def measure_frame(
+    split: LabeledSplit, frame_id: str, spec: PillarSpec, data: DataConfig, assigner: Assigner = "overlap"
+) -> FrameMeasure:
     """Read a frame without random changes, match it with the anchors, and count.
 
     Raises:
@@ -83,7 +85,7 @@ def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: Da
     frame = read_frame(split, frame_id, spec.class_names, camera_view=data.camera_view, min_points=0)
     points = points_in_boxes(frame.points, frame.boxes).sum(axis=0)
     to_find = replace(frame, labels=np.where(points < data.min_points, IGNORED, frame.labels))
-    outcomes, positives = match(to_find, spec)
+    outcomes, positives = match(to_find, spec, assigner)
     own = frame.labels != IGNORED
     scan = measure_scan(split.stored_points(frame_id), frame.points, spec)
     sample = frame.points[:: max(1, len(frame.points) // DOUBT_POINTS)]
@@ -99,20 +101,22 @@ def measure_frame(split: LabeledSplit, frame_id: str, spec: PillarSpec, data: Da
     )
 
 
-def match(frame: LabeledFrame, spec: PillarSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def match(
+    frame: LabeledFrame, spec: PillarSpec, assigner: Assigner = "overlap"
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The `MatchOutcome` of each box (M,), and counts (C,) of the positive anchors of each class."""
     # Rows in the place of the labels tell which boxes the grid holds.
     kept = within_ranges(replace(frame, labels=np.arange(len(frame.boxes))), spec.ranges).labels
     boxes, labels = frame.boxes[kept], frame.labels[kept]
-    targets = assign_targets(spec.anchors, spec.classes, boxes, labels)
-    anchors = spec.anchors.reshape(-1, 7)[targets.positives]
+    targets = assign_targets(spec.anchors, spec.classes, boxes, labels, assigner)
     outcomes = np.full(len(frame.boxes), MatchOutcome.LEFT_OUT, dtype=np.int64)
     for row in np.flatnonzero(labels != IGNORED):
-        overlap = aligned_bev_iou(anchors[targets.matched == row], boxes[row : row + 1]).max(initial=0)
-        if overlap >= spec.classes[labels[row]].positive_iou:
-            outcomes[kept[row]] = MatchOutcome.OVERLAPPED
+        overlap = aligned_bev_iou(targets.anchors[targets.matched == row], boxes[row : row + 1]).max(initial=0)
+        wanted = spec.classes[labels[row]].positive_iou if assigner == "overlap" else 0.0
+        if overlap == 0:
+            outcomes[kept[row]] = MatchOutcome.MISSED
         else:
-            outcomes[kept[row]] = MatchOutcome.FORCED if overlap > 0 else MatchOutcome.MISSED
+            outcomes[kept[row]] = MatchOutcome.OVERLAPPED if overlap >= wanted else MatchOutcome.FORCED
     return outcomes, np.bincount(labels[targets.matched], minlength=len(spec.classes))
 
 

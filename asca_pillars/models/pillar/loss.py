@@ -2,12 +2,15 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD
+from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.geometry.overlap import paired_iou_3d
 from asca_pillars.pillar_config import LossConfig
 
 
@@ -17,12 +20,14 @@ class TargetBatch(NamedTuple):
     Attributes:
         state: (B, H, W, A) int8, 1 positive, 0 negative, -1 without part.
         positives: (n,) flat indices into (B, H, W, A).
+        anchors: (n, 7), LiDAR frame.
         residuals: (n, 7).
         directions: (n,) int64.
     """
 
     state: Tensor
     positives: Tensor
+    anchors: Tensor
     residuals: Tensor
     directions: Tensor
 
@@ -52,8 +57,13 @@ def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossCon
     positives = max(len(targets.positives), 1)
     states = states_by_class(targets.state, maps.scores.shape[1] // targets.state.shape[-1])
     logits = _by_anchor(maps.scores, values=states.shape[1]).float()
-    classification = focal_loss(logits, states, config.focal_alpha, config.focal_gamma)
     residuals = _by_anchor(maps.boxes, values=7)[targets.positives].float()
+    if config.score_target == "one":
+        classification = focal_loss(logits, states, config.focal_alpha, config.focal_gamma)
+    else:
+        quality = logits.new_zeros(len(logits), 1)
+        quality[targets.positives, 0] = overlaps_found(residuals, targets)
+        classification = quality_focal_loss(logits, states, quality, config.focal_alpha, config.focal_gamma)
     directions = _by_anchor(maps.directions, values=2)[targets.positives].float()
     box = box_loss(residuals, targets.residuals, config.smooth_l1_beta)
     direction = F.cross_entropy(directions, targets.directions, reduction="sum")
@@ -96,6 +106,7 @@ def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
     return TargetBatch(
         targets.state.view(-1, anchors)[cells.long()],
         (row * anchors + targets.positives % anchors)[active],
+        targets.anchors[active],
         targets.residuals[active],
         targets.directions[active],
     )
@@ -111,6 +122,35 @@ def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Ten
     miss = torch.where(state == 1, torch.sigmoid(-logits), torch.sigmoid(logits))
     weight = torch.where(state == 1, alpha, 1 - alpha) * (state >= 0)
     return (weight * miss**gamma * cross_entropy).sum()
+
+
+def quality_focal_loss(logits: Tensor, state: Tensor, quality: Tensor, alpha: float, gamma: float) -> Tensor:
+    """Eq. (2) of Generalized Focal Loss (arXiv 2006.04388), summed: where `state` is 1 a score is to be `quality`.
+
+    With eq. (14)'s weights of positive and negative anchors, which that paper leaves out: where every quality is 1 this
+    is `focal_loss`.
+
+    Args:
+        logits, state: (anchors, scores), as of `focal_loss`.
+        quality: (anchors, 1) in [0, 1].
+        alpha, gamma: as of `focal_loss`; gamma is the paper's beta.
+    """
+    target = torch.where(state == 1, quality, torch.zeros_like(quality))
+    cross_entropy = F.binary_cross_entropy_with_logits(logits, target, reduction="none")
+    weight = torch.where(state == 1, alpha, 1 - alpha) * (state >= 0)
+    return (weight * (target - torch.sigmoid(logits)).abs() ** gamma * cross_entropy).sum()
+
+
+def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
+    """3D IoU of each positive anchor's predicted box with the one it is to find: (n, 7) -> (n,), without gradient."""
+    anchors, directions = targets.anchors.cpu().numpy(), targets.directions.cpu().numpy()
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows overlaps nothing
+        # Half a turn changes no overlap, so the direction that is predicted does not matter.
+        found, wanted = (
+            decode_boxes(each.detach().cpu().numpy(), directions, anchors).astype(np.float64)
+            for each in (residuals, targets.residuals)
+        )
+        return torch.from_numpy(paired_iou_3d(found, wanted)).to(residuals)
 
 
 def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:

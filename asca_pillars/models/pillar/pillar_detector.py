@@ -53,7 +53,8 @@ class PillarDetector(nn.Module):
     ) -> None:
         super().__init__()
         self.grid = spec.grid
-        self.preparation = PillarPreparation(spec, neck.rule if isinstance(neck, SparseRPNNeck) else None)
+        rule = neck.rule if isinstance(neck, SparseRPNNeck) else None
+        self.preparation = PillarPreparation(spec, rule, loss_weights.assigner)
         self.loss_weights = loss_weights
         self.encode = encode
         self.neck = neck

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from asca_pillars.data.frames import LabeledFrame, within_ranges
-from asca_pillars.geometry.targets import Targets, assign_targets
+from asca_pillars.geometry.targets import Assigner, Targets, assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch
 from asca_pillars.pillars.map_pooling import MapCells, map_cells
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -83,17 +83,19 @@ class PillarPreparation:
     Args:
         spec: grid, limits and classes.
         active_cells: of a sparse neck, whose tables are built here; None for a dense one.
+        assigner: what matches anchors with boxes.
     """
 
     spec: PillarSpec
     active_cells: MaskRule | None = None
+    assigner: Assigner = "overlap"
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedPillars:
         """Pillars of a frame and the targets of its anchors; nothing is drawn."""
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points)
-        targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels)
+        targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels, self.assigner)
         return PreparedPillars(pillars, self.place(pillars), targets)
 
     def collate(self, frames: Sequence[PreparedPillars]) -> LabeledPillars:
@@ -169,6 +171,7 @@ def batch_targets(frames: Sequence[Targets]) -> TargetBatch:
         positives=torch.from_numpy(
             np.concatenate([frame.positives + i * anchors_per_frame for i, frame in enumerate(frames)])
         ),
+        anchors=torch.from_numpy(np.concatenate([frame.anchors for frame in frames])),
         residuals=torch.from_numpy(np.concatenate([frame.residuals for frame in frames])),
         directions=torch.from_numpy(np.concatenate([frame.directions for frame in frames])),
     )

@@ -21,6 +21,7 @@ NO_TARGETS = Targets(
     np.zeros((ROWS, COLUMNS, COUNT), np.int8),
     np.empty(0, np.int64),
     np.empty((0, 7), np.float32),
+    np.empty((0, 7), np.float32),
     np.empty(0, np.int64),
     np.empty(0, np.int64),
 )
@@ -39,6 +40,7 @@ def batched(frames: list[Targets]) -> TargetBatch:
     return TargetBatch(
         state=torch.tensor(np.stack([frame.state for frame in frames])),
         positives=torch.tensor(positives, dtype=torch.int64),
+        anchors=torch.tensor(np.concatenate([frame.anchors for frame in frames])),
         residuals=torch.tensor(np.concatenate([frame.residuals for frame in frames])),
         directions=torch.tensor(np.concatenate([frame.directions for frame in frames])),
     )

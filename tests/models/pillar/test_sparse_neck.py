@@ -3,6 +3,7 @@
 import dataclasses
 import operator
 from functools import partial
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,10 +11,16 @@ import torch
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.models.pillar.loss import TargetBatch, detection_loss
+from asca_pillars.models.pillar.loss import TargetBatch, detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, PillarOutputs, build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarBatch, Placement, batch_pillars
+from asca_pillars.models.pillar.pillar_preparation import (
+    LabeledPillars,
+    PillarBatch,
+    Placement,
+    batch_pillars,
+    batch_targets,
+)
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.pillar_config import LossConfig, NetworkConfig, PillarModel
 from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder
@@ -100,9 +107,11 @@ def test_frames_of_a_batch_do_not_touch() -> None:
             np.testing.assert_allclose(found.scores, own.scores, atol=1e-5)
 
 
-def test_the_loss_is_that_of_the_active_anchors() -> None:
+@pytest.mark.parametrize("score_target", ["one", "iou"])
+def test_the_loss_is_that_of_the_active_anchors(score_target: Literal["one", "iou"]) -> None:
     frames = [make_scene(seed) for seed in (0, 1)]
     batch, detector = make_batch("fine"), make_detector("fine").eval()
+    detector.loss_weights = LossConfig(score_target=score_target)
     targets = [
         assign_targets(SPEC.anchors, SPEC.classes, boxes, np.array([SPEC.class_names.index(name) for name in names]))
         for _, boxes, names in frames
@@ -111,6 +120,7 @@ def test_the_loss_is_that_of_the_active_anchors() -> None:
     whole = TargetBatch(
         torch.from_numpy(np.stack([each.state for each in targets])),
         torch.from_numpy(np.concatenate([each.positives + i * size for i, each in enumerate(targets)])),
+        torch.from_numpy(np.concatenate([each.anchors for each in targets])),
         torch.from_numpy(np.concatenate([each.residuals for each in targets])),
         torch.from_numpy(np.concatenate([each.directions for each in targets])),
     )
@@ -130,10 +140,26 @@ def test_the_loss_is_that_of_the_active_anchors() -> None:
     kept = active[whole.positives // anchors]
     assert 0 < kept.sum() <= len(kept)
     state = torch.where(active.view(2, height, width, 1), whole.state, torch.tensor(-1, dtype=torch.int8))
-    masked = TargetBatch(state, whole.positives[kept], whole.residuals[kept], whole.directions[kept])
+    masked = TargetBatch(state, *(part[kept] for part in whole[1:]))
     as_maps = type(rows)(*(part.view(2, height, width, -1).permute(0, 3, 1, 2) for part in maps))
-    for one, other in zip(found, detection_loss(as_maps, masked, LossConfig()), strict=True):
+    for one, other in zip(found, detection_loss(as_maps, masked, detector.loss_weights), strict=True):
         torch.testing.assert_close(one, other)
+
+
+def test_targets_at_cells_are_those_of_their_anchors() -> None:
+    anchors, per_cell = SPEC.anchors.reshape(-1, 7), SPEC.anchors.shape[2]
+    _, boxes, names = make_scene(0)
+    labels = np.array([SPEC.class_names.index(name) for name in names])
+    targets = assign_targets(SPEC.anchors, SPEC.classes, boxes, labels)
+    cells = np.unique(targets.positives // per_cell)[1::2]
+    found = targets_at(batch_targets([targets]), torch.from_numpy(cells))
+    row, anchor = np.divmod(found.positives.numpy(), per_cell)
+    np.testing.assert_array_equal(found.anchors, anchors[cells[row] * per_cell + anchor])
+    own = np.isin(targets.positives // per_cell, cells)
+    assert 0 < own.sum() < len(own)
+    np.testing.assert_array_equal(found.residuals, targets.residuals[own])
+    np.testing.assert_array_equal(found.directions, targets.directions[own])
+    np.testing.assert_array_equal(found.state, targets.state.reshape(-1, per_cell)[cells])
 
 
 def test_it_detects_and_an_empty_scan_finds_nothing() -> None:
