@@ -13,7 +13,7 @@ from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.processes import in_processes
 
-VERSION = 1  # of what is computed; files of another version are computed again
+VERSION = 2  # of what is computed; files of another version are computed again
 _AT_ONCE = 16
 
 
