@@ -45,7 +45,7 @@ def prepare(
     spec = settings.model.spec
     split = open_split(data, settings.data.train_set)
     view = settings.data.camera_view and split.has_camera
-    inserter = prepare_inserter(split, spec, settings.data, insert)
+    inserter = prepare_inserter(split, spec, replace(settings.data, workers=workers), insert)
     if insert.method == "rs_aug":
         prepare_free_spaces(split, inserter.prepared, camera_view=view, workers=workers)
     lines = [f"{inserter.database.path}: {len(inserter.database)} objects of {len(split.frame_ids)} frames"]
