@@ -79,7 +79,7 @@ def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, 
         DatasetError: a class is wanted of which no object may be inserted, or the database cannot be built.
     """
     prepared = prepared_folder(split.root, data)
-    camera_view = data.camera_view
+    camera_view = data.camera_view and split.has_camera
     database = prepare_database(split, spec.class_names, prepared, camera_view=camera_view, workers=data.workers)
     counted = (database.point_counts >= data.min_points) & spec.ranges.hold_centers(database.boxes)
     counts = np.bincount(database.labels[counted], minlength=len(spec.class_names))
