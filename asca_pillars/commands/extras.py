@@ -5,7 +5,7 @@ import importlib.util
 from asca_pillars.errors import AscaError
 
 EXTRAS = {
-    "train": ("torch", "lightning", "onnx", "onnxscript", "sklearn", "tensorboard"),
+    "train": ("torch", "lightning", "onnx", "onnxscript", "tensorboard"),
     "sim": ("numba",),
     "openvino": ("openvino",),
     "eval": ("matplotlib",),

@@ -44,10 +44,9 @@ def prepare(
     insert = insert if insert.method != "none" else replace(insert, method="rs_aug")
     spec = settings.model.spec
     split = open_split(data, settings.data.train_set)
-    view = settings.data.camera_view and split.has_camera
-    inserter = prepare_inserter(split, spec, settings.data, insert)
+    inserter = prepare_inserter(split, spec, replace(settings.data, workers=workers), insert)
     if insert.method == "rs_aug":
-        prepare_free_spaces(split, inserter.prepared, camera_view=view, workers=workers)
+        prepare_free_spaces(split, inserter.prepared, camera_view=inserter.camera_view, workers=workers)
     lines = [f"{inserter.database.path}: {len(inserter.database)} objects of {len(split.frame_ids)} frames"]
     for name, objects, share in zip(spec.class_names, inserter.candidates, inserter.shares, strict=True):
         lines.append(f"  {name}: {len(objects)} with {insert.min_points} or more points, drawn {share:.0%} of the time")

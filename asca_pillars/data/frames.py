@@ -70,7 +70,8 @@ def read_frame(
     known |= {name: index for index, name in enumerate(class_names)}
     boxes, types = split.labeled_boxes(frame_id, known)
     labels = np.array([known[kind] for kind in types], dtype=np.int64)
-    labels[points_in_boxes(points, boxes).sum(axis=0) < min_points] = IGNORED
+    if min_points:
+        labels[points_in_boxes(points, boxes).sum(axis=0) < min_points] = IGNORED
     return LabeledFrame(frame_id, points, boxes, labels)
 
 

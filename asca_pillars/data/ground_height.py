@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ScanError
+from asca_pillars.geometry.common_plane import most_common_plane
 
 NEAR_M = (3.0, 20.0)  # beyond the vehicle itself, before the beams become sparse
 CELL_M = 1.0
@@ -20,7 +21,6 @@ MIN_SHARE = 0.3
 MAX_SHARE_BELOW = 0.3
 MAX_TILT_DEG = 5.0
 MAX_SPREAD_M = 0.3
-_DRAWS = 200
 _BY_HAND = "give the height in metres (--sensor-height 1.8, or sensor_height_m of the mounting)"
 
 
@@ -82,7 +82,7 @@ def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = N
     planes = []
     for number, points in enumerate(scans, start=1):
         plane = fit_ground_plane(level.points(points))
-        doubt = "too few points near the sensor" if plane is None else plane.doubt
+        doubt = "too few points near the sensor, or all on one line" if plane is None else plane.doubt
         if plane is None or doubt:
             raise ScanError(f"the sensor's height cannot be estimated from scan {number}: {doubt}; {_BY_HAND}")
         planes.append(plane)
@@ -105,7 +105,7 @@ def measured_mounting(
 
 
 def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
-    """The plane through most low points near the sensor: (N, >=3) level frame, metres; None: too few of them.
+    """The plane through most low points near the sensor: (N, >=3) level frame, metres; None: too few, or on a line.
 
     One low point per square metre has a say, so that the dense rings near the sensor do not outvote the rest. The
     draws are seeded: the same points give the same plane.
@@ -113,20 +113,9 @@ def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
     low = _low_points(points)
     if len(low) < MIN_CELLS:
         return None
-    rng = np.random.default_rng(0)
-    triples = low[rng.integers(0, len(low), (_DRAWS, 3))]
-    design = np.concatenate([triples[:, :, :2], np.ones((_DRAWS, 3, 1))], axis=2)
-    regular = np.abs(np.linalg.det(design)) > 10.0  # of twice the triangle's area, square metres
-    planes = np.linalg.solve(design[regular], triples[regular, :, 2, None])[..., 0]
-    full = np.column_stack([low[:, :2], np.ones(len(low))])
-    hits = (np.abs(low[:, 2] - planes @ full.T) < BAND_M).sum(axis=1)
-    plane = planes[hits.argmax()]
-    for _ in range(3):
-        near = np.abs(low[:, 2] - full @ plane) < BAND_M
-        if near.sum() < 3:
-            return None
-        plane = np.linalg.lstsq(full[near], low[near, 2], rcond=None)[0]
-    above = low[:, 2] - full @ plane
+    if (plane := most_common_plane(low, BAND_M)) is None:
+        return None
+    above = low[:, 2] - low[:, :2] @ plane[:2] - plane[2]
     tilt = float(np.degrees(np.arctan(np.hypot(*plane[:2]))))
     share, below = float((np.abs(above) < BAND_M).mean()), float((above < -2 * BAND_M).mean())
     x, y, z = (np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(1 + np.square(plane[:2]).sum())).tolist()

@@ -1,17 +1,13 @@
 """Simulating frame after frame in several processes, into a folder that says what it holds."""
 
-import contextlib
 import json
-import multiprocessing
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rich.progress import track
-
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path
+from asca_pillars.processes import in_processes
 
 ABOUT_FILE = "simulation.json"
 Item = TypeVar("Item")
@@ -28,15 +24,8 @@ def check_wishes(counts: dict[str, int], val_share: float) -> None:
 
 def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool) -> None:
     """Do a job for each item, in `workers` processes; the job has to be one that can be sent to a process."""
-    if workers > 1 and len(todo) > 1:
-        # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
-        with (
-            _one_thread_per_process(),
-            multiprocessing.get_context("spawn").Pool(min(workers, len(todo))) as pool,
-        ):
-            _watch(pool.imap_unordered(job, todo, chunksize=4), len(todo), progress)
-    else:
-        _watch(map(job, todo), len(todo), progress)
+    for _ in in_processes(job, todo, workers, "Simulating", progress=progress):
+        pass
 
 
 def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
@@ -59,22 +48,3 @@ def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
             temporary.write_text(text, encoding="utf-8")
     elif path.read_text(encoding="utf-8") != text:
         raise DatasetError(f"{path}: the frames there have another seed or configuration; choose another folder")
-
-
-@contextlib.contextmanager
-def _one_thread_per_process() -> Iterator[None]:
-    """Linear algebra of the processes started inside uses one thread each: the processes are the parallelism."""
-    before = os.environ.get("OPENBLAS_NUM_THREADS")
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["OPENBLAS_NUM_THREADS"]
-        else:
-            os.environ["OPENBLAS_NUM_THREADS"] = before
-
-
-def _watch(results: Iterable[None], total: int, progress: bool) -> None:
-    for _ in track(results, "Simulating", total=total, disable=not progress):
-        pass

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_pillars.data.ground_height import estimate_height, measured_mounting
+from asca_pillars.data.ground_height import estimate_height, fit_ground_plane, measured_mounting
 from asca_pillars.data.input_check import ground_z_m
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ScanError
@@ -48,6 +48,13 @@ def test_the_height_is_estimated(height: float) -> None:
     assert estimate.height_m == pytest.approx(height, abs=0.03)
     assert estimate.spread_m < 0.05 and estimate.share > 0.8 and estimate.scans == 3
     assert f"{height:.2f} m" in str(estimate) or abs(estimate.height_m - height) > 0.005
+
+
+def test_points_on_a_line_are_no_ground() -> None:
+    line = np.linspace((-16, -11.7, -1.7), (16, 11.9, -1.7), 4000)
+    assert fit_ground_plane(line) is None
+    with pytest.raises(ScanError, match="too few points near the sensor, or all on one line"):
+        estimate_height([line])
 
 
 def test_the_height_is_estimated_along_the_axes() -> None:

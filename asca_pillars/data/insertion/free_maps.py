@@ -1,20 +1,20 @@
 """Free space of a list's frames on disk: computed when a frame is first used, or all at once."""
 
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from asca_pillars.data.insertion.free_space import CELLS_PER_NODE, FreeSpace, find_free_space
 from asca_pillars.data.insertion.ground_fit import Ground
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.processes import in_processes
 
-VERSION = 1  # of what is computed; files of another version are computed again
+VERSION = 2  # of what is computed; files of another version are computed again
+_AT_ONCE = 16
 
 
 def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: bool, workers: int) -> None:
@@ -25,9 +25,8 @@ def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: boo
     """
     require_writable(prepared)
     job = partial(_prepare, split, prepared, camera_view)
-    with get_context("spawn").Pool(max(workers, 1)) as pool:
-        for _ in track(pool.imap_unordered(job, split.frame_ids, 8), "Free ground", total=len(split.frame_ids)):
-            pass
+    for _ in in_processes(job, split.frame_ids, workers, "Free ground", at_once=_AT_ONCE):
+        pass
 
 
 def load_free_space(split: LabeledSplit, frame_id: str, prepared: Path, *, camera_view: bool) -> FreeSpace:

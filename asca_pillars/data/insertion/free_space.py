@@ -6,8 +6,9 @@ separates the returns. A gap longer than that argument carries, an obstacle in i
 ground. Ground behind an obstacle is not seen and therefore not free, nor is anything beside the camera's view.
 """
 
+import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import cv2
@@ -15,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.insertion.clusters import cluster_boxes
-from asca_pillars.data.insertion.ground_fit import GROUND_BAND_M, LATTICE_M, Ground, fit_ground, plane_heights
+from asca_pillars.data.insertion.ground_fit import (
+    GROUND_BAND_M,
+    LATTICE_M,
+    REACH_M,
+    Ground,
+    fit_ground,
+    order_by_cell,
+    plane_heights,
+)
 from asca_pillars.geometry.boxes import footprints
 
 CELL_M = 0.25
@@ -24,6 +33,7 @@ CLEARANCE_M = 0.3  # height above the ground at which a beam may pass and still 
 MAX_SLOPE = 0.06
 _AZIMUTH_RAD = np.radians(0.4)
 _AZIMUTHS = 900
+_RINGS = math.ceil(math.sqrt(2) * REACH_M / CELL_M) + 1
 CELLS_PER_NODE = round(LATTICE_M / CELL_M)
 
 _Floats = NDArray[np.floating[Any]]
@@ -68,53 +78,60 @@ def find_free_space(points: _Floats) -> FreeSpace:
     ground = fit_ground(points)
     if ground is None:
         return nothing
-    low = ground.origin_m
-    high = low + np.array(ground.rise_m.shape) * LATTICE_M
-    xyz = points[((points[:, :2] >= low) & (points[:, :2] < high)).all(axis=1), :3].astype(np.float64)
-    above = xyz[:, 2] - ground.heights(xyz[:, :2])
+    low = ground.origin_m[:, None]
+    high = low + np.array(ground.rise_m.shape)[:, None] * LATTICE_M
+    xyz = np.ascontiguousarray(points[:, :3].T, np.float64)
+    xyz = np.compress(((xyz[:2] >= low) & (xyz[:2] < high)).all(axis=0), xyz, axis=1)
+    above = xyz[2] - ground.heights(xyz[:2].T)
     on_ground = np.abs(above) < GROUND_BAND_M
     obstacle = (above > OBSTACLE_M[0]) & (above < OBSTACLE_M[1])
-    clusters = cluster_boxes(xyz[obstacle], ground)
-    free = _seen_ground(xyz[:, :2], on_ground, obstacle, ground) & _is_flat(ground)
+    standing = np.compress(obstacle, xyz, axis=1)
+    clusters = cluster_boxes(standing.T, ground)
+    free = _seen_ground(xyz[:2], on_ground, obstacle, ground) & _is_flat(ground)
     blocked = np.zeros(free.shape, np.uint8)
-    cells = np.floor((xyz[obstacle, :2] - low) / CELL_M).astype(np.int64)
-    blocked[cells[:, 0], cells[:, 1]] = 1
-    for outline in footprints(clusters.astype(np.float64)):
-        # OpenCV's x is the second index, and integers name the middles of cells.
-        corners = ((outline - low) / CELL_M - 0.5)[:, ::-1]
-        cv2.fillConvexPoly(blocked, np.round(corners * 16).astype(np.int32), 1, shift=4)
+    rows, columns = ((standing[:2] - low) / CELL_M).astype(np.int64)
+    blocked[rows, columns] = 1
+    # OpenCV's x is the second index, and integers name the middles of cells.
+    corners = ((footprints(clusters.astype(np.float64)) - ground.origin_m) / CELL_M - 0.5)[..., ::-1]
+    for outline in np.round(corners * 16).astype(np.int32):
+        cv2.fillConvexPoly(blocked, outline, 1, shift=4)
     return FreeSpace(ground, free & (blocked == 0), clusters)
 
 
 def _seen_ground(
     xy_m: NDArray[np.float64], on_ground: NDArray[np.bool_], obstacle: NDArray[np.bool_], ground: Ground
 ) -> NDArray[np.bool_]:
-    """Cells (X, Y) of ground that beams landed on or passed low over, see the top of the module."""
+    """Cells (X, Y) of ground that beams landed on or passed low over, by points (2, N); see the top of the module."""
     used = on_ground | obstacle
-    xy_m, on_ground = xy_m[used], on_ground[used]
-    distance = np.hypot(xy_m[:, 0], xy_m[:, 1])
-    azimuth = _azimuth_bin(xy_m)
-    order = np.lexsort((distance, azimuth))
+    (x, y), on_ground = np.compress(used, xy_m, axis=1), on_ground[used]
+    distance = np.hypot(x, y)
+    azimuth = _azimuth_bin(x, y)
+    order = order_by_cell(azimuth, distance)
     distance, azimuth, on_ground = distance[order], azimuth[order], on_ground[order]
     sensor_m = max(-float(ground.heights(np.zeros((1, 2)))[0]), 0.5)
     gap = np.diff(distance)
     joined = (np.diff(azimuth) == 0) & on_ground[1:] & on_ground[:-1]
     joined &= gap < np.maximum(CLEARANCE_M / sensor_m * distance[1:], 2 * CELL_M)
-    start = np.concatenate([distance[:-1][joined], distance[on_ground]])
-    end = np.concatenate([distance[1:][joined], distance[on_ground]])
-    row = np.concatenate([azimuth[:-1][joined], azimuth[on_ground]])
-
-    rings = int(distance.max(initial=0.0) / CELL_M) + 2
-    edges = np.zeros((_AZIMUTHS, rings), np.int32)
-    np.add.at(edges, (row, (start / CELL_M).astype(np.int64)), 1)
-    np.add.at(edges, (row, (end / CELL_M).astype(np.int64) + 1), -1)
-    polar = (np.cumsum(edges, axis=1) > 0).astype(np.uint8)
+    cell = azimuth * _RINGS + (distance / CELL_M).astype(np.int64)
+    polar = np.zeros((_AZIMUTHS, _RINGS), bool)
+    polar.flat[cell[on_ground]] = True
+    start, length = cell[:-1][joined], np.diff(cell)[joined]
+    between = np.arange(length.sum()) + np.repeat(start - np.cumsum(length) + length, length)
+    polar.flat[between] = True
     # Some firings return nothing: one azimuth without returns between two with is no gap in the ground.
     polar |= np.roll(polar, 1, axis=0) & np.roll(polar, -1, axis=0)
 
-    middles = _middles(ground)
-    ring = np.minimum((np.hypot(middles[..., 0], middles[..., 1]) / CELL_M).astype(np.int64), rings - 1)
-    return polar[_azimuth_bin(middles), ring] > 0
+    row, column = np.round((ground.origin_m + REACH_M) / CELL_M).astype(int)
+    rows, columns = np.array(ground.rise_m.shape) * CELLS_PER_NODE
+    return polar.ravel()[_polar_index()[row : row + rows, column : column + columns]]
+
+
+@cache
+def _polar_index() -> NDArray[np.int64]:
+    """Azimuth and ring, as one index, of each cell (X, Y) of the square that reaches REACH_M around the sensor."""
+    middles = np.arange(-REACH_M, REACH_M, CELL_M) + 0.5 * CELL_M
+    x, y = np.meshgrid(middles, middles, indexing="ij")
+    return _azimuth_bin(x, y) * _RINGS + (np.hypot(x, y) / CELL_M).astype(np.int64)
 
 
 def _is_flat(ground: Ground) -> NDArray[np.bool_]:
@@ -126,17 +143,11 @@ def _is_flat(ground: Ground) -> NDArray[np.bool_]:
     return np.repeat(np.repeat(flat, CELLS_PER_NODE, axis=0), CELLS_PER_NODE, axis=1)
 
 
-def _azimuth_bin(xy_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    return (np.arctan2(xy_m[..., 1], xy_m[..., 0]) / _AZIMUTH_RAD).astype(np.int64) % _AZIMUTHS
+def _azimuth_bin(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.floor(np.arctan2(y_m, x_m) / _AZIMUTH_RAD).astype(np.int64) % _AZIMUTHS
 
 
 def _nodes(ground: Ground) -> NDArray[np.float64]:
     """(X, Y, 2) middles of the ground's lattice."""
     rows, columns = np.indices(ground.rise_m.shape)
     return ground.origin_m + (np.stack([rows, columns], axis=-1) + 0.5) * LATTICE_M
-
-
-def _middles(ground: Ground) -> NDArray[np.float64]:
-    """(X, Y, 2) middles of the free map's cells."""
-    rows, columns = np.indices(tuple(np.array(ground.rise_m.shape) * CELLS_PER_NODE))
-    return ground.origin_m + (np.stack([rows, columns], axis=-1) + 0.5) * CELL_M

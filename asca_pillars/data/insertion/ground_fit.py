@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.common_plane import most_common_plane
+
 REACH_M = 80.0  # beyond this, nothing is looked at
 LATTICE_M = 1.0
 GROUND_BAND_M = 0.15  # ground returns lie within this of the surface
@@ -57,48 +59,35 @@ def fit_plane(points: _Floats) -> NDArray[np.float64] | None:
     Fed one low point per square metre within 40 m: walls and cars, most of the points, become few, and the rings near
     the sensor no longer outvote the rest. The draws are seeded: the same points give the same plane.
     """
-    # Only frames seen for the first time need it; loaders that find their maps on disk start without.
-    from sklearn.linear_model import LinearRegression, RANSACRegressor
-
-    near = points[np.hypot(points[:, 0], points[:, 1]) < _PLANE_REACH_M, :3].astype(np.float64)
-    cells = np.floor(near[:, 0] / LATTICE_M).astype(np.int64) * 10_000 + np.floor(near[:, 1] / LATTICE_M).astype(int)
-    low = near[_low_per_cell(cells, near[:, 2])[1]]
+    x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
+    near = np.flatnonzero(np.hypot(x, y) < _PLANE_REACH_M)
+    cells = np.floor(x[near] / LATTICE_M) * 10_000 + np.floor(y[near] / LATTICE_M)
+    low = near[_low_per_cell(cells, z[near])]
     if len(low) < _MIN_CELLS:
         return None
-    model = RANSACRegressor(
-        LinearRegression(),
-        residual_threshold=_PLANE_BAND_M,
-        is_model_valid=lambda fit, *_: bool(np.abs(fit.coef_).max() < _MAX_SLOPE),
-        max_trials=60,
-        random_state=0,
-    )
-    try:
-        model.fit(low[:, :2], low[:, 2])
-    except ValueError:  # scikit-learn's way to say that no draw was a plane that may be
-        return None
-    return np.array([*model.estimator_.coef_, model.estimator_.intercept_])
+    return most_common_plane(np.stack([x[low], y[low], z[low]], axis=1), _PLANE_BAND_M, _MAX_SLOPE)
 
 
 def fit_ground(points: _Floats) -> Ground | None:
     """The surface under points (N, >=3), metres, LiDAR frame, or None where no ground is to be seen."""
-    points = points[(np.abs(points[:, :2]) < REACH_M).all(axis=1)]
-    plane = fit_plane(points)
+    # By columns: to choose among many short rows takes ten times as long.
+    xyz = np.ascontiguousarray(points[:, :3].T, np.float64)
+    xyz = np.compress((np.abs(xyz[:2]) < REACH_M).all(axis=0), xyz, axis=1)
+    plane = fit_plane(xyz.T)
     if plane is None:
         return None
-    xy = points[:, :2].astype(np.float64)
-    above = points[:, 2] - plane_heights(plane, xy)
+    above = xyz[2] - plane_heights(plane, xyz[:2].T)
     # Hills take the ground away from the plane, the farther the more; what lies outside this wedge is none.
-    wedge = np.abs(above) < 0.4 + 0.05 * np.hypot(xy[:, 0], xy[:, 1])
-    xy, above = xy[wedge], above[wedge]
+    wedge = np.abs(above) < 0.4 + 0.05 * np.hypot(xyz[0], xyz[1])
+    xy, above = np.compress(wedge, xyz[:2], axis=1).T, above[wedge]
     origin = np.floor(xy.min(axis=0) / _COARSE_M) * _COARSE_M
     coarse = _coarse_surface(xy, above, origin)
     near = np.abs(above - _interpolate(coarse, origin, _COARSE_M, xy)) < 0.25
-    xy, above = xy[near], above[near]
     shape = np.array(coarse.shape) * round(_COARSE_M / LATTICE_M)
-    cells = np.ravel_multi_index(tuple(((xy - origin) / LATTICE_M).astype(np.int64).T), tuple(shape))
+    cells = _flat_cells(np.compress(near, xy.T, axis=1).T, origin, LATTICE_M, shape)
     counts = np.bincount(cells, minlength=shape.prod())
-    sums = np.bincount(cells, above, minlength=shape.prod())
-    means = np.divide(sums, counts, out=np.zeros_like(sums), where=counts > 0)
+    sums = np.bincount(cells, above[near], minlength=shape.prod())
+    means = sums / np.maximum(counts, 1)
     weights = np.minimum(counts, 5.0)
     rise = _smooth(means.reshape(shape), weights.reshape(shape), sigmas=(0.7, 1.5, 4, 12))
     return Ground(plane, origin, rise.astype(np.float16))
@@ -110,11 +99,11 @@ def _coarse_surface(xy_m: _Floats, above_m: _Floats, origin_m: _Floats) -> NDArr
     The low points of the cells follow the ground except under cars and behind walls. A morphological opening tells
     these: it cuts off what stands out and is narrower than its window, and keeps slopes.
     """
-    index = ((xy_m - origin_m) / _COARSE_M).astype(np.int64)
-    shape = tuple(index.max(axis=0) + 1)
-    cells, low = _low_per_cell(np.ravel_multi_index(tuple(index.T), shape), above_m)
+    shape = ((xy_m - origin_m).max(axis=0) / _COARSE_M).astype(np.int64) + 1
+    cells = _flat_cells(xy_m, origin_m, _COARSE_M, shape)
+    low = _low_per_cell(cells, above_m)
     lowest = np.full(shape, _UNKNOWN, np.float32)
-    lowest.flat[cells] = above_m[low]
+    lowest.flat[cells[low]] = above_m[low]
     window = np.ones((_OPENING_CELLS, _OPENING_CELLS), np.uint8)
     eroded = cv2.erode(lowest, window)
     opened = cv2.dilate(np.where(eroded < _UNKNOWN, eroded, -_UNKNOWN), window)
@@ -122,11 +111,24 @@ def _coarse_surface(xy_m: _Floats, above_m: _Floats, origin_m: _Floats) -> NDArr
     return _smooth(np.where(ground > 0, lowest, 0), ground, sigmas=(0.7, 2, 6, 20))
 
 
-def _low_per_cell(cells: NDArray[np.int64], heights_m: _Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The cells in use, and for each the index of the point below which a tenth of its points lie."""
-    order = np.lexsort((heights_m, cells))
-    unique, first, count = np.unique(cells[order], return_index=True, return_counts=True)
-    return unique, order[first + count // 10]
+def _flat_cells(xy_m: _Floats, origin_m: _Floats, step_m: float, shape: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index (N,), in a raster (X, Y) laid out row by row, of the cell that each of (N, 2) lies in."""
+    index = ((xy_m - origin_m) / step_m).astype(np.int64)
+    return np.asarray(index[:, 0] * shape[1] + index[:, 1])
+
+
+def order_by_cell(cells: NDArray[Any], values_m: _Floats) -> NDArray[np.int64]:
+    """Order (N,) of points by the number of their cell and, within a cell, by a value, metres."""
+    # Both as one number: sorted in a sixth of the time that two take.
+    return np.argsort(cells * (4 * _UNKNOWN) + np.clip(values_m, -_UNKNOWN, _UNKNOWN))
+
+
+def _low_per_cell(cells: NDArray[Any], heights_m: _Floats) -> NDArray[np.int64]:
+    """For each cell in use the index of the point below which a tenth of its points lie."""
+    order = order_by_cell(cells, heights_m)
+    first = np.flatnonzero(np.diff(cells[order], prepend=np.nan))
+    count = np.diff(first, append=len(cells))
+    return np.asarray(order[first + count // 10])
 
 
 def _smooth(values: _Floats, weights: _Floats, sigmas: tuple[float, ...]) -> NDArray[np.float32]:
@@ -145,12 +147,12 @@ def _smooth(values: _Floats, weights: _Floats, sigmas: tuple[float, ...]) -> NDA
 
 def _interpolate(lattice: NDArray[Any], origin_m: _Floats, step_m: float, xy_m: _Floats) -> NDArray[np.float64]:
     """Bilinear values (N,) at (N, 2) of a lattice of cell middles."""
-    size = np.array(lattice.shape)
-    place = np.clip((xy_m - origin_m) / step_m - 0.5, 0, size - 1)
-    low = np.minimum(place.astype(np.int64), np.maximum(size - 2, 0))
-    high = np.minimum(low + 1, size - 1)
-    (i, j), (k, m), (s, t) = low.T, high.T, (place - low).T
-    values = lattice if len(xy_m) < lattice.size else lattice.astype(np.float64)
-    return np.asarray(
-        (values[i, j] * (1 - t) + values[i, m] * t) * (1 - s) + (values[k, j] * (1 - t) + values[k, m] * t) * s
-    )
+    rows, columns = lattice.shape
+    xy = np.ascontiguousarray(xy_m.T)
+    place = np.clip((xy - origin_m[:, None]) / step_m - 0.5, 0, [[rows - 1], [columns - 1]])
+    (i, j), (s, t) = place.astype(np.int64), place % 1
+    values = (lattice if len(xy_m) < lattice.size else lattice.astype(np.float64)).ravel()
+    here, below, right = i * columns + j, np.where(i < rows - 1, columns, 0), np.where(j < columns - 1, 1, 0)
+    near = values[here] * (1 - t) + values[here + right] * t
+    far = values[here + below] * (1 - t) + values[here + below + right] * t
+    return np.asarray(near * (1 - s) + far * s)

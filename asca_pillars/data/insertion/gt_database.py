@@ -1,6 +1,6 @@
 """The object database: every labelled object of a training list with the points inside its box (section 3.5, step 1).
 
-It is built once and lies beside the data:
+It is built once, by as many processes as are granted, and lies beside the data:
 
     <prepared>/objects/<list>-<key>.json   what it was built from, and how many objects of each class it holds
                                .npy        points of all objects, one after the other: (P, 4) float32
@@ -14,20 +14,21 @@ at once write the same bytes. Workers map the points into memory, which they sha
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
-from asca_pillars.data.frames import LabeledFrame, read_frame
+from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.processes import in_processes
 
 VERSION = 1
+_AT_ONCE = 16
 
 
 class StoredObject(NamedTuple):
@@ -90,7 +91,7 @@ class ObjectDatabase:
 
 
 def prepare_database(
-    split: LabeledSplit, class_names: Sequence[str], prepared: Path, *, camera_view: bool
+    split: LabeledSplit, class_names: Sequence[str], prepared: Path, *, camera_view: bool, workers: int = 1
 ) -> ObjectDatabase:
     """The database of a list's frames: the one on disk if nothing has changed since, else a new one.
 
@@ -99,6 +100,7 @@ def prepare_database(
         class_names: types that enter, as labels 0, 1, ...
         prepared: folder for what is computed once per dataset.
         camera_view: only points that the camera sees.
+        workers: processes that read the frames; any number of them gives the same bytes.
 
     Raises:
         DatasetError: a frame cannot be read, or the folder cannot be written.
@@ -113,11 +115,8 @@ def prepare_database(
     path = prepared / "objects" / f"{split.name}-{_key(split, built_from)}.json"
     if not path.exists():
         require_writable(prepared)
-        frames = (
-            read_frame(split, frame_id, class_names, camera_view=camera_view, min_points=0)
-            for frame_id in track(split.frame_ids, "Object database")
-        )
-        _build(path, frames, built_from)
+        read = partial(_read_objects, split, tuple(class_names), camera_view)
+        _build(path, in_processes(read, split.frame_ids, workers, "Object database", at_once=_AT_ONCE), built_from)
     return ObjectDatabase(path)
 
 
@@ -131,29 +130,55 @@ def _key(split: LabeledSplit, built_from: dict[str, Any]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _build(path: Path, frames: Iterable[LabeledFrame], built_from: dict[str, Any]) -> None:
-    names = built_from["class_names"]
-    boxes, labels, numbers = [np.zeros((0, 7), np.float32)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    points = [np.zeros((0, 4), np.float32)]
-    for number, frame in enumerate(frames):
-        wanted = frame.labels >= 0
-        boxes.append(frame.boxes[wanted])
-        labels.append(frame.labels[wanted])
-        numbers.append(np.full(int(wanted.sum()), number))
-        inside = points_in_boxes(frame.points, frame.boxes[wanted])
-        points += [frame.points[own] for own in inside.T]
+class _FrameObjects(NamedTuple):
+    """The M objects of one frame: boxes (M, 7), labels (M,), the number (M,) of points of each, and these (P, 4)."""
+
+    boxes: NDArray[np.float32]
+    labels: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    points: NDArray[np.float32]
+
+
+def _read_objects(split: LabeledSplit, class_names: Sequence[str], camera_view: bool, frame_id: str) -> _FrameObjects:
+    frame = read_frame(split, frame_id, class_names, camera_view=camera_view, min_points=0)
+    wanted = frame.labels >= 0
+    inside = points_in_boxes(frame.points, frame.boxes[wanted]).T
+    points = frame.points[np.nonzero(inside)[1]]
+    return _FrameObjects(frame.boxes[wanted], frame.labels[wanted], inside.sum(axis=1), points)
+
+
+def _build(path: Path, frames: Iterable[_FrameObjects], built_from: dict[str, Any]) -> None:
+    boxes, labels, counts = [np.zeros((0, 7), np.float32)], [np.zeros(0, np.int64)], [np.zeros(1, np.int64)]
+    numbers = [np.zeros(0, np.int64)]
+    with writing(path.with_suffix(".npy")) as temporary, temporary.open("wb") as file:
+        # Points are most of it, gigabytes of a large list: they go to the file as they come.
+        _write_header(file, 0)
+        for number, frame in enumerate(frames):
+            boxes.append(frame.boxes)
+            labels.append(frame.labels)
+            counts.append(frame.counts)
+            numbers.append(np.full(len(frame.labels), number))
+            file.write(frame.points.tobytes())
+        first = np.cumsum(np.concatenate(counts))
+        file.seek(0)
+        _write_header(file, int(first[-1]))
     all_labels = np.concatenate(labels)
-    counts = np.bincount(all_labels, minlength=len(names))
-    with writing(path.with_suffix(".npy")) as temporary:
-        np.save(temporary, np.concatenate(points))
     with writing(path.with_suffix(".npz")) as temporary:
         np.savez(
             temporary,
             boxes=np.concatenate(boxes),
             labels=all_labels,
             frames=np.concatenate(numbers),
-            first=np.cumsum([len(own) for own in points]),
+            first=first,
         )
+    names = built_from["class_names"]
+    objects = np.bincount(all_labels, minlength=len(names)).tolist()
     with writing(path) as temporary:
-        objects = dict(zip(names, counts.tolist(), strict=True))
-        temporary.write_text(json.dumps({**built_from, "objects": objects}, indent=2) + "\n", encoding="utf-8")
+        text = json.dumps({**built_from, "objects": dict(zip(names, objects, strict=True))}, indent=2)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _write_header(file: BinaryIO, points: int) -> None:
+    """The start of an .npy file of (points, 4) float32; NumPy makes it equally long for any number of points."""
+    header = {"descr": "<f4", "fortran_order": False, "shape": (points, 4)}
+    np.lib.format.write_array_header_1_0(file, header)

@@ -73,11 +73,14 @@ class Inserter:
 def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, insert: InsertConfig) -> Inserter:
     """Build or find the object database, and work out how often each class is to be drawn.
 
+    It is built by as many processes as load batches later (`data.workers`).
+
     Raises:
         DatasetError: a class is wanted of which no object may be inserted, or the database cannot be built.
     """
     prepared = prepared_folder(split.root, data)
-    database = prepare_database(split, spec.class_names, prepared, camera_view=data.camera_view)
+    camera_view = data.camera_view and split.has_camera
+    database = prepare_database(split, spec.class_names, prepared, camera_view=camera_view, workers=data.workers)
     counted = (database.point_counts >= data.min_points) & spec.ranges.hold_centers(database.boxes)
     counts = np.bincount(database.labels[counted], minlength=len(spec.class_names))
     wanted = np.array([insert.proportions.get(name, 0.0) for name in spec.class_names])
@@ -85,7 +88,7 @@ def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, 
         wanted[:] = 1.0
     shares = insertion_shares(counts / len(split.frame_ids), wanted, insert.objects)
     inserter = Inserter(
-        split, insert, spec.ranges, data.camera_view, data.min_points, prepared, database, tuple(shares.tolist())
+        split, insert, spec.ranges, camera_view, data.min_points, prepared, database, tuple(shares.tolist())
     )
     for name, share, objects in zip(spec.class_names, shares, inserter.candidates, strict=True):
         if share > 0 and not len(objects):

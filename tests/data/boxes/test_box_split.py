@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from asca_pillars.commands.prepare import prepare
 from asca_pillars.config import Config, DataConfig, InsertConfig, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
@@ -17,9 +19,11 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
+from asca_pillars.data.training_frames import open_frames
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.pillar_config import PillarModel
+from asca_pillars.schema import to_dict
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import SPEC, make_scene, write_dataset
 
@@ -164,6 +168,19 @@ def test_inspection_and_insertion_read_it(root: Path) -> None:
     grown = insert_objects(frame, inserter, np.random.default_rng(0))
     assert len(grown.boxes) > len(frame.boxes)
     assert inserter.free_space("000000").free.any()
+
+
+def test_prepare_makes_the_maps_that_training_reads(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a camera nothing is cut to its view, whatever `data.camera_view` is by default."""
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
+    prepare(tmp_path / "own.yaml", data=root, workers=1)
+    monkeypatch.setattr("asca_pillars.data.insertion.free_maps.find_free_space", lambda _: pytest.fail("again"))
+    monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
+    insert = replace(CONFIG.augment, insert=InsertConfig("rs_aug", objects=4))
+    inserter = open_frames(root, replace(CONFIG, augment=insert), training=True).inserter
+    assert inserter is not None and all(inserter.free_space(name).free.any() for name in inserter.split.frame_ids)
 
 
 def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 from shapely.geometry import MultiPoint, Point, Polygon
 
 from asca_pillars.data.insertion.clusters import cluster_boxes
-from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace, find_free_space
+from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace, _azimuth_bin, find_free_space
 from asca_pillars.data.insertion.ground_fit import fit_ground
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
 from tests.data.insertion.simple_streets import AZIMUTHS_RAD, LEVEL, cast, stand, street
@@ -94,6 +94,12 @@ def test_nothing_is_free_without_ground(points: np.ndarray) -> None:
     space = find_free_space(points)
     assert space.ground is None and not len(middles(space)) and space.clusters.shape == (0, 7)
     assert not space.is_free(np.zeros((3, 2))).any()
+
+
+def test_every_azimuth_is_as_wide_as_another() -> None:
+    """Straight ahead, where the angle changes its sign, too."""
+    angle = np.radians(np.arange(-180, 180, 0.1) + 0.05)
+    assert (np.bincount(_azimuth_bin(np.cos(angle), np.sin(angle))) == 4).all()
 
 
 def test_cells_agree_with_lookups() -> None:

@@ -88,12 +88,39 @@ def test_it_is_the_same_everywhere(split: KittiSplit, tmp_path: Path) -> None:
         assert one.with_suffix(suffix).read_bytes() == other.with_suffix(suffix).read_bytes()
 
 
-def test_a_build_that_fails_leaves_nothing_to_be_used(split: KittiSplit, tmp_path: Path) -> None:
+def test_any_number_of_processes_writes_the_same(
+    split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gt_database, "_AT_ONCE", 1)  # three frames are too few for two processes otherwise
+    alone = prepare(split, tmp_path / "alone").path
+    monkeypatch.setattr(gt_database, "read_frame", lambda *_, **__: pytest.fail("read in this process"))
+    shared = prepare_database(split, TYPES, tmp_path / "shared", camera_view=True, workers=2).path
+    assert alone.name == shared.name
+    for suffix in (".json", ".npy", ".npz"):
+        assert alone.with_suffix(suffix).read_bytes() == shared.with_suffix(suffix).read_bytes()
+
+
+def test_the_points_are_a_file_as_numpy_writes_it(split: KittiSplit, tmp_path: Path) -> None:
+    """They are written as they come, and how many they are stands before them."""
+    path = prepare(split, tmp_path / "prepared").path.with_suffix(".npy")
+    np.save(tmp_path / "again.npy", np.load(path))
+    assert path.read_bytes() == (tmp_path / "again.npy").read_bytes()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_build_that_fails_leaves_nothing_to_be_used(
+    split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    monkeypatch.setattr(gt_database, "_AT_ONCE", 1)
     text = split.label_path("000002").read_text()
     split.label_path("000002").write_text("Car 1 2\n")
     with pytest.raises(DatasetError, match="000002"):
-        prepare(split, tmp_path / "prepared")
-    assert not list((tmp_path / "prepared").rglob("*.json")) and not list((tmp_path / "prepared").rglob(".*"))
+        prepare_database(split, TYPES, tmp_path / "prepared", camera_view=True, workers=workers)
+    assert (
+        not list((tmp_path / "prepared").rglob("*.n*"))
+        and not list((tmp_path / "prepared").rglob("*.json"))
+        and not list((tmp_path / "prepared").rglob(".*"))
+    )
     split.label_path("000002").write_text(text)
     assert len(prepare(split, tmp_path / "prepared")) == 12
 
