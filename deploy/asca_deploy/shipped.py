@@ -9,7 +9,7 @@ from asca_pillars.errors import BundleError
 
 def default_bundle_path() -> Path:
     """Folder of the model that is used unless another is named: 8-bit, the faster one on every CPU."""
-    return shipped_bundles()["asca_small_sparse_sim_int8"]
+    return shipped_bundles()["asca_sim_int8"]
 
 
 def shipped_bundles() -> dict[str, Path]:

@@ -63,4 +63,4 @@ def test_a_bundle_to_compare_with_is_looked_at_first(
 
 def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:
     with pytest.raises(ConfigError, match="compared with itself"):
-        CliRunner().invoke(app, ["bench", "--compare", "asca_small_sparse_sim_int8"], catch_exceptions=False)
+        CliRunner().invoke(app, ["bench", "--compare", "asca_sim_int8"], catch_exceptions=False)

@@ -33,10 +33,12 @@ def test_weights_lie_in_some_bundles(tiny_bundle: Path, tmp_path: Path, monkeypa
 
 
 def test_shipped_files_lie_in_the_package() -> None:
-    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_small_sparse_sim_int8")
+    assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_sim_int8")
     assert [(name, load_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
         ("asca_refine_sim", "asca_refine_sim"),
         ("asca_refine_sim_int8", "asca_refine_sim_int8"),
+        ("asca_sim", "asca_sim"),
+        ("asca_sim_int8", "asca_sim_int8"),
         ("asca_small_sim", "asca_small_sim"),
         ("asca_small_sim_int8", "asca_small_sim_int8"),
         ("asca_small_sparse_sim", "asca_small_sparse_sim"),
