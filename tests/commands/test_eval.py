@@ -210,8 +210,7 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
     assert refusal(tmp_path, **texts, gallery=3) == "--gallery 3 draws scans: give --data ROOT that has them"
     assert refusal(tmp_path, **texts, score=float("nan")) == "--score nan must be a number"
     assert refusal(tmp_path, data=root, score=0.04) == (
-        "score 0.04 of Car is below --min-score 0.05, the lowest that asca_sim_int8 is run with; "
-        "lower --min-score"
+        "score 0.04 of Car is below --min-score 0.05, the lowest that asca_sim_int8 is run with; lower --min-score"
     )
     assert "bundle.json" in refusal(tmp_path, model=tmp_path, data=root)
     assert "velodyne" in refusal(tmp_path, data=tmp_path)
