@@ -69,15 +69,19 @@ def assign_targets(
         labels: (N,) index into `classes`, or IGNORED.
         assigner: which of both.
     """
-    match = _match_by_overlap if assigner == "overlap" else _match_nearest
-    state, positives, matched = match(anchors, classes, boxes, labels)
+    wanted = np.flatnonzero(labels != IGNORED)
+    if assigner == "overlap":
+        state, positives, matched = _match_by_overlap(anchors, classes, boxes, labels, wanted)
+    else:
+        state, positives, matched = _match_nearest(anchors, boxes, labels, wanted)
+    state[_ignored(anchors, classes, boxes[labels == IGNORED]) & (state == 0)] = -1
     found = anchors.reshape(-1, 7)[positives]
     residuals, directions = encode_boxes(boxes[matched], found)
     return Targets(state, positives, found, residuals, directions, matched)
 
 
 class _Matches(NamedTuple):
-    """`state`, `positives` and `matched` of `Targets`."""
+    """`state` without regard to IGNORED boxes, `positives` and `matched` of `Targets`."""
 
     state: NDArray[np.int8]
     positives: NDArray[np.int64]
@@ -89,16 +93,14 @@ def _match_by_overlap(
     classes: Sequence[ClassSpec],
     boxes: NDArray[np.float32],
     labels: NDArray[np.int64],
+    wanted: NDArray[np.int64],
 ) -> _Matches:
     shape = anchors.shape[:3]
     best_iou, best_box = np.zeros(shape), np.full(shape, -1)
-    ignored = np.zeros(shape, dtype=bool)
     forced: list[tuple[NDArray[np.int64], int]] = []
-    for box_index, (box, label) in enumerate(zip(boxes, labels, strict=True)):
-        if label == IGNORED:
-            _mark_ignored(ignored, anchors, classes, box)
-            continue
-        window, iou = _overlaps_nearby(anchors, box, classes[label], label)
+    for box_index in wanted:
+        label = labels[box_index]
+        window, iou = _overlaps_nearby(anchors, boxes[box_index], classes[label], label)
         closer = iou > best_iou[window]
         best_iou[window] = np.where(closer, iou, best_iou[window])
         best_box[window] = np.where(closer, box_index, best_box[window])
@@ -111,7 +113,6 @@ def _match_by_overlap(
     )
     state = -(best_iou >= negative_iou).astype(np.int8)
     state[best_iou >= positive_iou] = 1
-    state[ignored & (state == 0)] = -1
     for places, box_index in forced:
         state[tuple(places.T)] = 1
         best_box[tuple(places.T)] = box_index
@@ -120,24 +121,16 @@ def _match_by_overlap(
 
 
 def _match_nearest(
-    anchors: NDArray[np.float32],
-    classes: Sequence[ClassSpec],
-    boxes: NDArray[np.float32],
-    labels: NDArray[np.int64],
+    anchors: NDArray[np.float32], boxes: NDArray[np.float32], labels: NDArray[np.int64], wanted: NDArray[np.int64]
 ) -> _Matches:
-    ignored = np.zeros(anchors.shape[:3], dtype=bool)
     claims = [_Claims(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
-    for box_index, (box, label) in enumerate(zip(boxes, labels, strict=True)):
-        if label == IGNORED:
-            _mark_ignored(ignored, anchors, classes, box)
-        else:
-            claims.append(_claims(anchors, box, label, box_index))
+    claims += [_claims(anchors, boxes[row], labels[row], row) for row in wanted]
     places, claimants, weights = (np.concatenate(parts) for parts in zip(*claims, strict=True))
     order = np.lexsort((weights, places))
     places, claimants = places[order], claimants[order]
     strongest = np.diff(places, append=-1) != 0  # the last one at each place
     positives, matched = places[strongest], claimants[strongest]
-    state = -ignored.astype(np.int8)
+    state = np.zeros(anchors.shape[:3], np.int8)
     state.reshape(-1)[positives] = 1
     return _Matches(state, positives, matched)
 
@@ -181,16 +174,16 @@ def _nearest_cells(
     return rows[nearest // len(columns)], columns[nearest % len(columns)]
 
 
-def _mark_ignored(
-    ignored: NDArray[np.bool_],
-    anchors: NDArray[np.float32],
-    classes: Sequence[ClassSpec],
-    box: NDArray[np.float32],
-) -> None:
-    """Set (H, W, A) where anchors overlap `box`, which is IGNORED, by the `negative_iou` of their class."""
-    for class_index, spec in enumerate(classes):
-        window, iou = _overlaps_nearby(anchors, box, spec, class_index)
-        ignored[window] |= iou >= spec.negative_iou
+def _ignored(
+    anchors: NDArray[np.float32], classes: Sequence[ClassSpec], boxes: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Where anchors (H, W, A) overlap one of `boxes`, which are IGNORED, by the `negative_iou` of their class."""
+    ignored = np.zeros(anchors.shape[:3], dtype=bool)
+    for box in boxes:
+        for class_index, spec in enumerate(classes):
+            window, iou = _overlaps_nearby(anchors, box, spec, class_index)
+            ignored[window] |= iou >= spec.negative_iou
+    return ignored
 
 
 def _overlaps_nearby(
