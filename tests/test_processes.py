@@ -1,6 +1,7 @@
 """Jobs in processes: the results of one process, in its order, whatever their number."""
 
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,6 +61,9 @@ class Noting:
         self.folder = folder
 
     def __call__(self, item: int) -> int:
+        deadline = time.monotonic() + 60
+        while len(list(self.folder.iterdir())) < 2 and time.monotonic() < deadline:  # one may start after the other
+            time.sleep(0.01)
         return item
 
     def __reduce__(self) -> tuple[object, ...]:
