@@ -1,7 +1,8 @@
 """The sparse backbone in 8 bits, as `quantize` does it for the dense one; here no empty space has to be rounded.
 
 A channel's step is its largest value on the calibration scans / 255. Weights are rounded together (GPTQ), and the bias
-makes up for what rounding changes in the mean.
+makes up for what rounding changes in the mean. The head's are rounded for the cells that boxes come from: what it says
+of the many others is hardly read.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -16,6 +17,8 @@ from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.tables.neck_tables import NeckTables
 
+BEST_CELLS = 32  # of each scan and anchor, that the head is rounded for
+OTHER_CELLS = 64  # of each scan beside them, so that background stays background
 _TINY = 1e-6
 
 
@@ -86,12 +89,20 @@ def scale_rows_to_steps(backbone: SparseBackbone, samples: Iterable[SparseSample
 
 @torch.no_grad()
 def read_moments(backbone: SparseBackbone, samples: Sequence[SparseSample]) -> dict[str, InputMoments]:
-    """Moments of what every product reads on the calibration scans, at PLACES places of each at most."""
+    """Moments of what every product reads on the calibration scans, at PLACES places of each at most.
+
+    The head's are those of the cells with its highest scores, and of a few others.
+    """
     generator = torch.Generator().manual_seed(0)
     sums: dict[str, tuple[Tensor, Tensor]] = {}
     for sample in samples:
-        for name, read, _ in backbone.passes(*sample):
-            rows = read[torch.randperm(len(read), generator=generator)[:PLACES]].double()
+        for name, read, output in backbone.passes(*sample):
+            places = torch.randperm(len(read), generator=generator)[:PLACES]
+            if name == HEAD:
+                scores = output[:, : backbone.head_channels[0]]
+                best = scores.topk(min(BEST_CELLS, len(scores)), dim=0).indices.flatten()
+                places = torch.cat([best, places[:OTHER_CELLS]])
+            rows = read[places].double()
             mean, squares = rows.sum(dim=0) / max(len(rows), 1), rows.T @ rows / max(len(rows), 1)
             before = sums.get(name, (torch.zeros_like(mean), torch.zeros_like(squares)))
             sums[name] = before[0] + mean / len(samples), before[1] + squares / len(samples)

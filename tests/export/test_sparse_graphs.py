@@ -15,7 +15,14 @@ from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.quantize import STEPS, canvas_steps
 from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
-from asca_export.sparse_quantize import SparseSample, quantized_backbone, scale_rows_to_steps
+from asca_export.sparse_quantize import (
+    BEST_CELLS,
+    OTHER_CELLS,
+    SparseSample,
+    quantized_backbone,
+    read_moments,
+    scale_rows_to_steps,
+)
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
@@ -125,6 +132,20 @@ def test_eight_bits_are_near_and_the_same_for_any_number_of_threads(tmp_path: Pa
         for found, want in zip(runs[0], expected, strict=True):
             error = float(np.sqrt(np.square(found - want.numpy()).mean()))
             assert 0 < error < 0.1 * float(want.std()), (error, float(want.std()))
+
+
+def test_the_head_is_rounded_for_the_cells_that_boxes_come_from() -> None:
+    detector = sparse_detector("fine")
+    sample = sample_of(detector, SPEC.pillarize(SCANS[0]))
+    backbone = SparseBackbone(detector)
+    *_, (name, read, output) = backbone.passes(*sample)
+    scores = output[:, : detector.head.scores.out_channels]
+    assert name == HEAD and len(read) > 10 * (BEST_CELLS + OTHER_CELLS)
+    best = torch.cat([read[column.argsort(descending=True)[:BEST_CELLS]] for column in scores.T])
+    mean = read_moments(backbone, [sample])[HEAD].mean * (len(best) + OTHER_CELLS) - best.sum(dim=0)
+    spread = (read.std(dim=0) / OTHER_CELLS**0.5).clamp_min(1e-3)
+    assert float(((mean / OTHER_CELLS - read.mean(dim=0)) / spread).abs().max()) < 5, "a sample of all cells"
+    assert float(((best.mean(dim=0) - read.mean(dim=0)) / spread).abs().max()) > 5, "which the best ones are not"
 
 
 def test_the_eight_bit_graph_runs_in_integers(tmp_path: Path) -> None:
