@@ -1,6 +1,7 @@
 """What the host computes for the second stage of one scan: neighbours of keypoints and of the grids of proposals."""
 
 import math
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -82,7 +83,11 @@ class RefineScan:
 
 
 def refine_scan(
-    points: NDArray[np.float32], proposed: Proposed, proposals: Detections, settings: RefineSettings
+    points: NDArray[np.float32],
+    proposed: Proposed,
+    proposals: Detections,
+    settings: RefineSettings,
+    executor: Executor | None = None,
 ) -> RefineScan:
     """Neighbours for some proposals of a scan, in their order.
 
@@ -90,18 +95,21 @@ def refine_scan(
         points: (N, 4) of the scan.
         proposed: what the first stage says of it.
         proposals: those of them to be refined.
+        executor: of a thread for the grids' neighbours, while those of the keypoints are sought in this one.
     """
     keypoints = proposed.keypoints
+    pending = None if executor is None else executor.submit(grid_neighbors, keypoints, proposals.boxes, settings)
     # Points that no ball around a keypoint can reach are not worth sorting.
     all_boxes = proposed.proposals.boxes
     margin_m = max(settings.ball_radii_m) + _keypoint_margin_m(keypoints, all_boxes)
     near = points_near_boxes(points, all_boxes, margin_m)
-    grid = grid_neighbors(keypoints, proposals.boxes, settings)
+    balls = tuple(ball_query(near, keypoints, radius_m, settings.ball_samples) for radius_m in settings.ball_radii_m)
+    grid = grid_neighbors(keypoints, proposals.boxes, settings) if pending is None else pending.result()
     return RefineScan(
         points=near,
         keypoints=keypoints,
         bev=proposed.bev,
-        ball_indices=tuple(ball_query(near, keypoints, r, settings.ball_samples) for r in settings.ball_radii_m),
+        ball_indices=balls,
         grid_points=grid.points,
         grid_indices=grid.indices,
         roi_features=roi_features(proposals),

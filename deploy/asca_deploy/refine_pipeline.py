@@ -1,6 +1,7 @@
 """The pipeline of kind pillar_refine: a pillar detector proposes, a second graph refines (PV-RCNN, section 3)."""
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -85,6 +86,7 @@ class RefinePipeline:
         session = providers.open_session(path, "cpu", "float32", threads)
         inputs, outputs = refine_interface(bundle.refine, len(bundle.spec.classes))
         self._second: Session = check_interface(path, session, inputs, outputs)
+        self._executor = ThreadPoolExecutor(1) if threads > 1 else None
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedScan:
         """Points (N, 4) -> the input of the first stage's backbone."""
@@ -100,7 +102,7 @@ class RefinePipeline:
         """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
         proposed = proposed_from(raw.found, raw.points, self.spec, self.section.seen)
         laps.append(("propose", perf_counter()))
-        scan = refine_scan(raw.points, proposed, proposed.proposals, self.section.neighbors)
+        scan = refine_scan(raw.points, proposed, proposed.proposals, self.section.neighbors, self._executor)
         inputs = refine_inputs(scan)
         laps.append(("neighbors", perf_counter()))
         confidence, residuals = self.refine(inputs)

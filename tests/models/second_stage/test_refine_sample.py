@@ -1,5 +1,7 @@
 """Samples of the second stage and their batches."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -41,6 +43,17 @@ def test_points_that_no_ball_reaches_are_left_out_and_no_others() -> None:
         inside = np.minimum((away < radius_m).sum(axis=1), GEOMETRY.ball_samples)
         for row, count in zip(indices, inside, strict=True):
             assert len(np.unique(row)) == pytest.approx(count, abs=0)
+
+
+def test_a_second_thread_finds_the_same_neighbors() -> None:
+    points = make_scene(0)[0]
+    proposed = propose_on(RandomStage(), points, SETTINGS)
+    alone = refine_scan(points, proposed, proposed.proposals, GEOMETRY)
+    with ThreadPoolExecutor(1) as executor:
+        found = refine_scan(points, proposed, proposed.proposals, GEOMETRY, executor)
+    for one, two in zip(alone.ball_indices + alone.grid_indices, found.ball_indices + found.grid_indices, strict=True):
+        np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(alone.grid_points, found.grid_points)
 
 
 def test_indices_of_a_batch_point_at_the_same_rows() -> None:
