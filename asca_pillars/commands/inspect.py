@@ -57,15 +57,15 @@ def inspect(
     from asca_pillars.commands import inspect_tables as show
     from asca_pillars.commands.inspect_pictures import draw_frames
     from asca_pillars.commands.propose_config import propose_config
-    from asca_pillars.config import load_config, pillar_spec
+    from asca_pillars.config import load_config
     from asca_pillars.data.inspection.findings import findings
+    from asca_pillars.data.inspection.input_cells import input_cells
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
     from asca_pillars.data.open_split import open_split
     from asca_pillars.errors import ConfigError, DatasetError
     from asca_pillars.files import write_json
 
     settings = load_config(config)
-    pillar_spec(settings)  # pillars are what is inspected; said before the dataset is read
     console = Console(markup=False, highlight=False)
     frames_of = open_split(data, settings.data.train_set if split is None else split)
     if settings.model.kind == "pillar_refine":
@@ -77,7 +77,7 @@ def inspect(
         settings = dataclasses.replace(settings, model=with_first_stage(settings.model))
     if propose is not None:
         settings = propose_config(frames_of, settings, propose, frames, console)
-    spec, min_points = pillar_spec(settings), settings.data.min_points
+    spec, min_points = settings.model.spec, settings.data.min_points
     view = settings.data.camera_view and frames_of.has_camera
     assigner = settings.model.loss.assigner if settings.model.kind == "pillar" else "overlap"
     inspection = inspect_dataset(frames_of, spec, settings.data, assigner=assigner, frames=frames, progress=True)
@@ -94,7 +94,7 @@ def inspect(
     console.print(
         show.types(inspection, spec.class_names), show.objects(inspection, min_points), show.sizes(inspection), sep="\n"
     )
-    console.print(show.matching(inspection), show.scans(inspection, spec.limits, view), sep="\n")
+    console.print(show.matching(inspection), show.scans(inspection, input_cells(spec), view), sep="\n")
     if draw is not None:
         draw_frames(data, frames_of.name, settings, draw, out, console)
     errors = [finding for finding in found if finding.level == "error"]

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from rich.table import Table
 
 from asca_pillars.data.frames import NEIGHBOR_TYPES
+from asca_pillars.data.inspection.input_cells import InputCells
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread
-from asca_pillars.pillars.pillarize import PillarLimits
 
 
 def types(inspection: Inspection, names: Sequence[str]) -> Table:
@@ -63,13 +63,12 @@ def matching(inspection: Inspection) -> Table:
     return table
 
 
-def scans(inspection: Inspection, limits: PillarLimits, camera_view: bool) -> Table:
-    """Points, reflectance, ground and pillars of the scans."""
+def scans(inspection: Inspection, kind: InputCells, camera_view: bool) -> Table:
+    """Points, reflectance, ground, pillars or voxels of the scans."""
     scans = inspection.scans
     low, high = scans.reflectance_stored
     ground = "not seen" if scans.ground_z_m is None else _spread(scans.ground_z_m, 2)
     bottoms = " to ".join(f"{bottom:.2f}" for bottom in scans.anchor_bottoms_m)
-    over = _share(scans.scans_over_max_pillars, inspection.frames)
     view = "in the camera's view" if camera_view else "per scan"
     table = _table("Scans: 10 % / median / 90 %", "", "found", "expected")
     table.add_row(f"points {view}", _spread(scans.points), "")
@@ -78,10 +77,14 @@ def scans(inspection: Inspection, limits: PillarLimits, camera_view: bool) -> Ta
     table.add_row("reflectance in the files", f"{low:.3g} to {high:.5g}", "0 to 1")
     table.add_row("mean reflectance as read", _spread(scans.reflectance, 3), "")
     table.add_row("ground near the sensor, z in m", ground, f"{bottoms}, where the anchors stand")
-    table.add_row("pillars", _spread(scans.pillars), f"at most {limits.max_pillars}")
-    table.add_row("scans with more pillars", f"{over}, largest {scans.pillars.largest:.0f}", "0 %")
-    table.add_row("points of the fullest pillar", str(scans.fullest_pillar), f"at most {limits.max_points}")
-    table.add_row("pillars with more points", f"{100 * scans.crowded_share:.1f} %", "")
+    if kind.max_cells is None:
+        table.add_row(f"{kind.name}s", _spread(scans.cells), "")
+    else:
+        over = _share(scans.scans_over_max_cells, inspection.frames)
+        table.add_row(f"{kind.name}s", _spread(scans.cells), f"at most {kind.max_cells}")
+        table.add_row(f"scans with more {kind.name}s", f"{over}, largest {scans.cells.largest:.0f}", "0 %")
+    table.add_row(f"points of the fullest {kind.name}", str(scans.fullest_cell), f"at most {kind.max_points}")
+    table.add_row(f"{kind.name}s with more points", f"{100 * scans.crowded_share:.1f} %", "")
     table.add_row("points lost that way", f"{100 * scans.cut_share:.1f} %", "")
     return table
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,27 @@ class VoxelGrid(Strict):
         sizes = np.array(self.size_m) * strides[::-1]
         return (lows + (np.stack([x, y, z], axis=-1) + 0.5) * sizes).astype(np.float32)
 
+    def cells(self, points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+        """Flat index (y * nx + x) * nz + z of each point's voxel, or -1 outside the ranges.
+
+        A border belongs to the voxel above it. Points are compared as float32.
+
+        Args:
+            points: (N, >=3), columns x, y, z in metres, LiDAR frame; non-finite ones are outside.
+
+        Returns:
+            (N,) int64.
+        """
+        points = np.require(points, np.float32, ["C", "ALIGNED"])
+        lows_m, highs_m = (np.array(ends, np.float32) for ends in zip(*self.ranges_m, strict=True))
+        sizes_m = np.array(self.size_m, np.float32)
+        kernels = load_kernels(KERNELS)
+        if kernels is None:
+            return _cells_of_points(points[:, :3], lows_m, highs_m, sizes_m, self.shape)
+        cells = np.empty(len(points), np.int64)
+        kernels.cells_of_points(points, lows_m, highs_m, sizes_m, self.shape, cells)
+        return cells
+
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which points (M, >= 3), metres, LiDAR frame, lie in a voxel: (M,)."""
         lows_m, highs_m = (np.array(ends, np.float32) for ends in zip(*self.ranges_m, strict=True))
@@ -121,23 +142,17 @@ def voxelize(points: NDArray[np.float32], grid: VoxelGrid, cell_map: CellMap) ->
     if points.ndim != 2 or points.shape[1] < 3 or cell_map.shape != grid.shape:
         raise ValueError(f"points {points.shape} must be (M, >=3), the map {cell_map.shape} of shape {grid.shape}")
     points = np.require(points, np.float32, ["C", "ALIGNED"])
-    lows_m = np.array([low for low, _ in grid.ranges_m], np.float32)
-    highs_m = np.array([high for _, high in grid.ranges_m], np.float32)
-    sizes_m, shape = np.array(grid.size_m, np.float32), grid.shape
-    cell_of_point = np.empty(len(points), np.int64)
+    cell_of_point = grid.cells(points)
+    cell_map.activate_points(cell_of_point)
     kernels = load_kernels(KERNELS)
     if kernels is None:
-        cell_of_point = _cells_of_points(points[:, :3], lows_m, highs_m, sizes_m, shape)
-        cell_map.activate_points(cell_of_point)
         features = _means(points, cell_of_point, cell_map.cells, grid.max_points)
     else:
-        kernels.cells_of_points(points, lows_m, highs_m, sizes_m, shape, cell_of_point)
-        cell_map.activate_points(cell_of_point)
         sums = np.zeros((len(cell_map), points.shape[1]))
         features = np.empty(sums.shape, np.float32)
         counts = np.zeros(len(cell_map), np.int64)
         columns = cell_map.columns
-        kernels.sum_points(points, cell_of_point, shape[0], *columns, grid.max_points, sums, counts, features)
+        kernels.sum_points(points, cell_of_point, grid.shape[0], *columns, grid.max_points, sums, counts, features)
     return Voxels(features, cell_map.cells, int((cell_of_point < 0).sum()))
 
 

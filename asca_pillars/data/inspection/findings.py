@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from asca_pillars.data.input_check import TOLERANCE_M
+from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
-from asca_pillars.pillars.pillar_spec import PillarSpec
 
 # From these shares on something is a mistake or costs recall; KITTI and the simulator stay well below all of them.
 BOXES_OUTSIDE = 0.05
@@ -18,7 +18,7 @@ BOXES_FORCED = 0.6
 BOXES_MISSED = 0.02
 POINTS_OUTSIDE = 0.75  # a grid that looks forward loses half of what a sensor sees in a full turn
 POINTS_CUT = 0.2
-SCANS_OVER_MAX_PILLARS = 0.05
+SCANS_OVER_MAX_CELLS = 0.05
 ODD_SCANS = 0.5  # single scans of other sensors look turned: on wide streets and at crossings
 FEWEST_BOXES = 10  # with fewer a share or a mean says nothing
 DIM_REFLECTANCE = 0.1  # the brightest point of all scans; the reflectance was scaled down twice
@@ -32,7 +32,7 @@ class Finding(NamedTuple):
     text: str
 
 
-def findings(inspection: Inspection, spec: PillarSpec, min_points: int) -> list[Finding]:
+def findings(inspection: Inspection, spec: InspectedSpec, min_points: int) -> list[Finding]:
     """Errors first: frames that cannot be read, classes without positives; then whatever else looks wrong.
 
     Args:
@@ -64,7 +64,7 @@ def findings(inspection: Inspection, spec: PillarSpec, min_points: int) -> list[
     return found
 
 
-def _why_none(facts: ClassFacts, inspection: Inspection, spec: PillarSpec, min_points: int) -> str:
+def _why_none(facts: ClassFacts, inspection: Inspection, spec: InspectedSpec, min_points: int) -> str:
     if facts.boxes == 0:
         return _why_no_boxes(facts.name, inspection)
     if facts.no_points == facts.boxes:
@@ -73,7 +73,7 @@ def _why_none(facts: ClassFacts, inspection: Inspection, spec: PillarSpec, min_p
         return f"all of its boxes have fewer points than data.min_points = {min_points}; lower it"
     if facts.missed == 0:
         return f"its boxes with enough points lie outside the grid; {_widen(facts, spec)}"
-    return "the anchors stand too far apart to overlap its boxes; make model.spec.grid.v_max_m and v_y_m smaller"
+    return f"the anchors stand too far apart to overlap its boxes; {input_cells(spec).closer_anchors}"
 
 
 def _why_no_boxes(name: str, inspection: Inspection) -> str:
@@ -91,7 +91,7 @@ def _why_no_boxes(name: str, inspection: Inspection) -> str:
     return f"no label is of this type (there are: {there}); {advice}"
 
 
-def _of_class(facts: ClassFacts, spec: PillarSpec, min_points: int) -> Iterator[str]:
+def _of_class(facts: ClassFacts, spec: InspectedSpec, min_points: int) -> Iterator[str]:
     boxes = facts.boxes
     if boxes < FEWEST_BOXES:
         number = "1 box" if boxes == 1 else f"{boxes} boxes"
@@ -125,12 +125,12 @@ def _of_class(facts: ClassFacts, spec: PillarSpec, min_points: int) -> Iterator[
     if facts.missed > BOXES_MISSED * to_find:
         yield (
             f"{_percent(facts.missed, to_find)} of the objects have no positive anchor; "
-            "make model.spec.grid.v_max_m and v_y_m smaller, or look for labels that stand twice"
+            f"{input_cells(spec).closer_anchors}, or look for labels that stand twice"
         )
     if facts.forced > BOXES_FORCED * to_find >= facts.misfits:
         yield (
             f"{_percent(facts.forced, to_find)} of the objects have no anchor that overlaps them by positive_iou, only "
-            "the nearest; make model.spec.grid.v_max_m and v_y_m smaller, or lower positive_iou and negative_iou"
+            f"the nearest; {input_cells(spec).closer_anchors}, or lower positive_iou and negative_iou"
         )
 
 
@@ -192,7 +192,7 @@ def _of_height(inspection: Inspection) -> Iterator[str]:
         )
 
 
-def _of_points(scans: ScanFacts, frames: int, spec: PillarSpec) -> Iterator[str]:
+def _of_points(scans: ScanFacts, frames: int, spec: InspectedSpec) -> Iterator[str]:
     if scans.dropped_points:
         yield (
             f"points with a value that is not finite: {scans.dropped_points}, in {scans.scans_with_dropped} of "
@@ -208,19 +208,20 @@ def _of_points(scans: ScanFacts, frames: int, spec: PillarSpec) -> Iterator[str]
             f"{100 * scans.outside_share:.0f} % of the points lie outside the grid; widen its ranges, or check the "
             "axes: x is forward, y left, z up, in meters"
         )
-    if scans.scans_over_max_pillars > SCANS_OVER_MAX_PILLARS * frames:
+    kind = input_cells(spec)
+    if scans.scans_over_max_cells > SCANS_OVER_MAX_CELLS * frames:
         yield (
-            f"{_percent(scans.scans_over_max_pillars, frames)} of the scans have more pillars than "
-            f"limits.max_pillars = {spec.limits.max_pillars} and lose the rest; raise it to {scans.pillars.largest:.0f}"
+            f"{_percent(scans.scans_over_max_cells, frames)} of the scans have more pillars than "
+            f"model.spec.limits.max_pillars = {kind.max_cells} and lose the rest; raise it to {scans.cells.largest:.0f}"
         )
     if scans.cut_share > POINTS_CUT:
         yield (
-            f"limits.max_points = {spec.limits.max_points} takes away {100 * scans.cut_share:.0f} % of the points; "
-            "raise it, or make the pillars smaller"
+            f"{kind.max_points_key} = {kind.max_points} takes away {100 * scans.cut_share:.0f} % of the points; "
+            f"raise it, or make the {kind.name}s smaller"
         )
 
 
-def _widen(facts: ClassFacts, spec: PillarSpec) -> str:
+def _widen(facts: ClassFacts, spec: InspectedSpec) -> str:
     """Where the boxes are, beside the range of x, of y or both that does not hold them."""
     assert facts.reach_m is not None, "there are boxes"
     ranges = (spec.grid.x_range_m, spec.grid.y_range_m)

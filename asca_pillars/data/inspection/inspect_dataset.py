@@ -14,13 +14,13 @@ from rich.progress import track
 
 from asca_pillars.config import DataConfig
 from asca_pillars.data.input_check import FrameDoubt
+from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError, ScanError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.geometry.targets import Assigner
-from asca_pillars.pillars.pillar_spec import PillarSpec
 
 
 class Spread(NamedTuple):
@@ -71,7 +71,7 @@ class ClassFacts:
 
 @dataclass(frozen=True)
 class ScanFacts:
-    """The scans, and their pillars before any limit.
+    """The scans, and their pillars or voxels before any limit.
 
     Attributes:
         points: points of a scan that training sees.
@@ -84,9 +84,10 @@ class ScanFacts:
         reflectance: mean reflectance of a scan, in 0..1.
         ground_z_m: height of the ground near the sensor; None where no scan shows it.
         anchor_bottoms_m: lowest and highest bottom of the classes' anchors.
-        pillars: pillars of a scan; `scans_over_max_pillars` have too many.
-        fullest_pillar: most points of any pillar.
-        crowded_share: share of the pillars with more than max_points.
+        cell: `pillar` or `voxel`.
+        cells: of a scan; `scans_over_max_cells` have more than the detector takes.
+        fullest_cell: most points of any cell.
+        crowded_share: share of the cells with more than max_points.
         cut_share: share of the points inside the grid that max_points takes away.
     """
 
@@ -101,9 +102,10 @@ class ScanFacts:
     reflectance: Spread
     ground_z_m: Spread | None
     anchor_bottoms_m: tuple[float, float]
-    pillars: Spread
-    scans_over_max_pillars: int
-    fullest_pillar: int
+    cell: str
+    cells: Spread
+    scans_over_max_cells: int
+    fullest_cell: int
     crowded_share: float
     cut_share: float
 
@@ -135,7 +137,7 @@ class Inspection:
 
 def inspect_dataset(
     split: LabeledSplit,
-    spec: PillarSpec,
+    spec: InspectedSpec,
     data: DataConfig,
     *,
     assigner: Assigner = "overlap",
@@ -184,13 +186,13 @@ def inspect_dataset(
     )
 
 
-def _class_facts(frames: Sequence[FrameMeasure], index: int, detector: PillarSpec, min_points: int) -> ClassFacts:
-    spec, grid = detector.classes[index], detector.grid
+def _class_facts(frames: Sequence[FrameMeasure], index: int, detector: InspectedSpec, min_points: int) -> ClassFacts:
+    spec = detector.classes[index]
     own = np.concatenate([frame.labels for frame in frames]) == index
     boxes = np.concatenate([frame.boxes for frame in frames])[own].astype(np.float64)
     points = np.concatenate([frame.points for frame in frames])[own]
     outcomes = np.concatenate([frame.outcomes for frame in frames])[own]
-    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
+    low, high = np.array(detector.ranges).T
     outside = (boxes[:, :3] < low) | (boxes[:, :3] >= high)
     cut = (boxes[:, 2] - boxes[:, 5] / 2 < low[2]) | (boxes[:, 2] + boxes[:, 5] / 2 > high[2])
     return ClassFacts(
@@ -223,9 +225,9 @@ def _misfits(boxes: NDArray[np.float64], spec: ClassSpec) -> int:
     return int((aligned_bev_iou(anchor, in_place) < spec.positive_iou).sum())
 
 
-def _scan_facts(scans: Sequence[ScanMeasure], spec: PillarSpec) -> ScanFacts:
+def _scan_facts(scans: Sequence[ScanMeasure], spec: InspectedSpec) -> ScanFacts:
     column = dict(zip(ScanMeasure._fields, np.array(scans, dtype=np.float64).T, strict=True))
-    points, inside, pillars = column["points"], column["inside"].sum(), column["pillars"]
+    points, inside, cells, kind = column["points"], column["inside"].sum(), column["cells"], input_cells(spec)
     highest, ground = column["stored_reflectance_high"], column["ground_z_m"]
     bottoms = [item.z_m - item.height_m / 2 for item in spec.classes]
     above_one = highest[highest > 1]
@@ -241,10 +243,11 @@ def _scan_facts(scans: Sequence[ScanMeasure], spec: PillarSpec) -> ScanFacts:
         reflectance=_some(column["reflectance"]),
         ground_z_m=_spread(ground[np.isfinite(ground)]),
         anchor_bottoms_m=(min(bottoms), max(bottoms)),
-        pillars=_some(pillars),
-        scans_over_max_pillars=int((pillars > spec.limits.max_pillars).sum()),
-        fullest_pillar=int(column["fullest"].max()),
-        crowded_share=_share(column["crowded"].sum(), pillars.sum()),
+        cell=kind.name,
+        cells=_some(cells),
+        scans_over_max_cells=int((cells > kind.max_cells).sum()) if kind.max_cells is not None else 0,
+        fullest_cell=int(column["fullest"].max()),
+        crowded_share=_share(column["crowded"].sum(), cells.sum()),
         cut_share=_share(column["cut"].sum(), inside),
     )
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from asca_pillars.config import DataConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.input_check import FrameDoubt, doubt_frame, ground_z_m
+from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.geometry.targets import Assigner, assign_targets
-from asca_pillars.pillars.pillar_spec import PillarSpec
 
 DOUBT_POINTS = 8_192
 """Of a scan that its axes are judged by."""
@@ -36,10 +36,10 @@ class MatchOutcome(IntEnum):
 
 
 class ScanMeasure(NamedTuple):
-    """A scan as its file has it (stored) and as training sees it, and its pillars before any limit.
+    """A scan as its file has it (stored) and as training sees it, and its pillars or voxels before any limit.
 
     `inside` counts the points seen inside the grid, `reflectance` is the mean over those seen, in 0..1, and
-    `ground_z_m` is NaN where the ground near the sensor cannot be seen. `crowded` pillars have more than max_points,
+    `ground_z_m` is NaN where the ground near the sensor cannot be seen. `crowded` cells have more than max_points,
     which takes `cut` points away.
     """
 
@@ -50,7 +50,7 @@ class ScanMeasure(NamedTuple):
     stored_reflectance_high: float
     reflectance: float
     ground_z_m: float
-    pillars: int
+    cells: int
     fullest: int
     crowded: int
     cut: int
@@ -74,7 +74,7 @@ class FrameMeasure(NamedTuple):
 
 
 def measure_frame(
-    split: LabeledSplit, frame_id: str, spec: PillarSpec, data: DataConfig, assigner: Assigner = "overlap"
+    split: LabeledSplit, frame_id: str, spec: InspectedSpec, data: DataConfig, assigner: Assigner = "overlap"
 ) -> FrameMeasure:
     """Read a frame without random changes, match it with the anchors, and count.
 
@@ -102,7 +102,7 @@ def measure_frame(
 
 
 def match(
-    frame: LabeledFrame, spec: PillarSpec, assigner: Assigner = "overlap"
+    frame: LabeledFrame, spec: InspectedSpec, assigner: Assigner = "overlap"
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The `MatchOutcome` of each box (M,), and counts (C,) of the positive anchors of each class."""
     # Rows in the place of the labels tell which boxes the grid holds.
@@ -120,23 +120,23 @@ def match(
     return outcomes, np.bincount(labels[targets.matched], minlength=len(spec.classes))
 
 
-def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: PillarSpec) -> ScanMeasure:
+def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: InspectedSpec) -> ScanMeasure:
     """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4), in the LiDAR frame."""
     finite = stored[np.isfinite(stored).all(axis=1)]
     ground = ground_z_m(finite)
-    cells = spec.grid.cells(seen)
-    per_pillar = np.bincount(cells[cells >= 0])
-    per_pillar = per_pillar[per_pillar > 0]
+    kind = input_cells(spec)
+    cells = kind.of_points(seen)
+    _, per_cell = np.unique(cells[cells >= 0], return_counts=True)
     return ScanMeasure(
         points=len(seen),
-        inside=int(per_pillar.sum()),
+        inside=int(per_cell.sum()),
         dropped=len(stored) - len(finite),
         stored_reflectance_low=float(finite[:, 3].min(initial=0)),
         stored_reflectance_high=float(finite[:, 3].max(initial=0)),
         reflectance=float(seen[:, 3].mean(dtype=np.float64)) if len(seen) else 0.0,
         ground_z_m=np.nan if ground is None else ground,
-        pillars=len(per_pillar),
-        fullest=int(per_pillar.max(initial=0)),
-        crowded=int((per_pillar > spec.limits.max_points).sum()),
-        cut=int(np.maximum(per_pillar - spec.limits.max_points, 0).sum()),
+        cells=len(per_cell),
+        fullest=int(per_cell.max(initial=0)),
+        crowded=int((per_cell > kind.max_points).sum()),
+        cut=int(np.maximum(per_cell - kind.max_points, 0).sum()),
     )

@@ -2,23 +2,25 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.config import Config, pillar_spec
+from asca_pillars.config import Config
 from asca_pillars.data.inspection.findings import FEWEST_BOXES
+from asca_pillars.data.inspection.input_cells import InspectedSpec
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.pillars.fitting import NECK_STRIDE
-from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.schema import to_dict
+from asca_pillars.tables.voxel_spec import MAP_MULTIPLE
 
 HELD = 0.98  # share of the boxes that each range has to hold
 MATCHED = 0.6  # share of the boxes that an anchor should overlap by positive_iou; the best positive_iou that gives it
@@ -27,6 +29,7 @@ NEGATIVE_BELOW = 0.15  # negative_iou below positive_iou, as for KITTI's classes
 BEHIND_M = -5.0  # boxes beyond this need a grid that looks back
 FINDABLE_POINTS = 5  # ranges are those of the boxes with so many: far ones with fewer would make the grid huge
 SPARE_PILLARS = 1.1  # room above the fullest scan
+_TENTH_M = 0.1
 
 _Floats = NDArray[np.float64]
 
@@ -75,20 +78,19 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
         )
     measured = {kind: np.array(found[kind], np.float64) for kind in names}
     of_classes = [np.array(findable[kind] or found[kind], np.float64) for kind in names]
-    before = pillar_spec(config)
-    grid = _grid(before.grid, np.concatenate(of_classes))
-    classes = tuple(_class(kind, boxes, grid) for kind, boxes in measured.items())
-    fullest = max(len(np.unique(cells[cells >= 0])) for cells in map(grid.cells, clouds))
-    limits = before.limits
-    if fullest > limits.max_pillars:
-        limits = replace(limits, max_pillars=math.ceil(fullest * SPARE_PILLARS / 1000) * 1000)
-    spec = replace(before, grid=grid, limits=limits, classes=classes)
+    spec = _holding(config.model.spec, np.concatenate(of_classes))
+    spec = replace(spec, classes=tuple(_class(kind, boxes, spec) for kind, boxes in measured.items()))
+    if isinstance(spec, PillarSpec):
+        fullest = max(len(np.unique(cells[cells >= 0])) for cells in map(spec.grid.cells, clouds))
+        if fullest > spec.limits.max_pillars:
+            most = math.ceil(fullest * SPARE_PILLARS / 1000) * 1000
+            spec = replace(spec, limits=replace(spec.limits, max_pillars=most))
     insert = config.augment.insert
     kept = {kind: share for kind, share in insert.proportions.items() if kind in names}
     proposed = replace(
         config,
         name=f"{config.name}_own",
-        model=replace(config.model, spec=spec),  # type: ignore[arg-type]  # as `before` was
+        model=replace(config.model, spec=spec),  # type: ignore[arg-type]  # of the same family
         augment=replace(config.augment, insert=replace(insert, proportions=kept)),
         data=replace(config.data, camera_view=config.data.camera_view and split.has_camera),
     )
@@ -98,40 +100,53 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
 
 def differences(config: Config) -> dict[str, Any]:
     """What of a configuration is not the default, as plain values for a YAML."""
-    plain: dict[str, Any] = _differences(to_dict(config), to_dict(Config()))
+    plain = _differences(config, to_dict(config))
+    if config.model.kind != Config().model.kind:
+        plain["model"] = {"kind": config.model.kind} | plain["model"]
     return plain
 
 
-def _differences(value: Any, default: Any) -> Any:
-    if not (isinstance(value, dict) and isinstance(default, dict)):
-        return value
-    changed = {key: own for key, own in value.items() if key not in default or own != default[key]}
-    return {key: _differences(own, default.get(key)) for key, own in changed.items()}
+def _differences(settings: Any, plain: dict[str, Any]) -> dict[str, Any]:
+    """What of a dataclass is not its default; a section that is not starts from the defaults of its own type."""
+    default, changed = type(settings)(), {}
+    for key, value in plain.items():
+        own = getattr(settings, key)
+        if own != getattr(default, key):
+            changed[key] = _differences(own, value) if is_dataclass(own) else value
+    return changed
 
 
-def _grid(grid: PillarGrid, boxes: _Floats) -> PillarGrid:
-    """A grid of the same pillars whose ranges hold the boxes (N, 7)."""
-    outside = (1 - HELD) / 2
-    if np.quantile(boxes[:, 0], outside) < min(BEHIND_M, grid.x_range_m[0]):
-        # Zones grow coarser ahead of the sensor; a view all around needs pillars of one depth.
-        grid = _replaced(grid, zones=1, v_max_m=grid.v_y_m, **_ranges_all_around(grid, boxes, outside))
+def _holding(spec: InspectedSpec, boxes: _Floats) -> InspectedSpec:
+    """The same with a grid of the same cells whose ranges hold the boxes (N, 7)."""
+    grid, outside, changes = spec.grid, (1 - HELD) / 2, dict[str, Any]()
+    looks_back = np.quantile(boxes[:, 0], outside) < min(BEHIND_M, grid.x_range_m[0])
+    if isinstance(spec, PillarSpec):
+        depth_m, width_m, height_m = spec.grid.zones * spec.grid.v_max_m, spec.grid.v_y_m, _TENTH_M
+        if looks_back:
+            # Zones grow coarser ahead of the sensor; a view all around needs pillars of one depth.
+            changes, depth_m = {"zones": 1, "v_max_m": width_m}, width_m
+        steps_m = NECK_STRIDE * depth_m, NECK_STRIDE * width_m
     else:
-        steps = NECK_STRIDE * grid.zones * grid.v_max_m, NECK_STRIDE * grid.v_y_m
-        x_range_m = _widened(grid.x_range_m, boxes[:, 0], outside, steps[0])
-        grid = _replaced(grid, x_range_m=x_range_m, y_range_m=_widened(grid.y_range_m, boxes[:, 1], outside, steps[1]))
+        depth_m, width_m, height_m = spec.grid.size_m
+        steps_m = MAP_MULTIPLE * spec.map_stride * depth_m, MAP_MULTIPLE * spec.map_stride * width_m
+    for column, (axis, span_m, step_m) in enumerate(zip("xy", (grid.x_range_m, grid.y_range_m), steps_m, strict=True)):
+        fitted = _around if looks_back else _widened
+        changes[f"{axis}_range_m"] = fitted(span_m, boxes[:, column], outside, step_m)
     low = np.quantile(boxes[:, 2] - boxes[:, 5] / 2, outside)
     high = np.quantile(boxes[:, 2] + boxes[:, 5] / 2, 1 - outside)
     if not (grid.z_range_m[0] <= low and high <= grid.z_range_m[1]):
         margin_m = 0.5  # the ground below, and what is a little higher
-        grid = _replaced(grid, z_range_m=(_tenths(low - margin_m), _tenths(high + margin_m)))
-    return grid
+        changes["z_range_m"] = tuple(height_m * round(end / height_m) for end in (low - margin_m, high + margin_m))
+    # Without float dust: they are to be read in a YAML.
+    ranges = {key: tuple(round(float(end), 6) for end in changes[key]) for key in changes if key.endswith("range_m")}
+    return replace(spec, grid=replace(grid, **(changes | ranges)))  # type: ignore[arg-type]  # its own grid
 
 
-def _ranges_all_around(grid: PillarGrid, boxes: _Floats, outside: float) -> dict[str, tuple[float, float]]:
-    step_m = NECK_STRIDE * grid.v_y_m
-    reach_m = np.quantile(np.abs(boxes[:, :2]), 1 - outside, axis=0)
-    halves = [math.ceil(2 * reach / step_m) * step_m / 2 for reach in reach_m.tolist()]
-    return {f"{axis}_range_m": (-half, half) for axis, half in zip("xy", halves, strict=True)}
+def _around(span_m: tuple[float, float], centers: _Floats, outside: float, step_m: float) -> tuple[float, float]:
+    """As `_widened`, the same ahead and behind."""
+    reach_m = float(np.quantile(np.abs(centers), 1 - outside))
+    half = math.ceil(2 * reach_m / step_m) * step_m / 2
+    return -half, half
 
 
 def _widened(span_m: tuple[float, float], centers: _Floats, outside: float, step_m: float) -> tuple[float, float]:
@@ -145,32 +160,21 @@ def _widened(span_m: tuple[float, float], centers: _Floats, outside: float, step
     return start, start + math.ceil((max(high, span_m[1]) - start) / step_m) * step_m
 
 
-def _class(name: str, boxes: _Floats, grid: PillarGrid) -> ClassSpec:
+def _class(name: str, boxes: _Floats, spec: InspectedSpec) -> ClassSpec:
     length, width, height = (round(float(value), 2) for value in np.median(boxes[:, 3:6], axis=0))
     z_m = round(float(np.median(boxes[:, 2])), 2)
-    best = _best_overlaps(boxes, (length, width, height), grid)
+    best = _best_overlaps(boxes, (length, width, height), spec)
     reached = [iou for iou in POSITIVE_IOUS if (best >= iou).mean() >= MATCHED]
     positive = max(reached, default=POSITIVE_IOUS[-1])
     return ClassSpec(name, length, width, height, z_m, positive, round(positive - NEGATIVE_BELOW, 2))
 
 
-def _best_overlaps(boxes: _Floats, size_m: Sequence[float], grid: PillarGrid) -> _Floats:
+def _best_overlaps(boxes: _Floats, size_m: Sequence[float], spec: InspectedSpec) -> _Floats:
     """(N,) overlap of each box with the better one of the anchors of the cell that is nearest to it."""
-    x_m, y_m = grid.head_centers_m()
+    x_m, y_m = spec.anchor_centers_m()
     best = np.zeros(len(boxes))
     for row, box in enumerate(boxes):
         near = x_m[np.abs(x_m - box[0]).argmin()], y_m[np.abs(y_m - box[1]).argmin()], 0.0
         anchors = np.array([[*near, *size_m, yaw] for yaw in ANCHOR_YAWS_RAD])
         best[row] = aligned_bev_iou(anchors, box[None]).max()
     return best
-
-
-def _replaced(grid: PillarGrid, **changes: Any) -> PillarGrid:
-    """The grid with other values, without float dust in its ranges: they are to be read in a YAML."""
-    for name in {"x_range_m", "y_range_m"} & set(changes):
-        changes[name] = tuple(round(edge, 6) for edge in changes[name])
-    return replace(grid, **changes)
-
-
-def _tenths(value: float) -> float:
-    return round(float(value), 1)

@@ -169,11 +169,11 @@ def test_pillars_before_the_limits_agree_with_what_pillarize_drops(clean: Path) 
     points = read_scan(KittiSplit(clean).scan_path("000000")).points
     measure, stats = measure_scan(points, points, spec), spec.pillarize(points).stats
     assert (measure.points, measure.inside) == (stats.points, stats.points - stats.points_outside)
-    assert measure.pillars == stats.pillars and measure.cut == stats.points_over_limit > 0
+    assert measure.cells == stats.pillars and measure.cut == stats.points_over_limit > 0
     per_pillar = dataclasses.replace(spec, limits=PillarLimits(5000, 5000)).pillarize(points).point_counts
     assert (measure.fullest, measure.crowded) == (per_pillar.max(), (per_pillar > 3).sum())
     few = dataclasses.replace(spec, limits=PillarLimits(max_pillars=100, max_points=3)).pillarize(points).stats
-    assert measure.pillars == few.pillars + few.pillars_over_limit
+    assert measure.cells == few.pillars + few.pillars_over_limit
 
 
 def test_evenly_spaced_frames(clean: Path) -> None:
