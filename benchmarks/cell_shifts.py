@@ -75,8 +75,8 @@ def scores_by_shift(
     scores = np.zeros((len(SHIFTS_M) ** 2, len(frame.boxes)))
     for number, (dx, dy) in enumerate(product(SHIFTS_M, SHIFTS_M)):
         points, boxes = frame.points.copy(), frame.boxes.copy()
-        points[:, :2] += np.float32([dx, dy])
-        boxes[:, :2] += np.float32([dx, dy])
+        points[:, :2] += np.array([dx, dy], np.float32)
+        boxes[:, :2] += np.array([dx, dy], np.float32)
         found = detector(points)
         found = found[[detection.class_name == name for detection in found]]
         overlap = bev_iou(found.boxes, boxes)

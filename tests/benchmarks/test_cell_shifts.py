@@ -7,8 +7,8 @@ from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.detections import Detections
 from benchmarks.cell_shifts import SHIFTS_M, scores_by_shift
 
-BOXES = np.float32([[10, 0, -0.8, 0.8, 0.6, 1.7, 0], [10, 5, -0.8, 0.8, 0.6, 1.7, 0]])
-FRAME = LabeledFrame("000000", np.float32([[10, 0, 0, 0], [10, 5, 0, 0]]), BOXES, np.zeros(2, np.int64))
+BOXES = np.array([[10, 0, -0.8, 0.8, 0.6, 1.7, 0], [10, 5, -0.8, 0.8, 0.6, 1.7, 0]], np.float32)
+FRAME = LabeledFrame("000000", np.array([[10, 0, 0, 0], [10, 5, 0, 0]], np.float32), BOXES, np.zeros(2, np.int64))
 CLASSES = ("Car", "Pedestrian")
 
 
@@ -17,7 +17,7 @@ def _finds_what_stands_on_a_whole_meter(points: NDArray[np.float32]) -> Detectio
     moved = points[:, :2] - FRAME.points[:, :2]
     boxes = BOXES[[0, 0, 1]].copy()
     boxes[:, :2] += moved[[0, 0, 1]]
-    found = Detections(boxes, np.float32([0.9, 0.8, 0.7]), np.array([1, 1, 0]), CLASSES)
+    found = Detections(boxes, np.array([0.9, 0.8, 0.7], np.float32), np.array([1, 1, 0]), CLASSES)
     return found if not moved[0, 0] else Detections.empty(CLASSES)
 
 

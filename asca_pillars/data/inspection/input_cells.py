@@ -21,7 +21,7 @@ class InputCells:
     Attributes:
         name: of one cell.
         of_points: finite points (N, >=3), metres, LiDAR frame -> flat index of each one's cell (N,), -1 outside.
-        max_points: points of a cell that the network sees, the first ones.
+        max_points: points of a cell that the network sees.
         max_points_key: where the configuration says so.
         max_cells: of a scan; None without a limit.
         closer_anchors: how anchors come closer to each other, as advice.
