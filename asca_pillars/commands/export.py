@@ -112,9 +112,8 @@ def export(
     loaded = loaded._replace(config=replace(loaded.config, model=model))
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
-    kind = loaded.config.model.kind
-    if int8 and kind == "pv_rcnn":
-        raise ConfigError(f"--int8: {checkpoint} is of kind {kind}, which is exported in float32; leave it out")
+    kinds = {"pillar": export_bundle, "pillar_refine": export_refine_bundle, "pv_rcnn": export_pv_rcnn_bundle}
+    export_kind = kinds[loaded.config.model.kind]
     if loaded.expected_input is None and scans is None:
         raise ConfigError(
             f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
@@ -127,23 +126,16 @@ def export(
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
     weights = checkpoint if with_weights else None
     with console.status("Exporting") as status:
-        bundle: AnyBundle
-        if kind == "pv_rcnn":
-            bundle = export_pv_rcnn_bundle(
-                loaded, out, points, trained_on=trained_on, command=command, weights=weights, progress=status.update
-            )
-        else:
-            export_kind = export_refine_bundle if kind == "pillar_refine" else export_bundle
-            bundle = export_kind(
-                loaded,
-                out,
-                points,
-                trained_on=trained_on,
-                command=command,
-                calibration=calibration,
-                weights=weights,
-                progress=status.update,
-            )
+        bundle: AnyBundle = export_kind(
+            loaded,
+            out,
+            points,
+            trained_on=trained_on,
+            command=command,
+            calibration=calibration,
+            weights=weights,
+            progress=status.update,
+        )
     parity = bundle.parity
     assert parity is not None, "export_bundle proves it"
     console.print(

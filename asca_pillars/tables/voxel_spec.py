@@ -78,6 +78,11 @@ class VoxelSpec(DetectorSpec):
         return tuple(strides)
 
     @property
+    def scores_per_anchor(self) -> int:
+        """How many scores each anchor has: one for every class."""
+        return len(self.classes)
+
+    @property
     def map_stride(self) -> int:
         """Voxels along x and along y of a cell of the map seen from above."""
         return self.level_strides[-1][1]

@@ -240,7 +240,7 @@ class AnyBundle(Strict):
     """The family of detectors; the section of that name holds what only this family has."""
     spec: DetectorSpec
     precision: Literal["float32", "int8"]
-    """What the slowest graph, backbone.onnx, computes in."""
+    """What backbone.onnx computes in; of kind `pv_rcnn` voxels.onnx too."""
     backbone_gmac: float
     """Multiply-accumulates of backbone.onnx, 10^9; of a sparse neck in the mean over the scans of `parity`."""
     graphs: Mapping[str, GraphFile]

@@ -80,8 +80,6 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
         raise BundleError(f"{manifest}: a value makes no sense ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
     if isinstance(bundle, Bundle):
         _verify_refine(manifest, bundle)
-    elif bundle.precision != "float32":
-        raise BundleError(f"{manifest}: `precision` of kind {bundle.kind} is float32; {_EXPORT_AGAIN}")
     if set(bundle.graphs) != set(bundle.graph_names):
         raise BundleError(
             f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(bundle.graph_names)}, not "

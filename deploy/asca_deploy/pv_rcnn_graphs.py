@@ -26,6 +26,11 @@ def map_channels(bundle: PvRcnnBundle) -> int:
     return bundle.pv_rcnn.voxel_channels[-1] * bundle.spec.level_shapes[-1][0]
 
 
+def map_type(bundle: PvRcnnBundle) -> str:
+    """NumPy's name of the map's type: of an 8-bit backbone whole steps, step 0 standing for 0."""
+    return "float32" if bundle.precision == "float32" else "uint8"
+
+
 def keeps_memory(section: PvRcnnSection) -> bool:
     """Whether graphs keep the memory of a run for the next, judged by the largest gather, that of RoI-grid pooling.
 
@@ -46,14 +51,15 @@ def voxels_interface(bundle: PvRcnnBundle) -> Interface:
         inputs[f"strided_{number}"] = Tensor("int32", (None, convolution.taps))
     channels = dict(zip((*LEVEL_SOURCES, OUT), bundle.pv_rcnn.voxel_channels, strict=True))
     read = {each.source for each in bundle.pv_rcnn.settings.sources} | {OUT}
-    return inputs, {name: Tensor("float32", (None, width)) for name, width in channels.items() if name in read}
+    outputs = {name: Tensor("float32", (None, width)) for name, width in channels.items() if name in read}
+    return inputs, outputs | {OUT: Tensor(map_type(bundle), (None, channels[OUT]))}
 
 
 def backbone_interface(bundle: PvRcnnBundle) -> Interface:
     """Of backbone.onnx: the backbone on the map, and the anchors' head."""
     rows, columns = bundle.spec.map_shape
     anchors, classes = bundle.spec.anchors.shape[2], len(bundle.spec.classes)
-    return {"canvas": Tensor("float32", (1, rows, columns, map_channels(bundle)))}, {
+    return {"canvas": Tensor(map_type(bundle), (1, rows, columns, map_channels(bundle)))}, {
         name: Tensor("float32", (1, rows, columns, channels * anchors))
         for name, channels in zip(HeadMaps._fields, (classes, 7, 2), strict=True)
     }

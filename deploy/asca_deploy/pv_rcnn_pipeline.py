@@ -22,6 +22,7 @@ from asca_deploy.pv_rcnn_graphs import (
     keypoint_inputs,
     keypoints_interface,
     map_channels,
+    map_type,
     refine_interface,
     voxel_inputs,
     voxels_interface,
@@ -37,7 +38,7 @@ from asca_pillars.points.anchor_proposals import propose_anchors
 from asca_pillars.points.bilinear import read_map
 from asca_pillars.points.refine_geometry import GridNeighbors, grid_neighbors
 from asca_pillars.points.refined_detections import reported_detections
-from asca_pillars.points.voxel_scan import VoxelScan, voxel_levels, with_neighbors
+from asca_pillars.points.voxel_scan import VoxelizedScan, VoxelScan, voxel_levels, with_neighbors
 from asca_pillars.tables import cell_map, voxels
 from asca_pillars.tables.voxel_spec import VoxelSpec
 
@@ -63,7 +64,7 @@ class FirstAnswer(NamedTuple):
     scan: VoxelScan
     levels: dict[str, NDArray[np.float32]]
     bev: NDArray[np.float32]
-    """(K, C) the map seen from above at the keypoints."""
+    """(K, C) the map seen from above at the keypoints, in steps where the map is."""
     maps: HeadMaps[NDArray[np.float32]] | None
     """(channels, H, W); None of a scan without voxels."""
 
@@ -71,9 +72,9 @@ class FirstAnswer(NamedTuple):
 class PvRcnnPipeline:
     """See `pipeline.Pipeline`.
 
-    `provider` and `precision` are the map backbone's, which takes most of the time; the other graphs have rows of any
-    number or take positions in metres, so they run on onnxruntime's CPU provider in float32. Tables and canvases are
-    built in memory that is kept from scan to scan, as much as threads ever used at once.
+    `provider` and `precision` are the map backbone's; the other graphs have rows of any number or take positions in
+    metres, so they run on onnxruntime's CPU provider, the sparse backbone of an 8-bit bundle in 8 bits. Tables and
+    canvases are built in memory that is kept from scan to scan, as much as threads ever used at once.
 
     Args:
         folder: of the bundle.
@@ -116,15 +117,13 @@ class PvRcnnPipeline:
         self._keypoints = opened(KEYPOINTS, keypoints_interface(bundle))
         self._refine = opened(REFINE, refine_interface(bundle))
         self._deform = opened(DEFORM, deform_interface(bundle)) if self.settings.deformed else None
-        self._map_channels = map_channels(bundle)
+        self._map_channels, self._map_type = map_channels(bundle), map_type(bundle)
         self._canvases = [self._new_canvas()]
         self._builders = [self.spec.table_builder()]
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedVoxels:
         """Points (N, 4), metres, LiDAR frame, and reflectance -> the map seen from above."""
-        builder = self._builders.pop() if self._builders else self.spec.table_builder()
-        voxelized = voxel_levels(points, self.spec, builder)
-        self._builders.append(builder)
+        voxelized = self.voxelize(points)
         laps.append(("voxelize", perf_counter()))
         scan = with_neighbors(points, voxelized, self.spec, self.settings)
         laps.append(("neighbors", perf_counter()))
@@ -169,12 +168,22 @@ class PvRcnnPipeline:
         laps.append(("decode", perf_counter()))
         return detections
 
-    def encode(self, scan: VoxelScan) -> dict[str, NDArray[np.float32]]:
-        """Unitless features (N, C) of the voxels of every level that is read, by name, see OUT; at least one voxel."""
+    def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
+        """Points (N, 4), metres, LiDAR frame, and reflectance -> what voxels.onnx reads."""
+        builder = self._builders.pop() if self._builders else self.spec.table_builder()
+        voxelized = voxel_levels(points, self.spec, builder)
+        self._builders.append(builder)
+        return voxelized
+
+    def encode(self, scan: VoxelScan | VoxelizedScan) -> dict[str, NDArray[Any]]:
+        """Unitless features (N, C) of the voxels of every level that is read, by name, see OUT; at least one voxel.
+
+        Those of OUT are whole steps where the map is.
+        """
         names = list(self._voxels.outputs)
         return dict(zip(names, _run(self._voxels, names, voxel_inputs(scan.features, scan.levels)), strict=True))
 
-    def neck_and_head(self, canvas: NDArray[np.float32]) -> HeadMaps[NDArray[np.float32]]:
+    def neck_and_head(self, canvas: NDArray[Any]) -> HeadMaps[NDArray[np.float32]]:
         """The map (1, H, W, C) -> scores (A * classes, H, W), boxes (7A, H, W), directions (2A, H, W)."""
         found = self._backbone.run(HeadMaps._fields, {"canvas": canvas})
         return HeadMaps(*(part[0].transpose(2, 0, 1) for part in found))
@@ -218,10 +227,10 @@ class PvRcnnPipeline:
         return confidence, residuals
 
     def _new_canvas(self) -> VoxelCanvas:
-        return VoxelCanvas(self.spec.level_shapes[-1], self._map_channels)
+        return VoxelCanvas(self.spec.level_shapes[-1], self._map_channels, self._map_type)
 
 
-def _run(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[np.float32]]:
+def _run(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
     """The outputs of these names; an exporter drops inputs that the network does not use."""
     return session.run(outputs, {name: given[name] for name in session.inputs})
 

@@ -1,7 +1,9 @@
 """The map seen from above that the voxels of the last level make."""
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from asca_pillars.tables.convolution import Shape
 
@@ -14,17 +16,18 @@ class VoxelCanvas:
     Args:
         shape: of the last level, cells along z, y, x.
         channels: C.
+        dtype: of what is scattered: float32, or uint8 for whole steps.
     """
 
-    def __init__(self, shape: Shape, channels: int) -> None:
+    def __init__(self, shape: Shape, channels: int, dtype: DTypeLike = np.float32) -> None:
         height, rows, columns = shape
-        self.image: NDArray[np.float32] = np.zeros((1, rows, columns, channels), np.float32)
+        self.image: NDArray[Any] = np.zeros((1, rows, columns, channels), dtype)
         self.rows = self.image.reshape(-1, channels)
         """(H * W, C), the same memory."""
         self._voxels = self.image.reshape(-1, channels // height)
         self._occupied = np.empty(0, np.int64)
 
-    def scatter(self, features: NDArray[np.float32], cells: NDArray[np.int64]) -> None:
+    def scatter(self, features: NDArray[Any], cells: NDArray[np.int64]) -> None:
         """Write the features (N, C / nz) of the active voxels; every other one is zero.
 
         Args:

@@ -188,7 +188,7 @@ def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provena
 def _export_backbone(detector: PillarDetector, path: Path, scans: Sequence[NDArray[np.float32]]) -> float:
     """Write backbone.onnx; its multiply-accumulates, 10^9, of a sparse neck in the mean over the scans."""
     if detector.preparation.active_cells is None:
-        graphs.export_backbone(FastBackbone(detector), detector.grid, path)
+        graphs.export_backbone(FastBackbone(detector), detector.grid.map_shape, path)
         return graphs.multiply_accumulates(path) / 1e9
     backbone, preparation = SparseBackbone(detector), detector.preparation
     export_sparse_backbone(backbone, path)

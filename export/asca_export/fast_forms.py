@@ -76,8 +76,13 @@ class FastBackbone(nn.Module):
         self.upsamples = nn.ModuleList(Upsample(deblock) for deblock in detector.neck.deblocks)
         self.attention = nn.ModuleList(attention or [nn.Identity()] * len(self.blocks))
         self.head = _Head(detector.head)
+        self.border = int(padded)
+        """Rows and columns of padding that the pseudo-image comes with."""
+        first = next(iter(self.stages()[0].convolutions.values()))
         if padded:
-            _take_padded(next(iter(self.stages()[0].convolutions.values())), steps)
+            first.padding = (0, 0)
+        if steps is not None:
+            _take_steps(first, steps, padded=padded)
 
     def stages(self) -> list[Stage]:
         """The blocks, from the finest map to the coarsest."""
@@ -156,11 +161,10 @@ def _folded(block: nn.Module) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _take_padded(first: nn.Conv2d, steps: CanvasSteps | None) -> None:
-    """Let the first convolution find its padding, and the steps, in its input."""
-    first.padding = (0, 0)
-    if steps is not None:
-        assert first.bias is not None
-        with torch.no_grad():
-            first.weight.mul_(steps.scale[:, None, None] / STEP_VALUE)
-            first.bias.sub_((first.weight * steps.empty[:, None, None]).sum(dim=(1, 2, 3)) * STEP_VALUE)
+def _take_steps(first: nn.Conv2d, steps: CanvasSteps, *, padded: bool) -> None:
+    """Let the first convolution read steps."""
+    assert first.bias is not None
+    assert padded or not steps.empty.any(), "a convolution pads with zeros"
+    with torch.no_grad():
+        first.weight.mul_(steps.scale[:, None, None] / STEP_VALUE)
+        first.bias.sub_((first.weight * steps.empty[:, None, None]).sum(dim=(1, 2, 3)) * STEP_VALUE)

@@ -21,7 +21,6 @@ from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillarize import FEATURES
 
 B = TypeVar("B", bound=AnyBundle)
@@ -53,13 +52,16 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
     )
 
 
-def export_backbone(backbone: FastBackbone, grid: PillarGrid, path: Path) -> None:
-    """Write backbone.onnx: canvas (1, ny + 1, nx + 1, C) -> scores, boxes, directions, see `FastBackbone`."""
+def export_backbone(backbone: FastBackbone, map_shape: tuple[int, int], path: Path) -> None:
+    """Write backbone.onnx: canvas (1, H, W, C) -> scores, boxes, directions, see `FastBackbone`.
+
+    H and W are the rows and columns of `map_shape` and the padding that the backbone takes.
+    """
     channels = next(iter(backbone.stages()[0].convolutions.values())).in_channels
-    rows, columns = grid.map_shape
+    rows, columns = (size + backbone.border for size in map_shape)
     export_graph(
         backbone,
-        (torch.zeros(1, rows + 1, columns + 1, channels),),
+        (torch.zeros(1, rows, columns, channels),),
         path,
         input_names=["canvas"],
         output_names=list(HeadMaps._fields),

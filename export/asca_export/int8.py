@@ -5,12 +5,12 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, ENCODER, Bundle, CanvasFormat, LayerQuantization, Quantization
+from asca_deploy.bundle import BACKBONE, ENCODER, AnyBundle, Bundle, CanvasFormat, LayerQuantization, Quantization
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
@@ -23,6 +23,7 @@ from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.tables.voxel_spec import VoxelSpec
 
 MIN_CALIBRATION = 8
 # Of the class logits of the best anchors. With the bundle that ships 0.04 costs 0.2 points of AP and 0.10 costs two;
@@ -31,9 +32,10 @@ MAX_LOGIT_ERROR = 0.08
 SAME_IOU = 0.5
 
 Points = NDArray[np.float32]
+B = TypeVar("B", bound=AnyBundle)
 
 
-class _Sensitivity(NamedTuple):
+class Sensitivity(NamedTuple):
     """What came out of the sweep over the layers; errors are those of `logit_error`."""
 
     alone: dict[str, float]
@@ -41,6 +43,19 @@ class _Sensitivity(NamedTuple):
     kept_float: list[str]
     total: float
     """Without those that are kept in floating point."""
+
+    def report(self, own: "CalibrationScans", compared: int) -> Quantization:
+        """For the manifest, boxes not counted yet."""
+        return Quantization(
+            calibration_scans=len(own.used),
+            dropped_scans=own.dropped,
+            compared_scans=compared,
+            layers=tuple(LayerQuantization(name, error, name in self.kept_float) for name, error in self.alone.items()),
+            logit_rms_error=self.total,
+            boxes=0,
+            boxes_matched=0,
+            boxes_added=0,
+        )
 
 
 class CalibrationScans(NamedTuple):
@@ -51,7 +66,9 @@ class CalibrationScans(NamedTuple):
     """Those that parity is proven on."""
 
 
-def calibration_scans(calibration: Sequence[Points], scans: Sequence[Points], spec: PillarSpec) -> CalibrationScans:
+def calibration_scans(
+    calibration: Sequence[Points], scans: Sequence[Points], spec: PillarSpec | VoxelSpec
+) -> CalibrationScans:
     """Those of `calibration`, scans (N, 4) in the LiDAR frame, that have points on the grid and are not among `scans`.
 
     With one of `scans` the comparison would be with what the ranges were fitted to.
@@ -62,7 +79,7 @@ def calibration_scans(calibration: Sequence[Points], scans: Sequence[Points], sp
     shown = {_digest(points) for points in scans}
     own = [points for points in calibration if _digest(points) not in shown]
     dropped = len(calibration) - len(own)
-    used = [points for points in own if len(spec.pillarize(points).cells)]
+    used = [points for points in own if (spec.grid.cells(points) >= 0).any()]
     if len(used) < MIN_CALIBRATION:
         raise ExportError(
             f"{len(used)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are "
@@ -114,32 +131,47 @@ def quantize_bundle(
             found = (backbone.run(each).maps.scores for each in placed)
             return logit_error(expected, found, bundle.spec)
 
-        found = _sweep(rounded.layers, error_of, progress)
+        found = sweep(rounded.layers, error_of, progress)
         eight_bit = [layer for layer in rounded.layers if layer not in found.kept_float]
         rounded.write(graphs.graph_path(folder, BACKBONE), eight_bit)
     qdq.quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
-    report = Quantization(
-        calibration_scans=len(encoded),
-        dropped_scans=own.dropped,
-        compared_scans=len(scans),
-        layers=tuple(LayerQuantization(name, found.alone[name], name in found.kept_float) for name in rounded.layers),
-        logit_rms_error=found.total,
-        boxes=sum(map(len, boxes)),
-        boxes_matched=0,
-        boxes_added=0,
-    )
-    draft = replace(eight_bit_form, name=f"{bundle.name}_int8", precision="int8", quantization=report)
+    return write_quantized(folder, eight_bit_form, found.report(own, len(scans)), boxes, scans)
+
+
+def write_quantized(
+    folder: Path, bundle: B, report: Quantization, expected: Sequence[Detections], scans: Sequence[Points]
+) -> B:
+    """Sign the 8-bit graphs in `folder` and write their manifest, with the boxes that they find again.
+
+    Args:
+        folder: with all graphs.
+        bundle: the float bundle's manifest, in whatever the graphs have changed but name, precision and report.
+        report: without boxes.
+        expected: what the float bundle finds on the scans.
+        scans: (N, 4) each, LiDAR frame, that both are compared on.
+    """
+    report = replace(report, boxes=sum(map(len, expected)))
+    draft = replace(bundle, name=f"{bundle.name}_int8", precision="int8", quantization=report)
     draft = graphs.sign(folder, draft)
     write_bundle_manifest(folder, draft)
-    quantized = replace(draft, quantization=count_boxes(report, boxes, list(map(Detector(folder), scans))))
+    quantized = replace(draft, quantization=_with_boxes(report, expected, list(map(Detector(folder), scans))))
     write_bundle_manifest(folder, quantized)
     return quantized
 
 
-def _sweep(
+def sweep(
     layers: Sequence[str], error_of: Callable[[Sequence[str]], float], progress: Callable[[str], None]
-) -> _Sensitivity:
-    """Try every layer in floating point, and keep the most harmful ones so until the error is small enough."""
+) -> Sensitivity:
+    """Try every layer in floating point, and keep the most harmful ones so until the error is small enough.
+
+    Args:
+        layers: by name.
+        error_of: the `logit_error` with these layers in 8 bits.
+        progress: told what is being done.
+
+    Raises:
+        ExportError: MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
+    """
     total, alone = error_of(layers), {}
     for number, layer in enumerate(layers, start=1):
         progress(f"Sensitivity of layer {number} of {len(layers)}")
@@ -155,10 +187,10 @@ def _sweep(
             f"an 8-bit canvas alone moves the class logits by {total:.3g}, more than {MAX_LOGIT_ERROR}; "
             "calibrate on scans like those trained on"
         )
-    return _Sensitivity(alone, kept, total)
+    return Sensitivity(alone, kept, total)
 
 
-def count_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
+def _with_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
     """The report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
     matched = sum(map(_partnered, expected, found))
     added = sum(map(len, found)) - sum(map(_partnered, found, expected))
@@ -175,7 +207,7 @@ def _encode(pipeline: PillarPipeline, points: Points) -> Encoded:
 
 
 def logit_error(
-    expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], spec: PillarSpec
+    expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], spec: PillarSpec | VoxelSpec
 ) -> float:
     """RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
     squares = []

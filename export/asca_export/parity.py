@@ -18,6 +18,7 @@ from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.tables.voxel_spec import VoxelSpec
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
 BOX_TOLERANCE_M = 0.01
@@ -78,7 +79,7 @@ def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:
     return HeadMaps(*(part if batch.neck is not None else part[0] for part in maps))
 
 
-def by_class(scores: NDArray[np.float32], spec: PillarSpec) -> NDArray[np.float32]:
+def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArray[np.float32]:
     """The logits (A, H, W), or rows (M, A), of each class: (classes, n); likewise of A * classes."""
     classes = len(spec.classes)
     channels = scores if scores.ndim == 3 else scores.T

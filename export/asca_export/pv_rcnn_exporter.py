@@ -11,7 +11,9 @@ from asca_deploy.bundle import BACKBONE, MANIFEST, Parity, PvRcnnBundle, PvRcnnS
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_export import graphs
 from asca_export.exporter import LICENSE, provenance, require_parity_scans, write_proven
+from asca_export.int8 import calibration_scans
 from asca_export.pv_rcnn_forms import export_pv_rcnn_graphs
+from asca_export.pv_rcnn_int8 import quantize_pv_rcnn_bundle, require_quantizable
 from asca_export.pv_rcnn_parity import prove_pv_rcnn_parity
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.errors import ExportError
@@ -29,21 +31,27 @@ def export_pv_rcnn_bundle(
     *,
     trained_on: str = "not stated",
     command: str = "not stated",
+    calibration: Sequence[NDArray[np.float32]] | None = None,
     weights: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> PvRcnnBundle:
     """Write the four graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
 
-    Arguments as of `exporter.export_bundle`.
+    Arguments as of `exporter.export_bundle`. With `calibration` the first stage is then put in 8 bits; what follows
+    the proposals stays in float32.
 
     Raises:
-        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does.
+        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does. Or the network
+            is one that is not put in 8 bits.
     """
     require_parity_scans(scans)
     config, detector, expected = checkpoint.config, checkpoint.detector, checkpoint.expected_input
     model = config.model
     if not (isinstance(model, PvRcnnModel) and isinstance(detector, PvRcnnDetector)):
         raise ExportError(f"model.kind {model.kind}: not PV-RCNN")
+    if calibration is not None:
+        require_quantizable(model)
+        calibration_scans(calibration, scans, model.spec)  # too few are told before the work, not after it
     progress("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         draft = PvRcnnBundle(
@@ -68,4 +76,7 @@ def export_pv_rcnn_bundle(
             pipeline = PvRcnnPipeline(folder, opened, threads=default_threads())
             return prove_pv_rcnn_parity(detector.network, pipeline, scans)
 
-        return write_proven(folder, dataclasses.replace(draft, backbone_gmac=gmac), prove, weights)
+        bundle = write_proven(folder, dataclasses.replace(draft, backbone_gmac=gmac), prove, weights)
+        if calibration is not None:
+            bundle = quantize_pv_rcnn_bundle(folder, bundle, detector.network, calibration, scans, progress)
+    return bundle

@@ -12,16 +12,15 @@ from asca_deploy import pv_rcnn_graphs as interfaces
 from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
 from asca_deploy.graph import Tensor as Declared
 from asca_export.fast_forms import FastBackbone
-from asca_export.graphs import export_graph, graph_path
+from asca_export.graphs import export_backbone, export_graph, graph_path
 from asca_export.refine_graph import fold_norms
-from asca_pillars.geometry.decode import HeadMaps
+from asca_export.voxel_forms import VoxelProducts, export_voxels
 from asca_pillars.models.pv_rcnn.deformation import Surroundings
 from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
-from asca_pillars.models.pv_rcnn.voxel_backbone import TableLayer, VoxelBackbone
 from asca_pillars.models.refine.keypoint_encoder import SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
 from asca_pillars.points.point_scales import PointScale
-from asca_pillars.points.voxel_scan import LEVEL_SOURCES, SourceBalls, VoxelSetSettings
+from asca_pillars.points.voxel_scan import SourceBalls, VoxelSetSettings
 
 _EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
 
@@ -30,13 +29,10 @@ def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -
     """Write the graphs that `bundle` describes, see `asca_deploy.pv_rcnn_graphs`; every number of rows is dynamic."""
     export_refine_head(network, bundle, graph_path(folder, REFINE))
     network = fold_norms(network)
-    inputs, outputs = interfaces.voxels_interface(bundle)
-    levels = [name for name in (*LEVEL_SOURCES, interfaces.OUT) if name in outputs]
-    rows = {"features": "voxels_0"} | {name: f"voxels_{name.partition('_')[2]}" for name in list(inputs)[1:]}
-    _export(_Voxels(network.voxels, levels), graph_path(folder, VOXELS), inputs, rows, levels)
-    inputs, _ = interfaces.backbone_interface(bundle)
+    _, levels = interfaces.voxels_interface(bundle)
+    export_voxels(VoxelProducts(network.voxels), graph_path(folder, VOXELS), levels)
     backbone = FastBackbone(network, padded=False, attention=network.neck.attention)
-    _export(backbone, graph_path(folder, BACKBONE), inputs, {}, HeadMaps._fields)
+    export_backbone(backbone, bundle.spec.map_shape, graph_path(folder, BACKBONE))
     inputs, _ = interfaces.keypoints_interface(bundle)
     sources = bundle.pv_rcnn.settings.sources
     rows = _source_rows(inputs, sources) | {"points": "points"}
@@ -93,56 +89,7 @@ def _export(
         example.append(torch.zeros(size, dtype=torch.int32) if kind == "int32" else torch.rand(size))
         dynamic.append({0: multiples.get(own, 1) * sizes[own]} if own else {})
     names: dict[str, Any] = {"input_names": list(inputs), "output_names": list(outputs)}
-    if rows:
-        names["dynamic_shapes"] = (tuple(dynamic),)
-    export_graph(module, example, path, **names)
-
-
-class _TableProduct(nn.Module):
-    """A convolution by table with its normalization: gather, one matrix product, ReLU."""
-
-    def __init__(self, layer: TableLayer) -> None:
-        super().__init__()
-        norm, weight = layer.norm, layer.convolution.weight.detach()
-        assert norm.running_var is not None and norm.running_mean is not None
-        scale = (norm.weight / torch.sqrt(norm.running_var + norm.eps)).detach()
-        matrix = (weight * scale[:, None, None, None, None]).flatten(2).transpose(1, 2).flatten(1)
-        self.product = nn.Linear(matrix.shape[1], matrix.shape[0])
-        with torch.no_grad():
-            self.product.weight.copy_(matrix)
-            self.product.bias.copy_(norm.bias - norm.running_mean * scale)
-
-    def forward(self, features: Tensor, table: Tensor) -> Tensor:
-        """Unitless (N, C) by indices (M, taps) -> (M, outputs)."""
-        padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
-        gathered = padded.index_select(0, table.reshape(-1)).view(table.shape[0], self.product.in_features)
-        return torch.relu(self.product(gathered))
-
-
-class _Voxels(nn.Module):
-    """The sparse backbone; `levels` names what it returns."""
-
-    def __init__(self, backbone: VoxelBackbone, levels: list[str]) -> None:
-        super().__init__()
-        self.levels = levels
-        self.same = nn.ModuleList(
-            nn.ModuleList(_TableProduct(layer) for layer in level.children())  # type: ignore[arg-type]
-            for level in backbone.same
-        )
-        self.down = nn.ModuleList(_TableProduct(layer) for layer in backbone.down)  # type: ignore[arg-type]
-
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        features, *tables = inputs
-        same, strided = tables[: len(self.same)], tables[len(self.same) :]
-        found = {}
-        for number, name in enumerate((*LEVEL_SOURCES, interfaces.OUT)):
-            if number:
-                features = self.down[number - 1](features, strided[number - 1])
-            if number < len(same):
-                for layer in self.same[number].children():
-                    features = layer(features, same[number])
-            found[name] = features
-        return tuple(found[name] for name in self.levels)
+    export_graph(module, example, path, dynamic_shapes=(tuple(dynamic),), **names)
 
 
 class _Keypoints(nn.Module):

@@ -28,7 +28,7 @@ from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone
 HEAD = "head"
 STEPS = 255
 WEIGHT_STEPS = 64
-EMPTY_SIZE = 256  # pillars to a side; the deepest convolution of the paper's neck sees 99 of them
+EMPTY_SIZE = 256  # cells to a side; the deepest convolution of the paper's neck sees 99 of them
 PLACES = 8000  # of each scan and layer, whose inputs weights are rounded for
 _DAMPING = 0.001  # of the moments' mean diagonal, so that inputs that hardly ever move do not blow up
 _SHRINK = 0.95  # a range may lose this much of its end where that spares it coarser steps
@@ -55,14 +55,14 @@ def scale_to_steps(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]]
 
     Args:
         backbone: made with `steps`; changed in place.
-        canvases: (1, ny + 1, nx + 1, C) of the calibration scans.
+        canvases: (1, H, W, C) of the calibration scans, the padding that the backbone takes included.
     """
     highest: dict[str, Tensor] = {}
     for canvas in canvases:
         for name, pass_ in _passes(backbone, torch.from_numpy(canvas) * STEP_VALUE):
             high = pass_.output.amax(dim=(0, 2, 3))
             highest[name] = torch.maximum(highest[name], high) if name in highest else high
-    empty = {name: _center(pass_.output) for name, pass_ in _passes(backbone, _empty_canvas(steps))}
+    empty = {name: _center(pass_.output) for name, pass_ in _passes(backbone, _empty_canvas(backbone, steps))}
     stages = backbone.stages()
     for i, (convolutions, upsample_name, upsample) in enumerate(stages):
         names = list(convolutions)
@@ -99,9 +99,9 @@ def input_moments(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]],
 
     Args:
         backbone: scaled to steps.
-        canvases: (1, ny + 1, nx + 1, C) each, unitless.
+        canvases: likewise, unitless.
     """
-    empty = {name: _center(pass_.input) for name, pass_ in _passes(backbone, _empty_canvas(steps))}
+    empty = {name: _center(pass_.input) for name, pass_ in _passes(backbone, _empty_canvas(backbone, steps))}
     generator = torch.Generator().manual_seed(0)
     squares: dict[str, Tensor] = {}
     for number, canvas in enumerate(canvases, start=1):
@@ -180,8 +180,9 @@ def _passes(backbone: FastBackbone, canvas: Tensor) -> Iterator[tuple[str, _Pass
     yield HEAD, _Pass(joined, joined, (1, 1, 0))
 
 
-def _empty_canvas(steps: CanvasSteps) -> Tensor:
-    return (steps.empty * STEP_VALUE).expand(1, EMPTY_SIZE + 1, EMPTY_SIZE + 1, -1)
+def _empty_canvas(backbone: FastBackbone, steps: CanvasSteps) -> Tensor:
+    size = EMPTY_SIZE + backbone.border
+    return (steps.empty * STEP_VALUE).expand(1, size, size, -1)
 
 
 def _center(values: Tensor) -> Tensor:

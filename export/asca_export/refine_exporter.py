@@ -12,20 +12,19 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Bundle, Parity, RefineSection
 from asca_deploy.detector import Detector
-from asca_deploy.manifest import load_bundle, write_bundle_manifest
+from asca_deploy.manifest import load_bundle
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
 from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import draft_bundle, export_bundle, require_parity_scans, write_proven
-from asca_export.int8 import MAX_LOGIT_ERROR, count_boxes, logit_error
+from asca_export.int8 import MAX_LOGIT_ERROR, logit_error, write_quantized
 from asca_export.neck_output import add_neck_output, add_neck_steps, scale_bev
 from asca_export.refine_graph import export_refine
 from asca_export.refine_parity import prove_refine_parity
 from asca_pillars.config import pillar_spec
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
-from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.models.second_stage.open_first_stage import CHECKPOINT_SUFFIX, open_first_stage, with_first_stage
@@ -117,23 +116,14 @@ def _in_eight_bits(
             f"{eight_bit}: its class logits are {error:.3g} from the first stage's, more than {MAX_LOGIT_ERROR}; it is "
             "not its 8-bit form: export that again"
         )
-    expected = _detect(folder, scans)
+    expected = list(map(Detector(folder), scans))
     shutil.copyfile(eight_bit / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
     backbone, step = add_neck_steps(onnx.load(eight_bit / proposing.graphs[BACKBONE].file))
     onnx.save(backbone, graphs.graph_path(folder, BACKBONE))
     refine = graphs.graph_path(folder, REFINE)
     onnx.save(scale_bev(onnx.load(refine), _neck_gains(*stages, calibration) * np.float32(step)), refine)
-    report = dataclasses.replace(
-        proposing.quantization, compared_scans=len(scans), logit_rms_error=error, boxes=sum(map(len, expected))
-    )
-    draft = dataclasses.replace(
-        bundle, name=f"{bundle.name}_int8", precision="int8", pillar=proposing.pillar, quantization=report
-    )
-    signed = graphs.sign(folder, draft)
-    write_bundle_manifest(folder, signed)
-    quantized = dataclasses.replace(signed, quantization=count_boxes(report, expected, _detect(folder, scans)))
-    write_bundle_manifest(folder, quantized)
-    return quantized
+    report = dataclasses.replace(proposing.quantization, compared_scans=len(scans), logit_rms_error=error)
+    return write_quantized(folder, dataclasses.replace(bundle, pillar=proposing.pillar), report, expected, scans)
 
 
 def _neck_gains(
@@ -147,11 +137,6 @@ def _neck_gains(
         products, squares = products + (wanted * found).sum(axes), squares + np.square(found).sum(axes)
     silent = squares == 0  # a channel that is zero everywhere
     return np.where(silent, 1, products / np.where(silent, 1, squares)).astype(np.float32)
-
-
-def _detect(folder: Path, scans: Sequence[NDArray[np.float32]]) -> list[Detections]:
-    runtime = Detector(folder)
-    return [runtime(scan) for scan in scans]
 
 
 def _first_bundle(

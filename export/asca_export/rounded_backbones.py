@@ -1,7 +1,7 @@
 """A backbone before and after its weights are rounded to 8 bits, and graphs in which any of its layers is rounded."""
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -18,7 +18,13 @@ from asca_export.fast_forms import CanvasSteps, FastBackbone
 from asca_export.quantize import STEPS, input_moments, layer_names, round_weights, scale_to_steps
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
-from asca_export.sparse_quantize import SparseSample, read_moments, round_products, scale_rows_to_steps
+from asca_export.sparse_quantize import (
+    SparseSample,
+    mixed_products,
+    read_moments,
+    round_products,
+    scale_rows_to_steps,
+)
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillars.map_pooling import pool_pillars
 from asca_pillars.pillars.pillarize import Pillars
@@ -60,31 +66,49 @@ def round_backbone(
         work: folder for what is needed on the way.
     """
     if detector.preparation.active_cells is None:
-        return _RoundedDense(detector, encoded, steps, work)
-    return _RoundedSparse(detector, encoded, steps)
-
-
-class _RoundedDense:
-    def __init__(self, detector: PillarDetector, encoded: Sequence[Encoded], steps: CanvasSteps, work: Path) -> None:
-        form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
+        form, channels = CanvasFormat("uint8", tuple(int(step) for step in steps.empty)), len(steps.empty)
 
         def canvases() -> Iterator[NDArray[np.uint8]]:
-            canvas = Canvas(len(steps.empty), detector.grid, form)
+            canvas = Canvas(channels, detector.grid, form)
             return (
                 canvas.scatter(*pool_pillars(each.in_steps(steps), each.pillars.cells, detector.grid))
                 for each in encoded
             )
 
-        self._rounded = FastBackbone(detector, steps).eval()
+        return RoundedMaps(FastBackbone(detector, steps), canvases, steps, detector.grid.map_shape, work)
+    return _RoundedSparse(detector, encoded, steps)
+
+
+class RoundedMaps:
+    """A dense backbone, see `RoundedBackbone`.
+
+    Args:
+        backbone: made with `steps`; changed in place.
+        canvases: (1, H, W, C), unitless, of the calibration scans, each time anew.
+        steps: of the canvases.
+        map_shape: rows and columns of the map.
+        work: folder for what is needed on the way.
+    """
+
+    def __init__(
+        self,
+        backbone: FastBackbone,
+        canvases: Callable[[], Iterable[NDArray[np.uint8]]],
+        steps: CanvasSteps,
+        map_shape: tuple[int, int],
+        work: Path,
+    ) -> None:
+        self._rounded = backbone.eval()
         scale_to_steps(self._rounded, canvases(), steps)
         moments = input_moments(self._rounded, canvases(), steps)
         self._exact, self.layers = copy.deepcopy(self._rounded), layer_names(self._rounded)
         round_weights(self._exact, [], moments)
         round_weights(self._rounded, self.layers, moments)
         self._template = work / "template.onnx"
-        graphs.export_backbone(self._exact, detector.grid, self._template)
+        graphs.export_backbone(self._exact, map_shape, self._template)
 
     def write(self, path: Path, eight_bit: Sequence[str]) -> None:
+        """Write the graph with these layers in 8 bits."""
         qdq.quantize_backbone(self._template, path, eight_bit, self._parameters(eight_bit))
 
     def _parameters(self, eight_bit: Sequence[str]) -> dict[str, Tensor]:
@@ -105,9 +129,7 @@ class _RoundedSparse:
         round_products(self._rounded, self.layers, read_moments(self._exact, samples))
 
     def write(self, path: Path, eight_bit: Sequence[str]) -> None:
-        mixed = copy.deepcopy(self._exact)
-        for name in eight_bit:
-            mixed.products[name] = self._rounded.products[name]
+        mixed = mixed_products(self._exact, self._rounded, eight_bit)
         export_sparse_backbone(mixed, path, eight_bit, steps=True)
 
 

@@ -63,7 +63,7 @@ class SparseBackbone(nn.Module):
                 fused = fuse_conv_bn_eval(convolution, norm)
                 kind = ("strided", "first" if grows else "same", "same")[min(index, 2)]
                 layer = TableLayer(f"block{number}_{index}", f"{kind}_{number}")
-                self.products[layer.name] = _product(fused.weight.flatten(2).transpose(1, 2).flatten(1), fused.bias)
+                self.products[layer.name] = linear(fused.weight.flatten(2).transpose(1, 2).flatten(1), fused.bias)
                 convolutions.append(layer)
             ((transposed, norm),) = _pairs(deblock)
             assert isinstance(transposed, nn.ConvTranspose2d)
@@ -71,11 +71,11 @@ class SparseBackbone(nn.Module):
             assert fused_up.bias is not None
             stride, upsample = fused_up.stride[0], f"upsample{number}"
             weight = fused_up.weight.permute(2, 3, 1, 0).flatten(0, 2)  # (row, column, channel), inputs
-            self.products[upsample] = _product(weight, fused_up.bias.repeat(stride**2))
+            self.products[upsample] = linear(weight, fused_up.bias.repeat(stride**2))
             self.levels.append(Level(tuple(convolutions), upsample, f"places_{number}", stride))
         parts = (detector.head.scores, detector.head.boxes, detector.head.directions)
         biases = [part.bias for part in parts if part.bias is not None]
-        self.products[HEAD] = _product(torch.cat([part.weight[:, :, 0, 0] for part in parts]), torch.cat(biases))
+        self.products[HEAD] = linear(torch.cat([part.weight[:, :, 0, 0] for part in parts]), torch.cat(biases))
         self.head_channels = [part.out_channels for part in parts]
         first = self.product(self.levels[0].convolutions[0].name)
         self.channels = first.in_features // 9
@@ -124,7 +124,8 @@ def _pairs(block: nn.Module) -> list[tuple[Any, Any]]:
     return list(zip(children[0::3], children[1::3], strict=True))
 
 
-def _product(weight: Tensor, bias: Tensor | None) -> nn.Linear:
+def linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
+    """A product with this unitless weight (outputs, n) and bias (outputs,), which nothing trains."""
     assert bias is not None
     product = nn.Linear(weight.shape[1], weight.shape[0])
     with torch.no_grad():

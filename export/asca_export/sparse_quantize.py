@@ -5,11 +5,12 @@ makes up for what rounding changes in the mean. The head's are rounded for the c
 of the many others is hardly read.
 """
 
-from collections.abc import Collection, Iterable, Sequence
-from typing import NamedTuple
+import copy
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
 from asca_export.quantize import PLACES, STEPS, round_together
@@ -19,7 +20,7 @@ from asca_pillars.tables.neck_tables import NeckTables
 
 BEST_CELLS = 32  # of each scan and anchor, that the head is rounded for
 OTHER_CELLS = 64  # of each scan beside them, so that background stays background
-_TINY = 1e-6
+TINY = 1e-6
 
 
 class SparseSample(NamedTuple):
@@ -33,6 +34,21 @@ class SparseSample(NamedTuple):
         """With STEP_VALUE times the whole steps of its features."""
         whole = (self.features / steps.scale + steps.empty).round().clamp(0, STEPS)
         return self._replace(features=whole * STEP_VALUE)
+
+
+class RowProducts(Protocol):
+    """Matrix products by name, one after the other."""
+
+    products: nn.ModuleDict
+
+    def product(self, name: str) -> nn.Linear:
+        """Of this name."""
+
+    def passes(self, *sample: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
+        """Name, what it reads (M, n) and what it gives (M, outputs) of each product in turn, unitless."""
+
+
+Backbone = TypeVar("Backbone", bound=RowProducts)
 
 
 class InputMoments(NamedTuple):
@@ -74,35 +90,37 @@ def scale_rows_to_steps(backbone: SparseBackbone, samples: Iterable[SparseSample
     for number, level in enumerate(backbone.levels):
         following = [*names[number][1:], None]
         for name, next_name in zip(names[number], following, strict=True):
-            step = highest[name].clamp_min(_TINY) / STEPS
-            _count(backbone, name, step)
+            step = highest[name].clamp_min(TINY) / STEPS
+            count_steps(backbone.product(name), step)
             readers = [next_name] if next_name else [level.upsample, *(block[0] for block in names[number + 1 :][:1])]
             for reader in readers:
                 weight = backbone.product(reader).weight
                 weight.view(len(weight), -1, len(step)).mul_(step / STEP_VALUE)
         channels = len(highest[level.upsample]) // level.stride**2  # the places of a channel end up in one column
-        step = highest[level.upsample].view(-1, channels).amax(dim=0).clamp_min(_TINY) / STEPS
-        _count(backbone, level.upsample, step.repeat(level.stride**2))
+        step = highest[level.upsample].view(-1, channels).amax(dim=0).clamp_min(TINY) / STEPS
+        count_steps(backbone.product(level.upsample), step.repeat(level.stride**2))
         head.weight[:, first_channel : first_channel + channels] *= step / STEP_VALUE
         first_channel += channels
 
 
 @torch.no_grad()
-def read_moments(backbone: SparseBackbone, samples: Sequence[SparseSample]) -> dict[str, InputMoments]:
-    """Moments of what every product reads on the calibration scans, at PLACES places of each at most.
+def read_moments(
+    backbone: RowProducts, samples: Sequence[tuple[Any, ...]], places: int = PLACES
+) -> dict[str, InputMoments]:
+    """Moments of what every product reads on the calibration scans, at so many places of each at most.
 
-    The head's are those of the cells with its highest scores, and of a few others.
+    A head's are those of the cells with its highest scores, and of a few others.
     """
     generator = torch.Generator().manual_seed(0)
     sums: dict[str, tuple[Tensor, Tensor]] = {}
     for sample in samples:
         for name, read, output in backbone.passes(*sample):
-            places = torch.randperm(len(read), generator=generator)[:PLACES]
-            if name == HEAD:
+            chosen = torch.randperm(len(read), generator=generator)[:places]
+            if name == HEAD and isinstance(backbone, SparseBackbone):
                 scores = output[:, : backbone.head_channels[0]]
                 best = scores.topk(min(BEST_CELLS, len(scores)), dim=0).indices.flatten()
-                places = torch.cat([best, places[:OTHER_CELLS]])
-            rows = read[places].double()
+                chosen = torch.cat([best, chosen[:OTHER_CELLS]])
+            rows = read[chosen].double()
             mean, squares = rows.sum(dim=0) / max(len(rows), 1), rows.T @ rows / max(len(rows), 1)
             before = sums.get(name, (torch.zeros_like(mean), torch.zeros_like(squares)))
             sums[name] = before[0] + mean / len(samples), before[1] + squares / len(samples)
@@ -113,7 +131,7 @@ def read_moments(backbone: SparseBackbone, samples: Sequence[SparseSample]) -> d
 
 
 @torch.no_grad()
-def round_products(backbone: SparseBackbone, layers: Collection[str], moments: dict[str, InputMoments]) -> None:
+def round_products(backbone: RowProducts, layers: Collection[str], moments: dict[str, InputMoments]) -> None:
     """Round the weights of `layers` to what 8-bit arithmetic will use, in place."""
     for name in layers:
         product = backbone.product(name)
@@ -122,8 +140,15 @@ def round_products(backbone: SparseBackbone, layers: Collection[str], moments: d
         product.weight.copy_(rounded)
 
 
-def _count(backbone: SparseBackbone, name: str, step: Tensor) -> None:
-    """Let the outputs count steps."""
-    product = backbone.product(name)
+def mixed_products(exact: Backbone, rounded: Backbone, eight_bit: Iterable[str]) -> Backbone:
+    """A copy of `exact` with the rounded products of these names."""
+    mixed = copy.deepcopy(exact)
+    for name in eight_bit:
+        mixed.products[name] = rounded.products[name]
+    return mixed
+
+
+def count_steps(product: nn.Linear, step: Tensor) -> None:
+    """Let the outputs count unitless steps (outputs,), STEP_VALUE for each."""
     product.weight.mul_(STEP_VALUE / step[:, None])
     product.bias.mul_(STEP_VALUE / step)

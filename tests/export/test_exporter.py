@@ -99,7 +99,7 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
         other.head.get_parameter("boxes.bias").add_(0.01)
     export_backbone = graphs.export_backbone
     wrong = FastBackbone(other)
-    monkeypatch.setattr(graphs, "export_backbone", lambda _, grid, path: export_backbone(wrong, grid, path))
+    monkeypatch.setattr(graphs, "export_backbone", lambda _, shape, path: export_backbone(wrong, shape, path))
     with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime part at stage head `boxes`: .* 0\.01"):
         export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS)
     assert {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()} == before

@@ -63,7 +63,7 @@ def test_the_detector_stays_as_it_was() -> None:
 
 def test_multiply_accumulates_are_those_of_the_shapes(tmp_path: Path) -> None:
     detector = tiny_detector("none")
-    graphs.export_backbone(FastBackbone(detector), detector.grid, tmp_path / "backbone.onnx")
+    graphs.export_backbone(FastBackbone(detector), detector.grid.map_shape, tmp_path / "backbone.onnx")
     cells = detector.grid.ny * detector.grid.nx
     blocks = [  # (cells of the output, inputs, outputs, convolutions): one strided and one plain convolution each
         cells // 4 * 9 * (16 * 16 + 16 * 16),
