@@ -14,13 +14,17 @@ from torch import Tensor
 from asca_pillars.errors import TrainingError
 from asca_pillars.training.checkpoints import LastCheckpoint
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C; what `kill`, systemd and batch systems send
+
 
 class TrainingInterruptedError(TrainingError):
-    """Ctrl-C: the run is saved and can go on."""
+    """Asked to stop: the run is saved and can go on."""
 
 
 class SaveOnInterrupt(Checkpoint):
-    """The first Ctrl-C waits for the step to end, saves, and stops; the second one stops at once.
+    """The first Ctrl-C or SIGTERM waits for the step to end, saves, and stops; the second one stops at once.
+
+    To Lightning alone SIGTERM is the end of a run that went well.
 
     A `Checkpoint`, because those act after everything else that a step changes.
 
@@ -31,19 +35,20 @@ class SaveOnInterrupt(Checkpoint):
     def __init__(self, last: LastCheckpoint) -> None:
         self.last = last
         self.asked = False
-        self._before: Any = None
+        self._before: dict[int, Any] = {}
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
-        """Take over SIGINT, which only the main thread may, and give it back after Lightning has restored its own."""
+        """Take over both signals, which only the main thread may, until Lightning has restored its own handlers."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        self._before = signal.signal(signal.SIGINT, self._ask)
+        self._before = {number: signal.signal(number, self._ask) for number in _SIGNALS}
         try:
             yield
         finally:
-            signal.signal(signal.SIGINT, self._before)
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
         """Save and stop, on all ranks together."""
@@ -56,9 +61,9 @@ class SaveOnInterrupt(Checkpoint):
         if not trainer.sanity_checking and self._any_rank_asked(trainer):
             self._stop(trainer)
 
-    def _ask(self, *_: Any) -> None:
+    def _ask(self, number: int, *_: Any) -> None:
         self.asked = True
-        signal.signal(signal.SIGINT, self._before)
+        signal.signal(number, self._before[number])
 
     def _any_rank_asked(self, trainer: L.Trainer) -> bool:
         return trainer.strategy.reduce_boolean_decision(self.asked, all=False)

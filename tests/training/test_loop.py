@@ -163,21 +163,24 @@ def test_a_damaged_scan_is_one_line_from_a_loader_process(tmp_path: Path) -> Non
     assert "\n" not in str(caught.value)
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_who_asks_it_to_stop_is_told_how_to_go_on(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = write_dataset(tmp_path / "data", 7)
     config = with_train(epochs=1, checkpoint_steps=1000)
     step = DetectionModule.training_step
 
-    def interrupted(self: DetectionModule, batch: Batch, number: int) -> torch.Tensor:
+    def interrupted(self: DetectionModule, batch: Batch, index: int) -> torch.Tensor:
         if self.global_step == 1:
-            os.kill(os.getpid(), signal.SIGINT)
-        return step(self, batch, number)
+            os.kill(os.getpid(), number)
+        return step(self, batch, index)
 
     monkeypatch.setattr(DetectionModule, "training_step", interrupted)
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     with pytest.raises(TrainingInterruptedError, match="saved at step 2; the same command goes on"):
         train(config, data, tmp_path / "run")
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     checkpoints = tmp_path / "run" / "checkpoints"
     assert load_checkpoint(checkpoints / "last.ckpt").steps == load_checkpoint(checkpoints / "weights.ckpt").steps == 2
 
