@@ -100,6 +100,7 @@ def quantize_bundle(
 
     Args:
         folder: a proven float bundle.
+        bundle: its manifest.
         detector: what it was exported from, in evaluation mode.
         calibration: scans (N, 4), LiDAR frame, that set the ranges, see `calibration_scans`.
         scans: to measure on.

@@ -55,16 +55,7 @@ def quantize_pv_rcnn_bundle(
 ) -> PvRcnnBundle:
     """Replace the first stage's graphs and the manifest in `folder` by 8-bit ones.
 
-    Args:
-        folder: a proven float bundle.
-        bundle: its manifest.
-        network: what it was exported from, in evaluation mode.
-        calibration: scans (N, 4), LiDAR frame, that set the ranges, see `calibration_scans`.
-        scans: to measure on.
-        progress: told what is being done.
-
-    Raises:
-        ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
+    Arguments and errors as of `int8.quantize_bundle`, the network in place of its detector.
     """
     own = calibration_scans(calibration, scans, bundle.spec)
     runtime = Detector(folder)
