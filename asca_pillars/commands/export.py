@@ -11,7 +11,10 @@ from asca_pillars.commands.extras import require
 def export(
     checkpoint: Annotated[
         Path,
-        typer.Argument(help="RUN/checkpoints/best.ckpt or last.ckpt; with --golden or --browser a bundle."),
+        typer.Argument(
+            help="RUN/checkpoints/best.ckpt or last.ckpt, or a bundle that holds its weights, such as asca_sim; with "
+            "--golden or --browser any bundle."
+        ),
     ],
     *,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to be written.")],
@@ -24,8 +27,12 @@ def export(
         ),
     ] = None,
     trained_on: Annotated[
-        str, typer.Option("--trained-on", help="What the weights have seen, for the manifest.")
-    ] = "not stated",
+        str | None,
+        typer.Option(
+            "--trained-on",
+            help="What the weights have seen, for the manifest. Default: what a bundle says; not stated.",
+        ),
+    ] = None,
     score: Annotated[
         list[str] | None,
         typer.Option(
@@ -42,6 +49,14 @@ def export(
             help="Scans like those trained on, to calibrate with; 96 of the folder, evenly spaced. Default: simulated.",
         ),
     ] = None,
+    dense_neck: Annotated[
+        bool,
+        typer.Option(
+            "--dense-neck",
+            help="Write a sparse neck as dense convolutions with masks: the same boxes, for OpenVINO and TensorRT, "
+            "which want fixed shapes, and for GPUs. Slower on a CPU.",
+        ),
+    ] = False,
     with_weights: Annotated[
         bool, typer.Option("--with-weights", help="Add the weights, in 16 bits, for `asca train --init`.")
     ] = False,
@@ -71,16 +86,26 @@ def export(
 
     asca export runs/small/checkpoints/last.ckpt -o my_bundle --score Car=0.4
 
+    asca export asca_sim --dense-neck -o asca_sim_dense
+
     asca export my_bundle --golden -o golden
     """
     if golden or browser or ort_web is not None:
         from asca_pillars.commands.export_runtime import export_for_runtime
 
-        of_a_checkpoint = {"--score": score, "--int8": int8, "--calibrate": calibrate, "--with-weights": with_weights}
+        of_a_checkpoint = {
+            "--score": score,
+            "--int8": int8,
+            "--calibrate": calibrate,
+            "--dense-neck": dense_neck,
+            "--with-weights": with_weights,
+        }
         export_for_runtime(checkpoint, out, scans, of_a_checkpoint, golden=golden, browser=browser, ort_web=ort_web)
         return
     require("train")
+    from collections.abc import Callable
     from dataclasses import replace
+    from functools import partial
 
     import numpy as np
     from rich.console import Console
@@ -96,42 +121,51 @@ def export(
         PARITY_SEED,
         View,
         class_score,
+        open_source,
         print_quantization,
         read_or_simulate,
-        run_environment,
     )
     from asca_pillars.errors import ConfigError
     from asca_pillars.files import require_replaceable
-    from asca_pillars.models.checkpoint import load_checkpoint
 
     console = Console(markup=False)
     require_replaceable(out, "asca export", MANIFEST)  # before minutes of work
-    loaded = load_checkpoint(checkpoint)
-    spec = loaded.config.model.spec.with_score_threshold(dict(class_score(text) for text in score or ()))
+    source = open_source(checkpoint)
+    loaded = source.checkpoint
+    scores = source.score_thresholds | dict(class_score(text) for text in score or ())
+    spec = loaded.config.model.spec.with_score_threshold(scores)
     model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
     loaded = loaded._replace(config=replace(loaded.config, model=model))
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
-    kinds = {"pillar": export_bundle, "pillar_refine": export_refine_bundle, "pv_rcnn": export_pv_rcnn_bundle}
-    export_kind = kinds[loaded.config.model.kind]
+    kind = loaded.config.model.kind
+    if dense_neck and kind != "pillar":
+        raise ConfigError(
+            f"--dense-neck: {checkpoint} is of kind {kind}, and only kind pillar has that form; leave it out"
+        )
+    kinds: dict[str, Callable[..., AnyBundle]] = {
+        "pillar": partial(export_bundle, dense_neck=dense_neck),
+        "pillar_refine": export_refine_bundle,
+        "pv_rcnn": export_pv_rcnn_bundle,
+    }
+    export_kind = kinds[kind]
     if loaded.expected_input is None and scans is None:
         raise ConfigError(
             f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
             "give some of them with --scans"
         )
-    command = run_environment(checkpoint).get("command", "not recorded")
     points = read_or_simulate(scans, console, PARITY_SCANS, PARITY_SEED)
     # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
     view: View = "camera" if loaded.config.data.camera_view else "full"
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
-    weights = checkpoint if with_weights else None
+    weights = source.path if with_weights else None
     with console.status("Exporting") as status:
         bundle: AnyBundle = export_kind(
             loaded,
             out,
             points,
-            trained_on=trained_on,
-            command=command,
+            trained_on=trained_on or source.trained_on,
+            command=source.command,
             calibration=calibration,
             weights=weights,
             progress=status.update,

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +11,47 @@ from rich.progress import track
 from rich.table import Table
 
 from asca_deploy.bundle import Quantization
+from asca_deploy.manifest import load_any_bundle
+from asca_deploy.shipped import find_checkpoint
 from asca_pillars.commands.extras import require
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
 CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
 
 View = Literal["camera", "full"]
+
+
+class Source(NamedTuple):
+    """What is exported, and what it says of itself."""
+
+    path: Path
+    """Of the checkpoint."""
+    checkpoint: Checkpoint
+    score_thresholds: dict[str, float]
+    """Of the bundle that holds the checkpoint, class by class; empty of others: those of its config are meant."""
+    trained_on: str
+    command: str
+    """That trained it."""
+
+
+def open_source(source: Path) -> Source:
+    """A checkpoint, or a bundle (folder, or name of one that ships) that holds its own.
+
+    Raises:
+        AscaError: it is missing, damaged or a bundle without weights.
+    """
+    path = find_checkpoint(source)
+    checkpoint = load_checkpoint(path)
+    if path == source:
+        command = run_environment(source).get("command", "not recorded")
+        return Source(path, checkpoint, {}, "not stated", command)
+    bundle = load_any_bundle(path.parent)
+    scores = {each.name: each.score_threshold for each in bundle.spec.classes}
+    return Source(path, checkpoint, scores, bundle.provenance.trained_on, bundle.provenance.command)
 
 
 def print_quantization(report: Quantization, console: Console) -> None:

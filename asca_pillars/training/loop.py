@@ -16,12 +16,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from asca_deploy.bundle import WEIGHTS
-from asca_deploy.shipped import find_weights
+from asca_deploy.shipped import find_checkpoint
 from asca_pillars.config import Config, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
 from asca_pillars.models.checkpoint import load_checkpoint, save_weights
-from asca_pillars.models.second_stage.open_first_stage import CHECKPOINT_SUFFIX, with_first_stage
+from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (
@@ -154,9 +154,7 @@ def _trainer(
 
 
 def _start_from(module: DetectionModule, init: str | Path) -> None:
-    path = Path(init)
-    if not path.is_file() and path.suffix != CHECKPOINT_SUFFIX:
-        path = find_weights(init)
+    path = find_checkpoint(init)
     theirs, ours = load_checkpoint(path).detector.state_dict(), module.detector.state_dict()
     for name in ours | theirs:
         found, wanted = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))

@@ -76,5 +76,6 @@ def check_neck(bundle: Bundle, provider: str) -> None:
     if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
         raise ProviderError(
             f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
-            "choose provider cpu, or a bundle with a dense neck such as asca_small_sim"
+            "choose provider cpu, or a dense neck: `asca export --dense-neck` writes the same detector with one, "
+            "asca_small_sim comes with one"
         )

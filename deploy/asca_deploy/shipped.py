@@ -53,6 +53,16 @@ def find_weights(bundle: str | Path) -> Path:
     return path
 
 
+def find_checkpoint(source: str | Path) -> Path:
+    """A checkpoint itself, by its suffix, or the one that a bundle (folder, or name of one that ships) holds.
+
+    Raises:
+        BundleError: there is no such bundle, or it holds none.
+    """
+    path = Path(source)
+    return path if path.is_file() or path.suffix == Path(WEIGHTS).suffix else find_weights(source)
+
+
 def sample_scan_path() -> Path:
     """The simulated scan that comes with the package, KITTI .bin."""
     return Path(str(resources.files("asca_deploy") / "samples" / "street.bin"))

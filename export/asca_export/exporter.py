@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
 from asca_deploy.bundle import (
     BACKBONE,
@@ -27,6 +28,7 @@ from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
 from asca_export.int8 import calibration_scans, quantize_bundle
+from asca_export.masked_forms import MarkedEncoder, MaskedBackbone
 from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
@@ -53,6 +55,7 @@ def export_bundle(
     trained_on: str = "not stated",
     command: str = "not stated",
     calibration: Sequence[NDArray[np.float32]] | None = None,
+    dense_neck: bool = False,
     weights: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Bundle:
@@ -70,27 +73,28 @@ def export_bundle(
         command: the command that trained them.
         calibration: scans (N, 4) that set the ranges of an 8-bit bundle; those that are among `scans` are left out
             and counted.
+        dense_neck: write a sparse neck as dense convolutions with masks, in float32 alone, see `masked_forms`.
         weights: the checkpoint's file, whose weights are to lie beside the graphs in 16 bits; None leaves them out.
         progress: told what is being done.
 
     Raises:
-        ExportError: too few scans, to prove parity or to calibrate on, or PyTorch and onnxruntime differ; names the
-            first stage that does.
+        ExportError: too few scans, to prove parity or to calibrate on; `dense_neck` of a neck that is dense, or in
+            8 bits; or PyTorch and onnxruntime differ; names the first stage that does.
     """
     require_parity_scans(scans)
     config, detector = checkpoint.config, checkpoint.detector
     if not (isinstance(config.model, PillarModel) and isinstance(detector, PillarDetector)):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
+    if dense_neck:
+        _require_maskable(config.model.network.neck, calibration)
     if calibration is not None:
         calibration_scans(calibration, scans, config.model.spec)  # too few are told before the work, not after it
     progress("Exporting and proving parity")
     with atomic_directory(out, "asca export", MANIFEST) as folder:
-        graphs.export_encoder(detector, graphs.graph_path(folder, ENCODER))
-        gmac = _export_backbone(detector, graphs.graph_path(folder, BACKBONE), scans)
+        gmac = _export_graphs(detector, folder, scans, dense_neck=dense_neck)
         network = config.model.network
-        section = PillarSection(
-            network.cpa, network.pillar_channels, CanvasFormat(), network.neck, detector.preparation.active_cells
-        )
+        neck, cells = ("dense", None) if dense_neck else (network.neck, detector.preparation.active_cells)
+        section = PillarSection(network.cpa, network.pillar_channels, CanvasFormat(), neck, cells)
         draft = draft_bundle(checkpoint, scans, trained_on, command, pillar=section, backbone_gmac=gmac)
 
         def prove(signed: Bundle) -> Parity:
@@ -185,12 +189,26 @@ def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provena
     )
 
 
-def _export_backbone(detector: PillarDetector, path: Path, scans: Sequence[NDArray[np.float32]]) -> float:
-    """Write backbone.onnx; its multiply-accumulates, 10^9, of a sparse neck in the mean over the scans."""
-    if detector.preparation.active_cells is None:
-        graphs.export_backbone(FastBackbone(detector), detector.grid.map_shape, path)
+def _require_maskable(neck: str, calibration: Sequence[NDArray[np.float32]] | None) -> None:
+    if neck == "dense":
+        raise ExportError("--dense-neck: the neck of this model is dense; leave it out")
+    if calibration is not None:
+        raise ExportError("--dense-neck with --int8: its form is float32 alone; leave one of them out")
+
+
+def _export_graphs(
+    detector: PillarDetector, folder: Path, scans: Sequence[NDArray[np.float32]], *, dense_neck: bool
+) -> float:
+    """Write both graphs; the backbone's multiply-accumulates, 10^9, of a sparse neck in the mean over the scans."""
+    preparation = detector.preparation
+    encode: nn.Module = MarkedEncoder(detector.encode) if dense_neck else detector.encode
+    graphs.export_encoder(encode, graphs.graph_path(folder, ENCODER))
+    path = graphs.graph_path(folder, BACKBONE)
+    if dense_neck or preparation.active_cells is None:
+        dense = MaskedBackbone(detector) if dense_neck else FastBackbone(detector)
+        graphs.export_backbone(dense, detector.grid.map_shape, path)
         return graphs.multiply_accumulates(path) / 1e9
-    backbone, preparation = SparseBackbone(detector), detector.preparation
+    backbone = SparseBackbone(detector)
     export_sparse_backbone(backbone, path)
     tables = [preparation.place(preparation.spec.pillarize(scan)).tables for scan in scans]
     return float(np.mean([multiply_accumulates(backbone, each) for each in tables if each is not None])) / 1e9

@@ -19,8 +19,8 @@ from asca_deploy.bundle import AnyBundle
 from asca_deploy.manifest import essentials, graph_files
 from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
+from asca_export.masked_forms import MaskedBackbone
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.pillars.pillarize import FEATURES
 
 B = TypeVar("B", bound=AnyBundle)
@@ -29,10 +29,11 @@ OPSET = 20
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
 
 
-def export_encoder(detector: PillarDetector, path: Path) -> None:
+def export_encoder(encode: nn.Module, path: Path) -> None:
     """Write encoder.onnx: features (M, 9), pillar_index (M,), point_counts (P,) -> pillar_features (P, C).
 
-    M and P are dynamic. The `paper` reading takes P up to the limit that it was trained with.
+    `encode` is a `PillarEncoder`, or has its interface. M and P are dynamic. The `paper` reading takes P up to
+    the limit that it was trained with.
     """
     points, pillars = 24, 6  # sizes of the example that the tracer sees; neither is kept
     point_counts = torch.full((pillars,), points // pillars)
@@ -43,7 +44,7 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
     )
     rows, cells = torch.export.Dim("points"), torch.export.Dim("pillars")
     export_graph(
-        _Encoder(detector.encode),
+        _Encoder(encode),
         example,
         path,
         input_names=["features", "pillar_index", "point_counts"],
@@ -52,7 +53,7 @@ def export_encoder(detector: PillarDetector, path: Path) -> None:
     )
 
 
-def export_backbone(backbone: FastBackbone, map_shape: tuple[int, int], path: Path) -> None:
+def export_backbone(backbone: FastBackbone | MaskedBackbone, map_shape: tuple[int, int], path: Path) -> None:
     """Write backbone.onnx: canvas (1, H, W, C) -> scores, boxes, directions, see `FastBackbone`.
 
     H and W are the rows and columns of `map_shape` and the padding that the backbone takes.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
 from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
+from asca_export.masked_forms import NEVER
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.decode import HeadMaps
@@ -65,6 +66,8 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
             expected_canvas = np.pad(pseudo_image.transpose(0, 2, 3, 1), ((0, 0), (1, 0), (1, 0), (0, 0)))
             require_close("scatter", expected_canvas, placed.image, allowed, number)
         maps, cells = runtime.backbone.run(placed)
+        if cells is None and batch.neck is not None:  # a sparse neck as dense convolutions
+            maps, cells = _at_cells(maps, batch.neck.head_cells.numpy(), number)
         for name, expected, found in zip(HeadMaps._fields, expected_maps, maps, strict=True):
             error = require_close(f"head `{name}`", expected, found, MAP_TOLERANCE, number)
             worst_map = max(worst_map, error)
@@ -77,6 +80,13 @@ def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:
     """What PyTorch says of a batch of one frame: maps, or rows of its active head cells."""
     maps = (part.numpy() for part in detector(batch))
     return HeadMaps(*(part if batch.neck is not None else part[0] for part in maps))
+
+
+def _at_cells(maps: Maps, cells: NDArray[np.int32], scan: int) -> tuple[Maps, NDArray[np.int32]]:
+    """Rows of maps (channels, H, W) at the active head cells, (M,); no other cell may have a score."""
+    elsewhere = np.delete(maps.scores.reshape(len(maps.scores), -1), cells, axis=1)
+    require_close("head `scores` of inactive cells", np.full_like(elsewhere, NEVER), elsewhere, 0, scan)
+    return HeadMaps(*(part.reshape(len(part), -1).T[cells] for part in maps)), cells
 
 
 def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArray[np.float32]:

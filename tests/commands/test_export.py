@@ -1,0 +1,59 @@
+"""`asca export` on checkpoints and on bundles that hold their weights: what is written, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+
+from asca_deploy import Detector, load_bundle
+from asca_pillars.data.scans.scan_reader import write_scan
+from tests.export.test_sparse_bundle import sparse_checkpoint
+from tests.export.tiny import SCANS
+from tests.in_process import run_here
+from tests.models.second_stage.tiny_refine import save_checkpoint
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scans")
+    for number, points in enumerate(SCANS):
+        write_scan(folder / f"{number}.bin", points)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def with_weights(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export")
+    save_checkpoint(folder / "last.ckpt", sparse_checkpoint("fine"))
+    exported = run_here(
+        *("export", folder / "last.ckpt", "-o", folder / "bundle", "--scans", scans, "--with-weights"),
+        *("--score", "Car=0.05", "--trained-on", "random numbers"),
+    )
+    assert exported.returncode == 0, exported.stderr
+    return folder / "bundle"
+
+
+def test_a_bundle_with_its_weights_gets_a_dense_neck(with_weights: Path, scans: Path, tmp_path: Path) -> None:
+    out = tmp_path / "dense"
+    exported = run_here("export", with_weights, "--dense-neck", "-o", out, "--scans", scans, "--score", "Cyclist=0.06")
+    assert exported.returncode == 0, exported.stderr
+    before, after = load_bundle(with_weights), load_bundle(out)
+    assert (before.pillar.neck, after.pillar.neck) == ("sparse", "dense")
+    assert [each.score_threshold for each in after.spec.classes] == [0.05, 0.02, 0.06], "the bundle's, then the option"
+    assert after.provenance.trained_on == "random numbers" and after.provenance.weights_file is None
+    assert after.provenance.command == before.provenance.command
+    ours, theirs = (Detector(folder)(SCANS[0]).names for folder in (out, with_weights))
+    assert [name for name in ours if name != "Cyclist"] == [name for name in theirs if name != "Cyclist"]
+    assert len(ours) > 3
+
+
+def test_what_cannot_be_exported_is_one_line(with_weights: Path, scans: Path, tmp_path: Path) -> None:
+    out, tail = tmp_path / "out", ("-o", tmp_path / "out", "--scans", scans)
+    for arguments, said in (
+        (("asca_sim_int8", *tail), "asca_sim_int8: holds no weights.ckpt"),
+        ((tmp_path / "nowhere", *tail), "no such folder"),
+        ((with_weights, "--dense-neck", "--int8", *tail), "--dense-neck with --int8"),
+        ((with_weights, "--golden", "--dense-neck", "-o", out), "--dense-neck is for a checkpoint"),
+    ):
+        refused = run_here("export", *arguments)
+        assert refused.returncode == 2 and said in refused.stderr, refused.stderr
+        assert "Traceback" not in refused.stderr and not out.exists()
