@@ -21,6 +21,7 @@ from asca_pillars.schema import Strict
 from asca_pillars.settings import read_settings, shipped_configs
 
 InsertMethod = Literal["none", "gt_aug", "rs_aug"]
+Precision = Literal["auto", "fp32", "bf16"]
 
 
 def _family(settings: Any) -> Any:
@@ -138,7 +139,7 @@ class TrainConfig(Strict):
         schedule: `step` multiplies the rate by `decay` every `decay_epochs`; `one_cycle` rises to
             `learning_rate` and falls to almost nothing over the run, step by step.
         gradient_clip: largest norm of the whole gradient; 0 leaves it as it is.
-        precision: `fp32` or `bf16`.
+        precision: `fp32`, `bf16`, or `auto`: bf16 where the device has it.
         ema: decay of an exponential moving average of the weights, such as 0.999, that is validated, saved and
             exported in their place; 0 for none.
         checkpoint_steps: also save every so many steps, so that a kill costs minutes, not an epoch.
@@ -152,7 +153,7 @@ class TrainConfig(Strict):
     decay: float = 0.8
     decay_epochs: int = 15
     gradient_clip: float = 10.0
-    precision: Literal["fp32", "bf16"] = "fp32"
+    precision: Precision = "fp32"
     ema: float = 0.0
     checkpoint_steps: int = 500
     seed: int = 0

@@ -23,6 +23,7 @@ from asca_pillars.config import load_config
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.models.build import build_model
 from asca_pillars.system import cpu_model
+from asca_pillars.training.bfloat16 import computes_in_bfloat16
 from asca_pillars.training.dataset import open_dataset
 
 WARM_UP = 3
@@ -41,7 +42,7 @@ def main(
     model = build_model(settings.model).to(device)
     model.train()
     optimizer = torch.optim.Adam(model.parameters(), lr=settings.train.learning_rate)
-    size = settings.train.batch_size
+    size, in_bfloat16 = settings.train.batch_size, computes_in_bfloat16(settings.train.precision)
     clock = time.process_time if device == "cpu" else time.perf_counter  # other jobs on a CPU do not count
     loading, stepping = [], []
     for number in track(range(batches + WARM_UP), "Measuring"):
@@ -51,7 +52,7 @@ def main(
         loaded = time.process_time()
         begin = clock()
         inputs = inputs.to(device)
-        with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=settings.train.precision == "bf16"):
+        with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=in_bfloat16):
             loss = torch.stack(list(model.loss(model.predict(inputs), inputs).values())).sum()
         optimizer.zero_grad()
         loss.backward()
@@ -64,7 +65,8 @@ def main(
     for title, seconds in (("loading", loading), ("step", stepping)):
         low, median, high = np.percentile(1e3 * np.array(seconds[WARM_UP:]) / size, (25, 50, 75))
         rows.append((title, f"{median:.1f}", f"{low:.1f} to {high:.1f}", f"{1e3 / median:.0f}"))
-    print(f"{cpu_model()}; {torch.get_num_threads()} threads; network on {device}\n")
+    arithmetic = "bf16" if in_bfloat16 else "fp32"
+    print(f"{cpu_model()}; {torch.get_num_threads()} threads; network on {device} in {arithmetic}\n")
     print(markdown_table(("", "ms per sample", "quartiles", "samples per second and process"), rows, left=1))
 
 

@@ -43,7 +43,7 @@ def test_overrides_win(tmp_path: Path) -> None:
         ("train.epochs=[", "`train.epochs=[`: the value is not valid YAML"),
         ("name=2026-99-99", "`name=2026-99-99`: the value is not valid YAML"),
         ("train.epochs=0", "train.epochs = 0: must be at least 1"),
-        ("train.precision=64", "`train.precision` = 64: input should be 'fp32' or 'bf16'"),
+        ("train.precision=64", "`train.precision` = 64: input should be 'auto', 'fp32' or 'bf16'"),
         ("model.spec.grid.zones=9", "zones 9 must lie between 1 and 5"),
     ],
 )

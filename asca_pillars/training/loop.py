@@ -23,6 +23,7 @@ from asca_pillars.errors import TrainingError
 from asca_pillars.models.checkpoint import load_checkpoint, save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
+from asca_pillars.training.bfloat16 import computes_in_bfloat16, has_bfloat16
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (
     LAST,
@@ -84,8 +85,11 @@ def train(
     claim(out, config)
     remove_leftovers(checkpoints)
     resumed, damage = checkpoint_to_resume(checkpoints)
+    say = rank_zero_only(Console(markup=False, highlight=False).print)
     if damage is not None and resumed is not None:
-        rank_zero_only(Console(markup=False, highlight=False).print)(f"{damage}: going on from {resumed}")
+        say(f"{damage}: going on from {resumed}")
+    if config.train.precision == "bf16" and not has_bfloat16():
+        say("train.precision = bf16: this device has no bfloat16 and is many times slower in it; choose auto or fp32")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     L.seed_everything(config.train.seed, verbose=False)
     module = DetectionModule(config, measure_input(out, data.training_set.frames))
@@ -136,7 +140,7 @@ def _trainer(
         return L.Trainer(
             default_root_dir=out,
             max_epochs=recipe.epochs,
-            precision="bf16-mixed" if recipe.precision == "bf16" else "32-true",
+            precision="bf16-mixed" if computes_in_bfloat16(recipe.precision) else "32-true",
             gradient_clip_val=recipe.gradient_clip or None,
             num_sanity_val_steps=SANITY_STEPS,
             sync_batchnorm=torch.cuda.is_available(),  # there is no such thing on a CPU

@@ -1,0 +1,58 @@
+"""`train.precision`: what it means on machines with and without bfloat16."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from asca_pillars.config import Precision, load_config
+from asca_pillars.training import bfloat16
+from asca_pillars.training.bfloat16 import computes_in_bfloat16, has_bfloat16
+from asca_pillars.training.loop import train
+from tests.scenes import write_dataset
+from tests.test_config import CONFIGS
+from tests.training.test_loop import CONFIG
+
+
+@pytest.mark.parametrize(
+    ("precision", "with_it", "without"), [("auto", True, False), ("bf16", True, True), ("fp32", False, False)]
+)
+def test_auto_follows_the_device(
+    precision: Precision, with_it: bool, without: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda: True)
+    assert computes_in_bfloat16(precision) is with_it
+    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda: False)
+    assert computes_in_bfloat16(precision) is without
+
+
+def test_a_gpu_answers_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for native in (True, False):
+        monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation, native=native: native)
+        assert has_bfloat16() is native
+
+
+@pytest.mark.skipif(not Path("/proc/cpuinfo").is_file(), reason="needs Linux to say what the CPU has")
+def test_a_cpu_with_avx512_bf16_or_amx_has_it_and_one_without_avx512_has_not() -> None:
+    flags = set(Path("/proc/cpuinfo").read_text().split())
+    if flags & {"avx512_bf16", "amx_bf16"}:
+        assert has_bfloat16()
+    elif "avx2" in flags and not flags & {"avx512f", "avx_ne_convert"}:
+        assert not has_bfloat16()
+
+
+def test_bf16_where_there_is_none_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("asca_pillars.training.loop.has_bfloat16", lambda: False)
+    config = replace(CONFIG, train=replace(CONFIG.train, epochs=1, precision="bf16"))
+    train(config, write_dataset(tmp_path / "data", 3), tmp_path / "run")
+    assert "train.precision = bf16: this device has no bfloat16" in " ".join(capsys.readouterr().out.split())
+
+
+def test_configurations_that_ship_run_anywhere() -> None:
+    assert len(CONFIGS) > 5
+    for path in CONFIGS:
+        assert load_config(path).train.precision in ("auto", "fp32"), f"{path}: slow where there is no bfloat16"
