@@ -32,7 +32,7 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
 
     Args:
         out: folder: absent, empty, or an earlier output of this function.
-        bundle: folder of a bundle of kind pillar with a dense neck on a warped map.
+        bundle: folder of a bundle of kind pillar on a warped map.
         scan: what the page shows first; any format that `read_scan` reads.
         ort_web: npm's package onnxruntime-web, a .tgz or its folder.
 
@@ -42,10 +42,9 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
         OutputError: `out` holds something else.
     """
     manifest = load_bundle(bundle)
-    if manifest.kind != "pillar" or manifest.pillar.neck != "dense" or manifest.spec.grid.pools:
+    if manifest.kind != "pillar" or manifest.spec.grid.pools:
         raise BundleError(
-            f"{bundle}: kind {manifest.kind}, {manifest.pillar.neck} neck, {manifest.spec.grid.map} map; the page runs "
-            "kind pillar with a dense neck on a warped map"
+            f"{bundle}: kind {manifest.kind}, {manifest.spec.grid.map} map; the page runs kind pillar on a warped map"
         )
     if manifest.spec.anchor_places != "cells" or manifest.spec.anchor_scores != "own":
         raise BundleError(

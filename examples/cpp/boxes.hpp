@@ -87,12 +87,15 @@ inline double bev_iou(const Box& a, const Box& b) {
 
 }  // namespace detail
 
-// The boxes of one scan, best first. Maps are channels last; `spec` and `yaws` are of bundle.json.
+// The boxes of one scan, best first. Maps are channels last, or rows of the head cells that `cells` names, ascending;
+// `spec` and `yaws` are of bundle.json.
 inline std::vector<Box> detections(const float* scores, const float* residuals, const float* directions,
-                                   const Grid& grid, const nlohmann::json& spec, const std::vector<float>& yaws) {
+                                   const std::vector<int32_t>* cells, const Grid& grid, const nlohmann::json& spec,
+                                   const std::vector<float>& yaws) {
     const auto& classes = spec.at("classes");
     const auto columns = static_cast<int64_t>(grid.head_column_centers.size());
-    const auto cells = columns * static_cast<int64_t>(grid.head_row_centers.size());
+    const auto map_cells = columns * static_cast<int64_t>(grid.head_row_centers.size());
+    const auto rows = cells ? static_cast<int64_t>(cells->size()) : map_cells;
     const auto turns = static_cast<int64_t>(yaws.size());
     const int64_t anchors = static_cast<int64_t>(classes.size()) * turns;
     const size_t candidates = spec.at("post").at("candidates"), most = spec.at("post").at("max_detections");
@@ -102,15 +105,16 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
         const auto& size = classes[label];
         const double threshold = size.at("score_threshold");
         const double floor = std::log(threshold / (1 - threshold));
-        std::vector<std::tuple<float, int64_t, int64_t>> chosen;  // logit downwards, anchor, cell
+        std::vector<std::tuple<float, int64_t, int64_t>> chosen;  // logit downwards, anchor, row
         for (int64_t anchor = label * turns; anchor < static_cast<int64_t>(label + 1) * turns; ++anchor)
-            for (int64_t cell = 0; cell < cells; ++cell)
-                if (const float logit = scores[cell * anchors + anchor]; logit >= floor)
-                    chosen.emplace_back(-logit, anchor, cell);
+            for (int64_t row = 0; row < rows; ++row)
+                if (const float logit = scores[row * anchors + anchor]; logit >= floor)
+                    chosen.emplace_back(-logit, anchor, row);
         std::sort(chosen.begin(), chosen.end());
         if (chosen.size() > candidates) chosen.resize(candidates);
         std::vector<Box> kept;
-        for (const auto& [negative, anchor, cell] : chosen) {
+        for (const auto& [negative, anchor, row] : chosen) {
+            const int64_t cell = cells ? (*cells)[row] : row;
             const std::array<float, 7> box{grid.head_column_centers[cell % columns],
                                            grid.head_row_centers[cell / columns],
                                            size.at("z_m"),
@@ -118,7 +122,7 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
                                            size.at("width_m"),
                                            size.at("height_m"),
                                            yaws[anchor % turns]};
-            const int64_t place = cell * anchors + anchor;
+            const int64_t place = row * anchors + anchor;
             Box found = detail::decode(residuals + 7 * place, directions + 2 * place, box);
             found.score = 1 / (1 + std::exp(double{negative}));
             found.label = static_cast<int>(label);

@@ -16,16 +16,20 @@ from onnx import TensorProto, helper, numpy_helper
 
 from asca_deploy.bundle import Bundle, CanvasFormat, PillarSection, Provenance
 from asca_deploy.manifest import essentials, graph_files, write_bundle_manifest
+from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
+from asca_pillars.tables.neck_tables import MaskRule
 
 needs_openvino = pytest.mark.skipif(
     importlib.util.find_spec("openvino") is None, reason="needs pip install 'asca-pillars[openvino]'"
 )
 
 CHANNELS = 8
+HEADS = (("scores", 1, -3.0, 0.5), ("boxes", 7, 0.0, 0.05), ("directions", 2, 0.0, 0.5))
+"""Name, channels of an anchor, bias, spread of the weights."""
 STAGES = ("pillarize", "encode", "scatter", "neck+head", "decode")
 # 8 + 16 + 32 columns of 0.32, 0.16 and 0.08 m by 24 rows: rectangular, off center, with a positive minimum.
 SPEC = PillarSpec(
@@ -83,11 +87,8 @@ def backbone_graph() -> onnx.ModelProto:
         helper.make_node("Relu", ["neck"], ["relu"]),
     ]
     outputs = []
-    for name, count, bias, spread in (
-        ("scores", anchors, -3.0, 0.5),
-        ("boxes", 7 * anchors, 0.0, 0.05),
-        ("directions", 2 * anchors, 0.0, 0.5),
-    ):
+    for name, per_anchor, bias, spread in HEADS:
+        count = per_anchor * anchors
         weights[f"{name}.weight"] = rng.normal(0, spread, (count, 16, 1, 1)).astype(np.float32)
         weights[f"{name}.bias"] = np.full(count, bias, np.float32)
         nodes.append(helper.make_node("Conv", ["relu", f"{name}.weight", f"{name}.bias"], [f"{name}_first"]))
@@ -97,11 +98,49 @@ def backbone_graph() -> onnx.ModelProto:
     return _model(nodes, [canvas], outputs, weights)
 
 
-def write_bundle(folder: Path, uses_counts: bool = True) -> Path:
-    """A valid bundle in `folder`."""
+def sparse_backbone_graph() -> onnx.ModelProto:
+    """Strided convolutions of two levels, each upsampled to the head's cells; then the three heads."""
+    rng = np.random.default_rng(2)
+    anchors = SPEC.anchors.shape[2]
+    weights: dict[str, NDArray[Any]] = {"one_row": np.array([0, 0, 1, 0])}  # of zeros, behind the last
+    nodes, outputs = [], []
+    rows, inputs = PILLAR_FEATURES, [_info(PILLAR_FEATURES, ["P", CHANNELS])]
+
+    def product(name: str, given: str, channels: int, count: int, bias: float = 0.0, spread: float = 0.15) -> str:
+        weights[f"{name}.weight"] = rng.normal(0, spread, (channels, count)).astype(np.float32)
+        weights[f"{name}.bias"] = np.full(count, bias, np.float32)
+        nodes.append(helper.make_node("Gemm", [given, f"{name}.weight", f"{name}.bias"], [name]))
+        return name
+
+    def gathered(table: str, given: str, channels: int) -> str:
+        weights[f"{table}.shape"] = np.array([-1, channels], np.int64)
+        nodes.append(helper.make_node("Pad", [given, "one_row"], [f"{table}.padded"]))
+        nodes.append(helper.make_node("Gather", [f"{table}.padded", table], [f"{table}.rows"]))
+        nodes.append(helper.make_node("Reshape", [f"{table}.rows", f"{table}.shape"], [f"{table}.taps"]))
+        return f"{table}.taps"
+
+    for level, children in enumerate((1, 4)):
+        inputs.append(_info(f"strided_{level}", [f"M{level}", 9], TensorProto.INT32))
+        inputs.append(_info(f"places_{level}", ["h"], TensorProto.INT32))
+        block = product(f"block_{level}", gathered(f"strided_{level}", rows, 9 * CHANNELS), 9 * CHANNELS, CHANNELS)
+        nodes.append(helper.make_node("Relu", [block], [f"relu_{level}"]))
+        rows = f"relu_{level}"
+        up = product(f"up_{level}", rows, CHANNELS, children * CHANNELS, spread=0.5)
+        weights[f"up_{level}.shape"] = np.array([-1, CHANNELS], np.int64)
+        nodes.append(helper.make_node("Reshape", [up, f"up_{level}.shape"], [f"children_{level}"]))
+        gathered(f"places_{level}", f"children_{level}", CHANNELS)
+    nodes.append(helper.make_node("Add", ["places_0.taps", "places_1.taps"], ["head"]))
+    for name, count, bias, spread in HEADS:
+        product(name, "head", CHANNELS, count * anchors, bias, spread)
+        outputs.append(_info(name, ["h", count * anchors]))
+    return _model(nodes, inputs, outputs, weights)
+
+
+def write_bundle(folder: Path, uses_counts: bool = True, active_cells: MaskRule | None = None) -> Path:
+    """A valid bundle in `folder`, with a rule of active cells one with a sparse neck."""
     folder.mkdir(parents=True)
     onnx.save(encoder_graph(uses_counts), folder / "encoder.onnx")
-    onnx.save(backbone_graph(), folder / "backbone.onnx")
+    onnx.save(sparse_backbone_graph() if active_cells else backbone_graph(), folder / "backbone.onnx")
     provenance = Provenance(
         command="asca train tiny.yaml",
         created="2026-01-02",
@@ -116,7 +155,7 @@ def write_bundle(folder: Path, uses_counts: bool = True) -> Path:
         name="tiny",
         kind="pillar",
         spec=SPEC,
-        pillar=PillarSection("none", CHANNELS, CanvasFormat()),
+        pillar=PillarSection("none", CHANNELS, CanvasFormat(), "sparse" if active_cells else "dense", active_cells),
         precision="float32",
         backbone_gmac=0.1,
         graphs={},
@@ -144,6 +183,12 @@ def sign(folder: Path, bundle: Bundle) -> None:
 def tiny_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A good bundle that no test changes."""
     return write_bundle(tmp_path_factory.mktemp("bundles") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def sparse_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One with a sparse neck and the rule that no bundle has that ships; no test changes it."""
+    return write_bundle(tmp_path_factory.mktemp("bundles") / "sparse", active_cells="sub")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_deploy import sample_scan_path, shipped_bundles
+from asca_deploy import load_bundle, sample_scan_path, shipped_bundles
 from asca_deploy.golden import write_golden
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ScanError
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 MODULES = ROOT / "deploy" / "asca_deploy" / "browser"
 SCRIPTS = Path(__file__).parent / "javascript"
 NODE = shutil.which("node")
-DENSE = "asca_small_sim", "asca_small_sim_int8"  # the page runs no sparse neck
+MODELS = "asca_small_sim", "asca_small_sim_int8", "asca_small_sparse_sim", "asca_sim_int8"
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="needs node")
 
@@ -45,26 +45,32 @@ def _bytes(value: bytes) -> dict[str, str]:
 
 
 def test_stages_on_the_golden_vectors_of_the_models_that_ship(tmp_path: Path) -> None:
-    for name in DENSE:
-        folder = shipped_bundles()[name]
-        write_golden(tmp_path / name, folder, sample_scan_path())
-        assert_same_stages(node(SCRIPTS / "golden.mjs", MODULES, tmp_path / name, folder))
+    for name in MODELS:
+        write_golden(tmp_path / name, shipped_bundles()[name], sample_scan_path())
+        assert_same_stages(tmp_path / name, shipped_bundles()[name])
 
 
-def test_stages_on_a_grid_of_three_zones_beyond_both_limits(tiny_bundle: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("neck", ["dense", "sparse"])
+def test_stages_on_a_grid_of_three_zones_beyond_both_limits(
+    neck: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    bundle = request.getfixturevalue("tiny_bundle" if neck == "dense" else "sparse_bundle")
     write_scan(tmp_path / "scan.bin", tiny.make_scan(3, 6000))
-    stages = write_golden(tmp_path / "golden", tiny_bundle, tmp_path / "scan.bin")
+    stages = write_golden(tmp_path / "golden", bundle, tmp_path / "scan.bin")
     limits, pillars = tiny.SPEC.limits, stages["pillarize"]
     assert len(pillars["cells"]) == limits.max_pillars and pillars["point_counts"].max() == limits.max_points
     assert len(stages["suppress"]["boxes"]) > 2
-    assert_same_stages(node(SCRIPTS / "golden.mjs", MODULES, tmp_path / "golden", tiny_bundle))
+    assert_same_stages(tmp_path / "golden", bundle)
 
 
-def assert_same_stages(differences: dict[str, str]) -> None:
+def assert_same_stages(golden: Path, bundle: Path) -> None:
+    differences = node(SCRIPTS / "golden.mjs", MODULES, golden, bundle)
     for name, difference in differences.items():
         # Boxes are computed in float64 on both sides; exp and the like may differ in the last digit.
         assert float(difference) <= (1e-5 if name.endswith((".boxes", ".scores")) else 0), (name, difference)
-    assert len(differences) == 12
+    compared = {"dense": 12, "sub": 11 + 3 * len(("strided", "same", "places"))}
+    compared["fine"] = compared["sub"] + 1  # first_0
+    assert len(differences) == compared[load_bundle(bundle).pillar.active_cells or "dense"]
 
 
 def test_overlaps_of_random_boxes() -> None:

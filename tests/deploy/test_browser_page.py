@@ -48,12 +48,13 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
 
 @needs_ort_web
 @needs_chromium
-@pytest.mark.parametrize("name", ["asca_small_sim", "asca_small_sim_int8"])
+@pytest.mark.parametrize("name", ["asca_small_sim", "asca_small_sim_int8", "asca_small_sparse_sim", "asca_sim_int8"])
 def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path, tab: Tab) -> None:
     page = tmp_path / "page"
     write_page(page, shipped_bundles()[name], sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
     points = read_scan(sample_scan_path()).points
     write_scan(tmp_path / "half.bin", points[::2])
+    write_scan(tmp_path / "outside.bin", points[:9] + np.array([500, 0, 0, 0], np.float32))
     detector = Detector(name, threads=1)
     with file_server(page) as address:
         tab.call("Page.navigate", url=address)
@@ -63,6 +64,9 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         warm = finished(tab, "sample.bin")
         tab.choose_file("#file", tmp_path / "half.bin")
         assert_same(finished(tab, "half.bin"), detector(points[::2]))
+        tab.choose_file("#file", tmp_path / "outside.bin")
+        nothing = finished(tab, "outside.bin")
+        assert (nothing["pillars"], nothing["boxes"]) == (0, [])
         tab.choose_file("#file", page / "bundle.json")
         assert "scans are .bin and .pcd files" in failure(tab)
     print(f"{name} in {CHROMIUM}: {sum(warm['times_ms'].values()):.0f} ms per scan", warm["times_ms"])
@@ -116,7 +120,7 @@ def assert_drawn(tab: Tab, path: Path) -> None:
 
 
 def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_path: Path) -> None:
-    page, bundle = tmp_path / "page", shipped_bundles()["asca_small_sim_int8"]
+    page, bundle = tmp_path / "page", shipped_bundles()["asca_sim_int8"]
     options = ["--browser", "-o", str(page), "--ort-web", str(made_up_package)]
     for _ in range(2):  # and may be written again
         result = CliRunner().invoke(app, ["export", bundle.name, *options])
@@ -160,8 +164,11 @@ def test_a_folder_of_something_else_is_left_alone(made_up_package: Path, tmp_pat
 
 
 def test_a_bundle_that_the_page_cannot_run(made_up_package: Path, tmp_path: Path, monkeypatch) -> None:
-    bundle = load_bundle(shipped_bundles()["asca_small_sim"])
-    sparse = replace(bundle, pillar=replace(bundle.pillar, neck="sparse", active_cells="sub"))
-    monkeypatch.setattr("asca_deploy.browser_page.load_bundle", lambda _: sparse)
-    with pytest.raises(BundleError, match="sparse neck, warped map; the page runs"):
+    bundle = load_bundle(shipped_bundles()["asca_sim_int8"])
+    pooled = replace(bundle.spec, grid=replace(bundle.spec.grid, zones=3, map="pooled"))
+    monkeypatch.setattr("asca_deploy.browser_page.load_bundle", lambda _: replace(bundle, spec=pooled))
+    with pytest.raises(BundleError, match="kind pillar, pooled map; the page runs"):
         write_page(tmp_path / "page", tmp_path, sample_scan_path(), made_up_package)
+    with pytest.raises(BundleError, match="kind pillar_refine, warped map; the page runs"):
+        monkeypatch.undo()
+        write_page(tmp_path / "page", shipped_bundles()["asca_refine_sim_int8"], sample_scan_path(), made_up_package)

@@ -1,5 +1,6 @@
-"""The C++ example, compiled: it finds the boxes of the golden vectors, and refuses what it cannot run."""
+"""The C++ example, compiled: tables and boxes of the golden vectors, and refusals of what it cannot run."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -12,9 +13,10 @@ import pytest
 from asca_deploy import sample_scan_path, shipped_bundles
 from asca_deploy.golden import write_golden
 from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, table_inputs
 from tests.deploy import conftest as tiny
 
-SOURCE = Path(__file__).parents[2] / "examples" / "cpp" / "detect.cpp"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "cpp"
 COMPILER = shutil.which("g++") or shutil.which("clang++")
 LIBRARIES = sorted((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*"))
 """Of the Python package; its C interface is that of the C++ one, and older headers go with it."""
@@ -40,21 +42,52 @@ def detect(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip("needs a C++ compiler and the headers of onnxruntime and nlohmann-json (ASCA_ORT_INCLUDE)")
     folder = tmp_path_factory.mktemp("cpp")
     (folder / "libonnxruntime.so.1").symlink_to(LIBRARIES[-1])
-    command = [
-        *(COMPILER, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", *flags, str(SOURCE)),
-        *(str(LIBRARIES[-1]), f"-Wl,-rpath,{folder}", "-o", str(folder / "detect")),
-    ]
+    return build(EXAMPLE / "detect.cpp", folder / "detect", *flags, str(LIBRARIES[-1]), f"-Wl,-rpath,{folder}")
+
+
+@pytest.fixture(scope="module")
+def build_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A program that writes the tables of the scans that it is given."""
+    if COMPILER is None:
+        pytest.skip("needs a C++ compiler")
+    return build(Path(__file__).parent / "cpp" / "build_tables.cpp", tmp_path_factory.mktemp("cpp") / "build_tables")
+
+
+def build(source: Path, program: Path, *flags: str) -> Path:
+    options = ("-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{EXAMPLE}")
+    command = [str(COMPILER), *options, str(source), *flags, "-o", str(program)]
     built = subprocess.run(command, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
-    return folder / "detect"
+    return program
 
 
-def assert_golden(detect: Path, bundle: Path, scan: Path, golden: Path) -> None:
+@pytest.mark.parametrize("rule", ["sub", "fine"])
+def test_tables_are_those_of_python(build_tables: Path, rule: MaskRule) -> None:
+    ny, nx = 24, 40
+    rng = np.random.default_rng(6)
+    # A full map before sparse ones, which must not inherit it; nothing, and the corners alone.
+    scans = [np.flatnonzero(rng.random(ny * nx) < share) for share in (1.0, 0.05, 0.0, 0.3)]
+    scans.append(np.array([0, nx - 1, (ny - 1) * nx, ny * nx - 1]))
+    given = b"".join(np.array([len(cells), *cells], np.int32).tobytes() for cells in scans)
+    answer = subprocess.run([build_tables, str(ny), str(nx), rule], input=given, check=True, capture_output=True)
+    values = np.frombuffer(answer.stdout, np.int32)
+    for cells in scans:
+        tables = NeckTableBuilder(ny, nx, rule).build(cells)
+        expected = {**table_inputs(tables), "head_cells": tables.head_cells}
+        for name, table in expected.items():
+            if name.startswith("first") and (rule, name) != ("fine", "first_0"):
+                table = table[:0]  # where nothing grows a graph reads `same`
+            found, values = values[1 : 1 + values[0]], values[1 + values[0] :]
+            np.testing.assert_array_equal(found, table.reshape(-1), err_msg=name)
+    assert not len(values)
+
+
+def assert_golden(detect: Path, bundle: Path, scan: Path, golden: Path, least: int = 3) -> None:
     stages = write_golden(golden, bundle, scan)
     lines = subprocess.run([detect, bundle, scan], check=True, capture_output=True, text=True).stdout.splitlines()
-    found = np.array([line.split()[1:] for line in lines], float)
+    found = np.array([line.split()[1:] for line in lines], float).reshape(-1, 8)
     expected = stages["suppress"]
-    assert len(expected["boxes"]) > 2
+    assert len(expected["boxes"]) >= least
     np.testing.assert_allclose(found[:, 1:], expected["boxes"], atol=1e-3)
     np.testing.assert_allclose(found[:, 0], expected["scores"], atol=1e-3)
     names = ("Car", "Pedestrian", "Cyclist")
@@ -62,21 +95,53 @@ def assert_golden(detect: Path, bundle: Path, scan: Path, golden: Path) -> None:
 
 
 def test_it_finds_the_boxes_of_the_models_that_ship(detect: Path, tmp_path: Path) -> None:
-    for name in ("asca_small_sim", "asca_small_sim_int8"):  # the example has no tables of a sparse neck
+    for name in ("asca_small_sim", "asca_small_sim_int8", "asca_small_sparse_sim", "asca_sim_int8"):
         assert_golden(detect, shipped_bundles()[name], sample_scan_path(), tmp_path / name)
 
 
-def test_a_grid_of_three_zones_beyond_both_limits(detect: Path, tiny_bundle: Path, tmp_path: Path) -> None:
+def test_a_grid_of_three_zones_beyond_both_limits(
+    detect: Path, tiny_bundle: Path, sparse_bundle: Path, tmp_path: Path
+) -> None:
     write_scan(tmp_path / "scan.bin", tiny.make_scan(3, 6000))
-    assert_golden(detect, tiny_bundle, tmp_path / "scan.bin", tmp_path / "golden")
+    for bundle in (tiny_bundle, sparse_bundle):
+        assert_golden(detect, bundle, tmp_path / "scan.bin", tmp_path / bundle.name)
+
+
+def test_a_scan_without_pillars(detect: Path, tiny_bundle: Path, sparse_bundle: Path, tmp_path: Path) -> None:
+    write_scan(tmp_path / "scan.bin", np.array([[-50, 0, 0, 0.5]], np.float32))
+    for bundle in (tiny_bundle, sparse_bundle):
+        assert_golden(detect, bundle, tmp_path / "scan.bin", tmp_path / bundle.name, least=0)
+
+
+@pytest.mark.parametrize("neck", ["dense", "sparse"])
+def test_repeats_say_what_the_stages_take(
+    detect: Path, neck: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    write_scan(tmp_path / "scan.bin", tiny.make_scan())
+    bundle = request.getfixturevalue("tiny_bundle" if neck == "dense" else "sparse_bundle")
+    result = subprocess.run([detect, bundle, tmp_path / "scan.bin", "3"], check=True, capture_output=True, text=True)
+    stages = [line.split() for line in result.stderr.splitlines()]
+    placed = "scatter" if neck == "dense" else "tables"
+    assert [stage for stage, _, _ in stages] == ["pillarize", "encode", placed, "neck+head", "decode"]
+    assert all(float(time) >= 0 and unit == "ms" for _, time, unit in stages)
+    assert len(result.stdout.splitlines()) > 2
 
 
 def test_mistakes_are_one_line(detect: Path, tiny_bundle: Path, tmp_path: Path) -> None:
     (tmp_path / "torn.bin").write_bytes(b"torn")
+    pooled, every = (tmp_path / name for name in ("pooled", "every"))
+    for folder, key, value in ((pooled, "grid", {"map": "pooled"}), (every, "anchor_scores", "every")):
+        shutil.copytree(tiny_bundle, folder)
+        manifest = json.loads((folder / "bundle.json").read_text())
+        spec = manifest["spec"]
+        spec[key] = {**spec[key], **value} if isinstance(value, dict) else value
+        (folder / "bundle.json").write_text(json.dumps(manifest))
     for arguments, said in (
         ([tmp_path, sample_scan_path()], "bundle.json: cannot be read"),
+        ([pooled, sample_scan_path()], "pooled: needs schema 3, kind pillar and a warped map"),
+        ([every, sample_scan_path()], "every: needs anchors at cell centers with one score for each"),
         ([tiny_bundle, tmp_path / "torn.bin"], "torn.bin: no whole number of points"),
-        ([], "usage: detect BUNDLE SCAN.bin"),
+        ([], "usage: detect BUNDLE SCAN.bin [REPEATS]"),
     ):
         result = subprocess.run([detect, *arguments], capture_output=True, text=True)
         assert result.returncode == 2

@@ -9,28 +9,28 @@ const MAX_LOG_RATIO = Math.log(100);
  * @param {object} grid of `makeGrid`
  * @param {object} spec of bundle.json
  * @param {number[]} yaws `pillar.layout.anchor_yaws_rad`
+ * @param {Int32Array} [cells] of the head's map whose rows the maps hold, ascending; all of them if left out
  * @returns {{box: Float32Array, score: number, label: number}[]} box: x, y, z, length, width, height, yaw
  */
-export function decodeCandidates(maps, grid, spec, yaws) {
+export function decodeCandidates(maps, grid, spec, yaws, cells) {
   const anchors = spec.classes.length * yaws.length;
   const floors = spec.classes.map(({ score_threshold: score }) => Math.log(score / (1 - score)));
   const best = spec.classes.map(() => []);
   maps.scores.forEach((logit, index) => {
     const anchor = index % anchors;
     const label = Math.floor(anchor / yaws.length);
-    if (logit >= floors[label]) best[label].push({ logit, anchor, cell: (index - anchor) / anchors, label });
+    if (logit >= floors[label]) best[label].push({ logit, anchor, row: (index - anchor) / anchors, label });
   });
   const chosen = best.flatMap((own) =>
     own
-      .sort((a, b) => b.logit - a.logit || a.anchor - b.anchor || a.cell - b.cell)
+      .sort((a, b) => b.logit - a.logit || a.anchor - b.anchor || a.row - b.row)
       .slice(0, spec.post.candidates),
   );
   return chosen
-    .map(({ logit, anchor, cell, label }) => ({
-      box: decodeBox(maps, cell, anchor, anchors, anchorBox(grid, spec.classes[label], cell, yaws[anchor % yaws.length])),
-      score: 1 / (1 + Math.exp(-logit)),
-      label,
-    }))
+    .map(({ logit, anchor, row, label }) => {
+      const own = anchorBox(grid, spec.classes[label], cells ? cells[row] : row, yaws[anchor % yaws.length]);
+      return { box: decodeBox(maps, row * anchors + anchor, own), score: 1 / (1 + Math.exp(-logit)), label };
+    })
     .filter(({ box, score }) => box.every(Number.isFinite) && Number.isFinite(score));
 }
 
@@ -42,11 +42,9 @@ function anchorBox(grid, class_, cell, yaw) {
   return [x, y, class_.z_m, class_.length_m, class_.width_m, class_.height_m, yaw].map(Math.fround);
 }
 
-function decodeBox(maps, cell, anchor, anchors, [x, y, z, length, width, height, yaw]) {
-  const start = (cell * anchors + anchor) * 7;
-  const residual = maps.boxes.subarray(start, start + 7);
-  const turn = (cell * anchors + anchor) * 2;
-  const bin = maps.directions[turn + 1] > maps.directions[turn] ? 1 : 0;
+function decodeBox(maps, place, [x, y, z, length, width, height, yaw]) {
+  const residual = maps.boxes.subarray(7 * place, 7 * place + 7);
+  const bin = maps.directions[2 * place + 1] > maps.directions[2 * place] ? 1 : 0;
   const diagonal = Math.hypot(length, width);
   const grow = (ratio) => Math.exp(Math.min(Math.max(ratio, -MAX_LOG_RATIO), MAX_LOG_RATIO));
   const heading = BIN_START + Math.PI * bin + modulo(residual[6] + yaw - BIN_START, Math.PI);

@@ -7,6 +7,7 @@ const [modules, golden, bundle] = process.argv.slice(2).map((path) => resolve(pa
 const load = (name) => import(pathToFileURL(join(modules, name)));
 const { makeGrid } = await load("grid.js");
 const { pillarize, Canvas } = await load("pillars.js");
+const { NeckTableBuilder } = await load("tables.js");
 const { decodeCandidates, suppress } = await load("boxes.js");
 
 const TYPES = {
@@ -40,20 +41,30 @@ await compare("pillarize", "pillar_index", pillars.pillarIndex);
 await compare("pillarize", "point_counts", pillars.pointCounts);
 await compare("pillarize", "cells", pillars.cells);
 
-const canvas = new Canvas(grid, pillar.channels, pillar.canvas);
-canvas.scatter(canvas.values.slice(0, pillar.channels).fill(1), Int32Array.of(7)); // a scan before this one
-canvas.scatter(await npy("encode", "pillar_features"), pillars.cells);
-const rows = await npy("scatter", "rows");
-const width = pillar.channels;
-await compare("scatter", "values", Array.from(rows).flatMap((row) => [...canvas.values.subarray(Number(row) * width, (Number(row) + 1) * width)]));
-const filled = new Set(Array.from(rows, Number));
-differences["scatter.elsewhere"] = String(
-  canvas.values.reduce((sum, value, i) => sum + (!filled.has(Math.floor(i / width)) && value !== canvas.empty[i % width]), 0),
-);
+let headCells;
+if (pillar.neck === "sparse") {
+  const builder = new NeckTableBuilder(grid.ny, grid.nx, pillar.active_cells);
+  builder.build(Int32Array.from({ length: grid.ny * grid.nx }, (_, cell) => cell)); // a scan before this one
+  const tables = builder.build(pillars.cells);
+  for (const [name, table] of Object.entries(tables.inputs)) await compare("tables", name, table);
+  headCells = tables.headCells;
+  await compare("neck_head", "cells", headCells);
+} else {
+  const canvas = new Canvas(grid, pillar.channels, pillar.canvas);
+  canvas.scatter(canvas.values.slice(0, pillar.channels).fill(1), Int32Array.of(7)); // a scan before this one
+  canvas.scatter(await npy("encode", "pillar_features"), pillars.cells);
+  const rows = await npy("scatter", "rows");
+  const width = pillar.channels;
+  await compare("scatter", "values", Array.from(rows).flatMap((row) => [...canvas.values.subarray(Number(row) * width, (Number(row) + 1) * width)]));
+  const filled = new Set(Array.from(rows, Number));
+  differences["scatter.elsewhere"] = String(
+    canvas.values.reduce((sum, value, i) => sum + (!filled.has(Math.floor(i / width)) && value !== canvas.empty[i % width]), 0),
+  );
+}
 
 const maps = {};
 for (const name of ["scores", "boxes", "directions"]) maps[name] = await npy("neck_head", name);
-const candidates = decodeCandidates(maps, grid, spec, pillar.layout.anchor_yaws_rad);
+const candidates = decodeCandidates(maps, grid, spec, pillar.layout.anchor_yaws_rad, headCells);
 for (const [stage, found] of [["decode", candidates], ["suppress", suppress(candidates, spec.post)]]) {
   await compare(stage, "boxes", found.flatMap(({ box }) => [...box]));
   await compare(stage, "scores", found.map(({ score }) => score));
