@@ -26,11 +26,12 @@ namespace detail {
 using nlohmann::json;
 using Values = std::map<std::string, Ort::Value>;
 
-inline Ort::Session open(const Ort::Env& env, const std::string& folder, const json& manifest, const char* graph) {
+inline Ort::Session open(const Ort::Env& env, const std::string& folder, const json& manifest, const char* graph,
+                         int threads) {
     Ort::SessionOptions options;
     // docs/BUNDLE.md: the encoder needs one thread; the optimizer would quantize layers that are kept in floating
     // point.
-    options.SetIntraOpNumThreads(1);
+    options.SetIntraOpNumThreads(threads);
     options.AddConfigEntry("optimization.disable_specified_optimizers", "WeightBiasQuantization");
     const std::string path = folder + "/" + manifest.at("graphs").at(graph).at("file").get<std::string>();
     return Ort::Session(env, path.c_str(), options);
@@ -100,9 +101,11 @@ inline nlohmann::json read_manifest(const std::string& folder) {
 template <typename T>
 class Detector {
 public:
-    Detector(const Ort::Env& env, const std::string& folder, const nlohmann::json& manifest)
-        : spec_(manifest.at("spec")), grid_(spec_.at("grid")), encoder_(detail::open(env, folder, manifest, "encoder")),
-          backbone_(detail::open(env, folder, manifest, "backbone")) {
+    // Threads are the backbone's; 0 takes ONNX Runtime's choice, the physical cores.
+    Detector(const Ort::Env& env, const std::string& folder, const nlohmann::json& manifest, int threads = 0)
+        : spec_(manifest.at("spec")), grid_(spec_.at("grid")), encoder_(detail::open(env, folder, manifest, "encoder", 1)),
+          backbone_(detail::open(env, folder, manifest, "backbone", threads)),
+          pillarizer_(grid_, spec_.at("limits").at("max_pillars"), spec_.at("limits").at("max_points")) {
         const auto& pillar = manifest.at("pillar");
         yaws_ = pillar.at("layout").at("anchor_yaws_rad").get<std::vector<float>>();
         empty_ = pillar.at("canvas").at("empty").get<std::vector<T>>();
@@ -115,8 +118,7 @@ public:
     std::vector<Box> detect(const std::vector<float>& points) {
         laps_ms.clear();
         lap_start_ = std::chrono::steady_clock::now();
-        const auto& limits = spec_.at("limits");
-        const Pillars pillars = pillarize(points, grid_, limits.at("max_pillars"), limits.at("max_points"));
+        const Pillars& pillars = pillarizer_.pillarize(points);
         lap("pillarize");
         if (tables_ && pillars.cells.empty()) return {};
         Ort::Value features{nullptr};
@@ -182,6 +184,7 @@ private:
     nlohmann::json spec_;
     Grid grid_;
     Ort::Session encoder_, backbone_;
+    Pillarizer pillarizer_;
     std::vector<float> yaws_;
     std::vector<T> empty_;                    // (C,) of a cell without a pillar
     std::optional<NeckTableBuilder> tables_;  // of a sparse neck

@@ -60,8 +60,15 @@ struct Grid {
     }
 
 private:
+    // Which of the intervals between evenly spaced edges a value within them lies in. Computed, then put right where it
+    // was rounded: a search takes ten times as long.
     static int64_t interval(float value, const std::vector<float>& edges) {
-        return std::upper_bound(edges.begin(), edges.end(), value) - edges.begin() - 1;
+        const auto count = static_cast<int64_t>(edges.size()) - 1;
+        const float share = (value - edges.front()) / (edges.back() - edges.front());
+        int64_t found = std::min(static_cast<int64_t>(share * static_cast<float>(count)), count - 1);
+        while (value < edges[found]) --found;
+        while (value >= edges[found + 1]) ++found;
+        return found;
     }
 
     // Rounded as numpy.linspace rounds.
