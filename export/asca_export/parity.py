@@ -24,6 +24,7 @@ from asca_pillars.tables.voxel_spec import VoxelSpec
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
 BOX_TOLERANCE_M = 0.01
 YAW_TOLERANCE_RAD = np.deg2rad(0.5)
+OVERLAP_TIE = 1e-4  # of an overlap with the largest that suppression allows
 COMPARED_ANCHORS = 100  # per class and scan: the best ones, whatever their score, so that there is always something
 
 Maps = HeadMaps[NDArray[np.float32]]
@@ -175,7 +176,8 @@ def _require_ties(
 ) -> None:
     """Raise ExportError unless ties between scores explain every box that one side alone has.
 
-    A box is explained if its score ties with the threshold or with a box of the other side that overlaps it; and if
+    A box is explained if its score ties with the threshold or with a box of the other side that overlaps it; if the
+    overlap with one is as large as suppression allows, within rounding; and if
     it overlaps an explained box of the other side, which suppression then put in its place or took out of its way.
     """
     explained = [_ties(our_lone, theirs, spec), _ties(their_lone, ours, spec)]
@@ -197,7 +199,10 @@ def _ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.
     thresholds = np.array([class_.score_threshold for class_ in spec.classes])
     tied = np.abs(thresholds[lone.labels] - lone.scores) <= MAP_TOLERANCE
     equal = np.abs(lone.scores[:, None] - others.scores[None]) <= MAP_TOLERANCE
-    return tied | (_clash(lone, others, spec) & equal).any(axis=1)
+    allowed = spec.post.nms_iou  # 1: nothing was suppressed
+    same_class = lone.labels[:, None] == others.labels[None]
+    barely = same_class & (allowed < 1) & (np.abs(bev_iou(lone.boxes, others.boxes) - allowed) <= OVERLAP_TIE)
+    return tied | (_clash(lone, others, spec) & equal).any(axis=1) | barely.any(axis=1)
 
 
 def _clash(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.bool_]:

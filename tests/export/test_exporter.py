@@ -174,6 +174,25 @@ def test_ties_are_no_differences() -> None:
     compare_boxes(maps._replace(scores=left), maps._replace(scores=right), SPEC)
 
 
+def test_an_overlap_as_large_as_suppression_allows_is_a_tie() -> None:
+    maps = _maps(0)
+    maps.scores[:], maps.boxes[:] = -20, 0
+    maps.scores[0, 10, 10], maps.scores[0, 10, 12] = 2.0, 1.0
+    first, second = SPEC.anchors[10, 10, 0], SPEC.anchors[10, 12, 0]
+    length, width, allowed = first[3], first[4], SPEC.post.nms_iou
+    shift = length * (1 - allowed) / (1 + allowed)  # of two boxes in a row, whose overlap it makes the allowed one
+    sides = []
+    for factor in (1 - 1e-5, 1 + 1e-5, 1.02):
+        boxes = maps.boxes.copy()
+        boxes[0, 10, 12] = (first[0] + factor * shift - second[0]) / np.hypot(length, width)
+        sides.append(maps._replace(boxes=boxes))
+    suppressed, kept, apart = sides
+    assert len(SPEC.decode(suppressed)) == 1 and len(SPEC.decode(kept)) == 2
+    compare_boxes(suppressed, kept, SPEC)
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(suppressed, apart, SPEC)
+
+
 @pytest.mark.parametrize("cpa", READINGS[1:])
 def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: CpaReading) -> None:
     root = os.environ.get("ASCA_KITTI_MINI")

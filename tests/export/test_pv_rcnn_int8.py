@@ -161,8 +161,9 @@ def test_onnxruntime_computes_what_the_graph_says(folders: tuple[Path, Path], na
             (wanted,) = plain.run([output], given)
             wanted = wanted if name == "voxels" else np.moveaxis(wanted[0], -1, 0)
             error = wanted.astype(np.float64) - values
-            # A tie between two steps may fall either way, and then a few values differ by what a step is worth.
-            assert np.sqrt(np.square(error).mean()) < 0.01 * wanted.std(), output
+            # A tie between two steps may fall either way, and then a few values differ by what a step is worth, more
+            # where it stands in an early layer.
+            assert np.sqrt(np.square(error).mean()) < 0.03 * wanted.std(), output
 
 
 @pytest.mark.parametrize("threads", [2, 4])
