@@ -30,7 +30,7 @@ def export(
         str | None,
         typer.Option(
             "--trained-on",
-            help="What the weights have seen, for the manifest. Default: what a bundle says; not stated.",
+            help="What the weights saw, for the manifest. Default: what a bundle says of itself, or `not stated`.",
         ),
     ] = None,
     score: Annotated[

@@ -61,7 +61,7 @@ struct Grid {
 
 private:
     // Which of the intervals between evenly spaced edges a value within them lies in. Computed, then put right where it
-    // was rounded: a search takes ten times as long.
+    // was rounded: a search takes five times as long.
     static int64_t interval(float value, const std::vector<float>& edges) {
         const auto count = static_cast<int64_t>(edges.size()) - 1;
         const float share = (value - edges.front()) / (edges.back() - edges.front());

@@ -176,12 +176,12 @@ def _require_ties(
 ) -> None:
     """Raise ExportError unless ties between scores explain every box that one side alone has.
 
-    A box is explained if its score ties with the threshold or with a box of the other side that overlaps it; if the
-    overlap with one is as large as suppression allows, within rounding; and if
-    it overlaps an explained box of the other side, which suppression then put in its place or took out of its way.
+    A box is explained if its score ties with the threshold or with a box of the other side that overlaps it; if its
+    overlap with one is as large as suppression allows, within rounding; and if it overlaps an explained box of the
+    other side, which suppression then put in its place or took out of its way.
     """
     explained = [_ties(our_lone, theirs, spec), _ties(their_lone, ours, spec)]
-    clash = _clash(our_lone, their_lone, spec)
+    clash = _beyond_allowed(our_lone, their_lone, spec) > 0
     while True:
         grown = [explained[0] | clash[:, explained[1]].any(axis=1), explained[1] | clash[explained[0]].any(axis=0)]
         if all(np.array_equal(before, after) for before, after in zip(explained, grown, strict=True)):
@@ -199,12 +199,12 @@ def _ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.
     thresholds = np.array([class_.score_threshold for class_ in spec.classes])
     tied = np.abs(thresholds[lone.labels] - lone.scores) <= MAP_TOLERANCE
     equal = np.abs(lone.scores[:, None] - others.scores[None]) <= MAP_TOLERANCE
-    allowed = spec.post.nms_iou  # 1: nothing was suppressed
-    same_class = lone.labels[:, None] == others.labels[None]
-    barely = same_class & (allowed < 1) & (np.abs(bev_iou(lone.boxes, others.boxes) - allowed) <= OVERLAP_TIE)
-    return tied | (_clash(lone, others, spec) & equal).any(axis=1) | barely.any(axis=1)
+    beyond = _beyond_allowed(lone, others, spec)
+    barely = (np.abs(beyond) <= OVERLAP_TIE) & (spec.post.nms_iou < 1)  # 1: nothing was suppressed
+    return tied | ((beyond > 0) & equal | barely).any(axis=1)
 
 
-def _clash(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.bool_]:
-    """(N, M): pairs that suppression does not keep side by side."""
-    return (a.labels[:, None] == b.labels[None]) & (bev_iou(a.boxes, b.boxes) > spec.post.nms_iou)
+def _beyond_allowed(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.float64]:
+    """(N, M): overlap minus the largest that suppression keeps side by side; -inf for pairs of two classes."""
+    same_class = a.labels[:, None] == b.labels[None]
+    return np.where(same_class, bev_iou(a.boxes, b.boxes) - spec.post.nms_iou, -np.inf)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +149,7 @@ def test_onnxruntime_computes_what_the_graph_says(folders: tuple[Path, Path], na
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     path = folders[1] / f"{name}.onnx"
     plain = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    errors = defaultdict(list)
     for points in SCANS[:3]:
         prepared = pipeline.prepare(points, [])
         assert prepared.canvas is not None
@@ -161,9 +163,11 @@ def test_onnxruntime_computes_what_the_graph_says(folders: tuple[Path, Path], na
             (wanted,) = plain.run([output], given)
             wanted = wanted if name == "voxels" else np.moveaxis(wanted[0], -1, 0)
             error = wanted.astype(np.float64) - values
-            # A tie between two steps may fall either way, and then a few values differ by what a step is worth, more
-            # where it stands in an early layer.
-            assert np.sqrt(np.square(error).mean()) < 0.03 * wanted.std(), output
+            errors[output].append(np.sqrt(np.square(error).mean()) / wanted.std())
+    # One value in the middle between two steps may round either way. Of 29 other weights and three scans each four
+    # scans had one; each layer then spreads it, to a quarter of the rows of the last and to 2 % here.
+    for output, of_scans in errors.items():
+        assert np.median(of_scans) < 1e-5 and max(of_scans) < 0.03, (output, of_scans)
 
 
 @pytest.mark.parametrize("threads", [2, 4])
