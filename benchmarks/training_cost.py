@@ -42,7 +42,7 @@ def main(
     model = build_model(settings.model).to(device)
     model.train()
     optimizer = torch.optim.Adam(model.parameters(), lr=settings.train.learning_rate)
-    size, in_bfloat16 = settings.train.batch_size, computes_in_bfloat16(settings.train.precision)
+    size, in_bfloat16 = settings.train.batch_size, computes_in_bfloat16(settings.train.precision, device)
     clock = time.process_time if device == "cpu" else time.perf_counter  # other jobs on a CPU do not count
     loading, stepping = [], []
     for number in track(range(batches + WARM_UP), "Measuring"):

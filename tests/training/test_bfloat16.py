@@ -21,17 +21,19 @@ from tests.training.test_loop import CONFIG
 def test_auto_follows_the_device(
     precision: Precision, with_it: bool, without: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda: True)
+    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: True)
     assert computes_in_bfloat16(precision) is with_it
-    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda: False)
+    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: False)
     assert computes_in_bfloat16(precision) is without
 
 
 def test_a_gpu_answers_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    of_the_cpu = has_bfloat16("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for native in (True, False):
         monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation, native=native: native)
-        assert has_bfloat16() is native
+        assert has_bfloat16() is has_bfloat16("cuda") is native
+        assert has_bfloat16("cpu") is of_the_cpu
 
 
 @pytest.mark.skipif(not Path("/proc/cpuinfo").is_file(), reason="needs Linux to say what the CPU has")
