@@ -13,8 +13,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from rich.text import Text
+from typer.main import get_command
 
 from asca_deploy import Detector, sample_scan_path
+from asca_pillars.cli import app
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.schema import to_dict
@@ -54,6 +57,16 @@ def refusal(result: subprocess.CompletedProcess) -> str:
     lines = result.stderr.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith("asca: "), result.stderr
     return lines[0]
+
+
+def test_help_says_all_that_is_written() -> None:
+    """Words in brackets are styles to rich, which drops those that it does not know."""
+    commands = get_command(app).commands.items()  # type: ignore[attr-defined]
+    assert len(commands) > 5
+    for name, command in commands:
+        for each in (command, *command.params):
+            written = each.help or ""
+            assert Text.from_markup(written).plain == written.replace("\\[", "["), f"{name} {each.name}"
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -60,7 +60,7 @@ def simulate(
         typer.Option(
             "--report",
             help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/. "
-            "Needs matplotlib: pip install 'asca-pillars[eval]'.",
+            "Needs matplotlib: pip install 'asca-pillars\\[eval]'.",
         ),
     ] = False,
     like: Annotated[
