@@ -158,7 +158,9 @@ def export(
     # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
     view: View = "camera" if loaded.config.data.camera_view else "full"
     calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
-    weights = source.path if with_weights else None
+    # A bundle that is written anew from its own weights keeps them: they may be the only ones.
+    keeps = with_weights or source.path.parent.resolve() == out.resolve()
+    weights = source.path if keeps else None
     with console.status("Exporting") as status:
         bundle: AnyBundle = export_kind(
             loaded,

@@ -46,12 +46,13 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
         scans: (N, 4) each, LiDAR frame.
 
     Raises:
-        ExportError: they differ; names the first stage that does, and the scan.
+        ExportError: they differ; names the first stage that does, and the scan. Or no scan has a point in the ranges.
     """
-    spec = runtime.spec
+    spec, compared = runtime.spec, 0
     worst_map = worst_box = worst_yaw = 0.0
     for number, points in enumerate(scans):
         pillars = spec.pillarize(points)
+        compared += bool(len(pillars.cells))  # without pillars there is no more to compare than what is empty
         batch = batch_pillars([pillars], [detector.preparation.place(pillars)])
         with torch.inference_mode():
             expected_features = detector.encode(batch.features, batch.pillar_index, batch.point_counts)
@@ -74,7 +75,14 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
             worst_map = max(worst_map, error)
         boxes = compare_boxes(expected_maps, maps, spec, number, cells)
         worst_box, worst_yaw = max(worst_box, boxes.center_size_m), max(worst_yaw, boxes.yaw_rad)
-    return Parity(worst_map, worst_box, worst_yaw, len(scans), MAP_TOLERANCE)
+    return Parity(worst_map, worst_box, worst_yaw, require_compared(compared), MAP_TOLERANCE)
+
+
+def require_compared(scans: int) -> int:
+    """The number of scans that a proof rests on, which must not be none."""
+    if not scans:
+        raise ExportError("none of the scans given to prove parity on has a point in the model's ranges; give others")
+    return scans
 
 
 def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:

@@ -11,7 +11,7 @@ from asca_deploy.bundle import Parity
 from asca_deploy.pv_rcnn_graphs import OUT, balls_around
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.voxel_canvas import VoxelCanvas
-from asca_export.parity import YAW_TOLERANCE_RAD, nearest_partners, require_close
+from asca_export.parity import YAW_TOLERANCE_RAD, nearest_partners, require_close, require_compared
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
@@ -86,9 +86,7 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
                 f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees and a centimetre"
             )
         worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
-    if not compared:
-        raise ExportError("none of the scans given to prove parity on has a point in the model's ranges; give others")
-    return Parity(worst, worst_box, worst_yaw, compared, RELATIVE_TOLERANCE)
+    return Parity(worst, worst_box, worst_yaw, require_compared(compared), RELATIVE_TOLERANCE)
 
 
 def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[torch.Tensor]) -> dict[str, Array]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
 from asca_deploy.refine_pipeline import RefinePipeline, refine_inputs
-from asca_export.parity import MAP_TOLERANCE, YAW_TOLERANCE_RAD, nearest_partners, require_close
+from asca_export.parity import MAP_TOLERANCE, YAW_TOLERANCE_RAD, nearest_partners, require_close, require_compared
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
@@ -39,9 +39,10 @@ def prove_refine_parity(
         scans: (N, 4) each.
 
     Raises:
-        ExportError: they differ; names the first stage that does, and the scan.
+        ExportError: they differ; names the first stage that does, and the scan. Or no scan has a point in the ranges.
     """
     worst = worst_box = worst_yaw = 0.0
+    compared = 0
     spec = model.spec.with_score_threshold(0.0)
     spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=10_000))  # every box, none suppressed
     for number, scan in enumerate(scans):
@@ -49,9 +50,12 @@ def prove_refine_parity(
         expected, found = stage(points), runtime.infer(runtime.prepare(points, []), []).found
         for name, one, other in zip(HeadMaps._fields, expected.maps, found.maps, strict=True):
             worst = max(worst, require_close(f"head `{name}`", one, other, MAP_TOLERANCE, number))
-        allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max()))
+        allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max(initial=0.0)))
         worst = max(worst, require_close("neck", expected.neck, found.neck, allowed, number))
         proposed = proposed_from(found, points, model.spec, model.refine.seen)
+        if not len(proposed.proposals):
+            continue
+        compared += 1
         asked = refine_scan(points, proposed, proposed.proposals, model.refine.neighbors)
         with torch.inference_mode():
             wanted = refiner(collate_scans([asked]))
@@ -67,4 +71,4 @@ def prove_refine_parity(
                 f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees and a centimetre"
             )
         worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
-    return Parity(worst, worst_box, worst_yaw, len(scans), MAP_TOLERANCE)
+    return Parity(worst, worst_box, worst_yaw, require_compared(compared), MAP_TOLERANCE)

@@ -1,11 +1,14 @@
 """`asca export` on checkpoints and on bundles that hold their weights: what is written, and what is refused."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from asca_deploy import Detector, load_bundle
+from asca_deploy.bundle import WEIGHTS
 from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.models.checkpoint import load_checkpoint, weights_sha256
 from tests.export.test_sparse_bundle import sparse_checkpoint
 from tests.export.tiny import SCANS
 from tests.in_process import run_here
@@ -44,6 +47,16 @@ def test_a_bundle_with_its_weights_gets_a_dense_neck(with_weights: Path, scans: 
     ours, theirs = (Detector(folder)(SCANS[0]).names for folder in (out, with_weights))
     assert [name for name in ours if name != "Cyclist"] == [name for name in theirs if name != "Cyclist"]
     assert len(ours) > 3
+
+
+def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(with_weights, tmp_path / "bundle")
+    for score in (0.1, 0.2):
+        exported = run_here("export", folder, "-o", folder, "--scans", scans, "--score", f"Car={score}")
+        assert exported.returncode == 0, exported.stderr
+        assert load_bundle(folder).spec.classes[0].score_threshold == score
+    weights, kept = (load_checkpoint(each / WEIGHTS).detector.state_dict() for each in (with_weights, folder))
+    assert weights_sha256(weights) == weights_sha256(kept)
 
 
 def test_what_cannot_be_exported_is_one_line(with_weights: Path, scans: Path, tmp_path: Path) -> None:

@@ -139,6 +139,16 @@ def test_too_few_scans_are_refused(tmp_path: Path) -> None:
         export_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS[:7])
 
 
+@pytest.mark.parametrize("neck", ["dense", "sparse"])
+def test_parity_is_not_proven_on_nothing(neck: str, tmp_path: Path) -> None:
+    behind = [points * np.array([-1, 1, 1, 1], np.float32) for points in SCANS]
+    with pytest.raises(ExportError, match="none of the scans given to prove parity on has a point"):
+        export_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", behind)
+    assert not list(tmp_path.iterdir())
+    bundle = export_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", [*SCANS, behind[0]])
+    assert bundle.parity is not None and bundle.parity.scans == len(SCANS)
+
+
 def _maps(seed: int) -> HeadMaps:
     rng = np.random.default_rng(seed)
     height, width, count, _ = SPEC.anchors.shape

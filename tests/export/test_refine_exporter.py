@@ -136,6 +136,12 @@ def test_scans_with_little_or_nothing(trained: tuple[Path, Path]) -> None:
     assert len(Detector(trained[1], score_threshold=1.0, threads=1)(SCANS[0])) == 0
 
 
+def test_scans_without_a_point_prove_nothing(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    empty = np.empty((0, 4), np.float32)
+    bundle = export_refine_bundle(load_checkpoint(trained[0]), tmp_path / "bundle", [empty, *SCANS])
+    assert bundle.parity is not None and bundle.parity.scans == len(SCANS)
+
+
 def test_folded_norms_change_nothing() -> None:
     refiner, inputs = small_refiner(), batch((0, 1)).inputs
     refiner.train()
