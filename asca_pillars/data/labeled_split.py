@@ -1,6 +1,6 @@
 """What a dataset is to training, inspection, insertion and evaluation, whatever its files look like.
 
-`data.kitti.KittiSplit` reads KITTI's layout, `data.boxes.BoxSplit` the layout with boxes in the LiDAR frame
+`data.kitti.KittiSplit` reads KITTI's layout, `data.boxes.box_split.BoxSplit` the layout with boxes in the LiDAR frame
 (docs/DATA.md); `data.open_split` tells them apart.
 """
 

@@ -149,7 +149,7 @@ class _Encoder(nn.Module):
 
 
 def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:
-    """`models.encoder.pillar_max` in ONNX: ScatterND with a max is the fast one of the forms that exist."""
+    """`models.pillar.encoder.pillar_max` in ONNX: ScatterND with a max is the fast one of the forms that exist."""
     shape = op.Concat(op.Shape(point_counts), op.Shape(features, start=1), axis=0)
     lowest = op.Expand(op.Constant(value_float=LOWEST), shape)
     return op.ScatterND(lowest, op.Unsqueeze(pillar_index, op.Constant(value_ints=[1])), features, reduction="max")

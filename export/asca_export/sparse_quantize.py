@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
 from asca_export.quantize import PLACES, STEPS, round_together
 from asca_export.sparse_forms import HEAD, SparseBackbone
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.tables.neck_tables import NeckTables
 
 BEST_CELLS = 32  # of each scan and anchor, that the head is rounded for
@@ -56,20 +55,6 @@ class InputMoments(NamedTuple):
 
     mean: Tensor
     squares: Tensor
-
-
-def quantized_backbone(detector: PillarDetector, samples: Sequence[SparseSample], steps: CanvasSteps) -> SparseBackbone:
-    """The sparse backbone with every row in steps and every weight on the grid of 8-bit arithmetic.
-
-    Args:
-        detector: in evaluation mode, with a sparse neck.
-        samples: of the calibration scans, real values, none of them empty.
-        steps: of their pillar features, see `quantize.canvas_steps`.
-    """
-    backbone, counted = SparseBackbone(detector, steps), [sample.in_steps(steps) for sample in samples]
-    scale_rows_to_steps(backbone, counted)
-    round_products(backbone, list(backbone.products), read_moments(backbone, counted))
-    return backbone
 
 
 @torch.no_grad()

@@ -12,6 +12,7 @@ from torch.utils._pytree import tree_map_only
 
 from asca_deploy.ort_session import OrtSession
 from asca_deploy.pillar_graphs import PILLAR_FEATURES
+from asca_export.fast_forms import CanvasSteps
 from asca_export.quantize import STEPS, canvas_steps
 from asca_export.sparse_forms import HEAD, SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
@@ -19,8 +20,8 @@ from asca_export.sparse_quantize import (
     BEST_CELLS,
     OTHER_CELLS,
     SparseSample,
-    quantized_backbone,
     read_moments,
+    round_products,
     scale_rows_to_steps,
 )
 from asca_pillars.geometry.decode import HeadMaps
@@ -59,6 +60,14 @@ def sample_of(detector: PillarDetector, pillars: Pillars) -> SparseSample:
     assert batch.neck is not None
     with torch.inference_mode():
         return SparseSample(detector.encode(batch.features, batch.pillar_index, batch.point_counts), batch.neck)
+
+
+def quantized_backbone(detector: PillarDetector, samples: Sequence[SparseSample], steps: CanvasSteps) -> SparseBackbone:
+    """Every row in steps and every weight on the grid of 8-bit arithmetic, from real values of scans with pillars."""
+    backbone, counted = SparseBackbone(detector, steps), [sample.in_steps(steps) for sample in samples]
+    scale_rows_to_steps(backbone, counted)
+    round_products(backbone, list(backbone.products), read_moments(backbone, counted))
+    return backbone
 
 
 class OpenGraph:

@@ -15,7 +15,7 @@ from asca_pillars.pillar_config import LossConfig
 
 
 class TargetBatch(NamedTuple):
-    """`models.targets.Targets` of B frames.
+    """`geometry.targets.Targets` of B frames.
 
     Attributes:
         state: (B, H, W, A) int8, 1 positive, 0 negative, -1 without part.

@@ -1,7 +1,8 @@
 """Which returns are ground: the method that the reference statistics were made with, for the comparison alone.
 
 A plane through the near ground, then a polar grid in which the local height is tracked outward from it. Cruder than
-`data.ground`, which training uses; but shares of ground can only be compared if both sides call the same things ground.
+`data.insertion.ground_fit`, which training uses; but shares of ground can only be compared if both sides call the same
+things ground.
 """
 
 from itertools import pairwise
