@@ -6,7 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.commands import detect_archive
+from asca_pillars.commands.detect import detect
 from asca_pillars.data.scans.scan_reader import write_scan
+from tests.commands.test_detect_archive import Here
 from tests.export.test_pv_rcnn_int8 import CALIBRATION, random_checkpoint
 from tests.export.tiny import SCANS
 from tests.in_process import run_here
@@ -35,6 +38,11 @@ def test_an_8_bit_bundle_from_export_to_evaluation(tmp_path: Path, monkeypatch: 
     detected = run_here("detect", scans, "--bundle", bundle, "--out", tmp_path / "out", "--threads", 1)
     assert detected.returncode == 0, detected.stderr
     assert "cpu int8" in detected.stdout and len(list((tmp_path / "out").glob("*.json"))) == len(SCANS)
+    monkeypatch.setattr(detect_archive, "run_shards", Here())
+    monkeypatch.setattr(detect_archive, "require", lambda extra: None)
+    detect([scans], out=tmp_path / "archive", bundle=bundle, cluster="made-up:1")
+    lines = [(tmp_path / folder / "detections.jsonl").read_text() for folder in ("out", "archive")]
+    assert lines[0] == lines[1]
     monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
     timed = run_here("bench", scans / "0.bin", "--bundle", bundle, "--rounds", 2, "--threads", 1)
     assert timed.returncode == 0 and "voxels" in timed.stdout, timed.stderr
