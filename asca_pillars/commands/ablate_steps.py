@@ -23,13 +23,28 @@ TIMED_ROUNDS = 10
 
 
 def claim(out: Path, base: dict[str, Any]) -> None:
-    """Note what all runs in `out` have in common, or refuse to mix them with runs on another base."""
-    require_own(out, "asca ablate", "ablation.json", text='"config"')
+    """Note what all runs in `out` have in common, or refuse to mix them with runs on another base.
+
+    Raises:
+        OutputError: `out` holds files of something else.
+        TrainingError: the runs there have another base, or the note of it is damaged.
+    """
+    if not any(out.glob("*/seed*/train.log")):  # which says as much, where a damaged note was deleted
+        require_own(out, "asca ablate", "ablation.json", text='"config"')
     path = out / "ablation.json"
     if not path.exists():
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(base, indent=1) + "\n", encoding="utf-8")
-    elif json.loads(path.read_text(encoding="utf-8")) != base:
+        return
+    try:
+        noted = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # not JSON, or not UTF-8
+        reason = " ".join(str(error).split())
+        raise TrainingError(
+            f"{path}: not what `asca ablate` wrote, or damaged ({reason}); delete it if the runs there have this base "
+            "configuration and data, or choose another --out"
+        ) from None
+    if noted != base:
         raise TrainingError(f"{path}: the runs there have another base configuration or data; choose another --out")
 
 

@@ -37,7 +37,7 @@ class ResultWriter:
         self._stack = ExitStack()
         self._lines: IO[str] | None = None
         self.remarks: list[str] = []
-        """What could not be drawn, and why; for the user."""
+        """What could not be drawn or written, and why; for the user."""
 
     def __enter__(self) -> "ResultWriter":
         require_own(self.out, "asca detect", RUN_FILE)
@@ -52,15 +52,14 @@ class ResultWriter:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too."""
         if self._lines is None:
             self._lines = self._open()
+        calibration = self._calibration(path)  # first: of several remarks a user sees the first one
         content = scan_content(path, scan, detections)
         write_json(self._named(name, ".json"), content)
         self._lines.write(as_line(content))
         if self._pictures:
             write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=self._labels(path)))
-        calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
-        if path.parent.name != "velodyne" or not calib_path.exists():
+        if calibration is None:
             return
-        calibration = read_calibration(calib_path)
         image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
         image = read_image(image_path)
         if image is None and image_path.exists():
@@ -69,6 +68,16 @@ class ResultWriter:
         if image is not None and self._pictures:
             drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
             write_png(self._named(name, "_image.png"), drawn)
+
+    def _calibration(self, path: Path) -> Calibration | None:
+        calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
+        if path.parent.name != "velodyne" or not calib_path.exists():
+            return None
+        try:
+            return read_calibration(calib_path)
+        except AscaError as error:
+            self.remarks.append(f"no KITTI text is written: {error}")
+            return None
 
     def _labels(self, path: Path) -> NDArray[np.float32] | None:
         try:

@@ -1,6 +1,7 @@
 """Trained weights together with the configuration that they belong to."""
 
 import hashlib
+import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,12 +57,24 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         detector.load_state_dict(weights)
         measured = content["hyper_parameters"].get("expected_input")
         expected = None if measured is None else parse(ExpectedInput, measured, str(path))
+        steps = int(content["global_step"])
     except ConfigError as error:
         raise TrainingError(f"{error}; the checkpoint was made by another version of asca-pillars") from None
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({reason})") from error
-    return Checkpoint(config, detector.eval(), int(content["global_step"]), expected)
+        raise TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({unread(error)})") from error
+    return Checkpoint(config, detector.eval(), steps, expected)
+
+
+def unread(error: Exception) -> str:
+    """Why a file of weights was not read, in one line.
+
+    The words of torch.load for a pickle that it does not take are left out: they advise to execute what is in it.
+    """
+    if isinstance(error, pickle.UnpicklingError):
+        return "it is not plain arrays and settings; nothing in it was executed"
+    if isinstance(error, KeyError):
+        return f"no {error}"
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def save_weights(checkpoint: Path, path: Path) -> None:

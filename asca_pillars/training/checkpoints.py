@@ -14,6 +14,7 @@ from lightning.pytorch.callbacks import Checkpoint
 
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
+from asca_pillars.models.checkpoint import unread
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 
@@ -77,7 +78,7 @@ def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
         try:
             torch.load(path, map_location="cpu", weights_only=True, mmap=False)
         except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as e:
-            damage.append(f"{path} is damaged ({(str(e).splitlines() or [type(e).__name__])[0]})")
+            damage.append(f"{path} is damaged ({unread(e)})")
         else:
             return path, damage[0] if damage else None
     if damage:

@@ -22,7 +22,8 @@ WhenFull: TypeAlias = Literal["drop", "wait"]
 class ScanQueue:
     """Between a sensor's thread, which calls `put`, and `Detector.stream`, which iterates. For one of each.
 
-    A stream takes up to two scans ahead of the one that it hands out; those are no longer in the queue.
+    A stream takes up to two scans ahead of the one that it hands out; those are no longer in the queue. After a stream
+    that failed or was left, a new one over the same queue goes on with the scans that wait.
 
     Args:
         when_full: what a scan does that finds the queue full. "drop": the oldest waiting scan is dropped and counted,
@@ -44,7 +45,8 @@ class ScanQueue:
             raise ConfigError(f"size {size}: at least one scan has to wait somewhere")
         self._drops, self._size = when_full == "drop", size
         self._waiting: deque[tuple[NDArray[Any], Any]] = deque()
-        self._tags: deque[Any] = deque()
+        self._tags: dict[int, Any] = {}  # by the number of the scan; a scan without a tag leaves nothing to be kept
+        self._next = 0  # the scan whose tag is asked for next, counted as `taken`
         self._changed = threading.Condition()
         self._closed = False
         self.dropped = self.taken = 0
@@ -77,19 +79,31 @@ class ScanQueue:
     def next_tag(self) -> Any:
         """The tag of the oldest scan that was handed out: call it once for each result of the stream.
 
+        None for a scan that was put without one, so that scans with and without tags keep their places. Tags that are
+        never asked for are kept until the next stream begins; it starts with its own first scan.
+
         Raises:
             IndexError: it was called more often than scans were handed out.
         """
-        return self._tags.popleft()
+        with self._changed:
+            if self._next == self.taken:
+                raise IndexError("next_tag: no scan was handed out since the last call; call it once for each result")
+            number, self._next = self._next, self._next + 1
+            return self._tags.pop(number, None)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
+        with self._changed:
+            # Scans that an earlier stream took and never handed out have no result that could ask for their tags.
+            self._tags.clear()
+            self._next = self.taken
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closed or self._waiting)
                 if not self._waiting:
                     return
                 points, tag = self._waiting.popleft()
-                self._tags.append(tag)
+                if tag is not None:
+                    self._tags[self.taken] = tag
                 self.taken += 1
                 self._changed.notify_all()
             yield points

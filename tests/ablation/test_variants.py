@@ -120,3 +120,18 @@ def test_what_does_not_exist_is_one_line(tmp_path: Path, config: str, seeds: str
 def _accuracies(text: str) -> list[str]:
     """The tables without parameters, speed and time, which depend on the machine's mood."""
     return [" | ".join(line.split(" | ")[:10]) for line in text.splitlines() if line.startswith("|")]
+
+
+def test_a_damaged_note_of_the_base_is_one_line_and_can_be_deleted(tmp_path: Path) -> None:
+    base = {"config": {"name": "small"}, "data": "data/sim"}
+    ablate_steps.claim(tmp_path, base)
+    (tmp_path / "none" / "seed0").mkdir(parents=True)
+    (tmp_path / "none" / "seed0" / "train.log").write_text("")
+    note = tmp_path / "ablation.json"
+    note.write_text(note.read_text()[:-5])
+    with pytest.raises(TrainingError, match=r"ablation\.json: not what `asca ablate` wrote, or damaged .*; delete it"):
+        ablate_steps.claim(tmp_path, base)
+    note.unlink()
+    ablate_steps.claim(tmp_path, base)
+    with pytest.raises(TrainingError, match="another base"):
+        ablate_steps.claim(tmp_path, base | {"data": "other"})

@@ -108,3 +108,17 @@ def test_an_image_that_cannot_be_read_is_said(tmp_path: Path, capfd: pytest.Capt
     image.write_bytes(b"no picture")
     detect([KittiSplit(root).scan_path("000000")], out=tmp_path / "out", threads=1)
     assert "000000.png: cannot be read as an image" in " ".join(capfd.readouterr().out.split())
+
+
+def test_a_damaged_calibration_is_said_and_the_scans_are_detected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    split = KittiSplit(write_dataset(tmp_path / "kitti", 3))
+    split.calib_path("000001").write_text("P2: 1 2\n")
+    detect([split.scan_path("000000").parent], out=tmp_path / "out", threads=1)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "no KITTI text is written: " in said and "000001.txt: " in said
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written >= {"000000.txt", "000001.json", "000001_bev.png", "000002.txt"} and "000001.txt" not in written
+    lines = (tmp_path / "out" / "detections.jsonl").read_text().splitlines()
+    assert [Path(json.loads(line)["scan"]).name for line in lines] == ["000000.bin", "000001.bin", "000002.bin"]

@@ -92,6 +92,24 @@ def test_pcd_files_read_as_python_reads_them(tmp_path: Path, encoding: str) -> N
     assert_reads_alike(path)
 
 
+def test_cloudcompare_s_name_of_the_reflectance_is_known(tmp_path: Path) -> None:
+    path = tmp_path / "scan.pcd"
+    path.write_bytes(pcd(tiny.make_scan(count=50), "ascii").replace(b"z intensity", b"z scalar_Intensity"))
+    assert_reads_alike(path)
+    assert read_scan(path).points[:, 3].max() > 0
+
+
+def test_words_for_what_is_not_finite_are_no_damage(tmp_path: Path) -> None:
+    path = tmp_path / "scan.pcd"
+    header, body = pcd(tiny.make_scan(count=50), "ascii").split(b"DATA ascii\n")
+    lines = body.split(b"\n")
+    for number, word in enumerate((b"nan", b"NaN", b"-inf", b"Infinity", b"1e2", b"+.5", b"3.")):
+        lines[number] = b" ".join([word, *lines[number].split()[1:]])
+    path.write_bytes(header + b"DATA ascii\n" + b"\n".join(lines))
+    assert_reads_alike(path)
+    assert len(read_scan(path).points) == 46
+
+
 def test_bin_files_read_as_python_reads_them(tmp_path: Path) -> None:
     points = tiny.make_scan(count=400)
     rings = np.column_stack([points, np.arange(400) % 32]).astype(np.float32)
@@ -106,6 +124,7 @@ def test_bin_files_read_as_python_reads_them(tmp_path: Path) -> None:
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
     good = pcd(tiny.make_scan(count=5), "binary")
     packed = pcd(tiny.make_scan(count=5), "binary_compressed")
+    text = pcd(tiny.make_scan(count=5), "ascii")
     cases = {
         "a.bin": b"torn",
         "b.bin": b"",
@@ -115,6 +134,12 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         "f.pcd": b"nothing",
         "g.txt": good,
         "h.pcd": good.replace(b"TYPE F", b"TYPE Q"),
+        "i.pcd": text.replace(b" 7 7 ", b" 7 seven ", 1),
+        "j.pcd": text.replace(b" 7 7 ", b" 7 0x7 ", 1),
+        "k.pcd": good.replace(b"WIDTH 5", b"WIDTH 6"),
+        "l.pcd": good.replace(b"HEIGHT 1", b"HEIGHT one"),
+        "m.pcd": good.replace(b"WIDTH 5\n", b"").replace(b"POINTS 5\n", b""),
+        "n.pcd": good.replace(b"ring", b"scalar_x"),
     }
     answers = call("readers.js", "readScan", *([name, data] for name, data in cases.items()))
     for (name, data), answer in zip(cases.items(), answers, strict=True):

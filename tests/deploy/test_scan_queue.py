@@ -9,7 +9,7 @@ import pytest
 
 from asca_deploy import Detector
 from asca_deploy.scan_queue import ScanQueue
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, ScanError
 from tests.deploy.conftest import make_scan
 
 PATIENCE_S = 20
@@ -94,6 +94,33 @@ def test_a_stream_that_is_slower_than_the_sensor(tiny_bundle: Path, started: lis
         assert np.array_equal(detections.boxes, alone.boxes), "the tag is that of the scan"
     assert tags == sorted(tags) and tags[-1] == 39, "the latest scan is never the one that is dropped"
     assert len(tags) == queue.taken and queue.taken + queue.dropped == 40
+
+
+def test_a_stream_after_one_that_failed_has_the_tags_of_its_own_scans(tiny_bundle: Path) -> None:
+    queue, detector = ScanQueue("wait", size=5), Detector(tiny_bundle)
+    for number in range(5):
+        queue.put(make_scan(number)[:, : 3 if number == 1 else 4], tag=number)
+    queue.close()
+    tags = []
+    with pytest.raises(ScanError):
+        tags.extend(queue.next_tag() for _ in detector.stream(queue))
+    assert queue.next_tag() == 1, "the scan that failed can be named"
+    for detections in detector.stream(queue):
+        tags.append(queue.next_tag())
+        assert np.array_equal(detections.boxes, detector(make_scan(tags[-1])).boxes)
+    assert tags == [0, 2, 3, 4]
+
+
+def test_tags_keep_their_places_among_scans_without_and_those_leave_nothing_behind() -> None:
+    queue = ScanQueue("wait", size=2000)
+    for number in range(2000):
+        queue.put(scan(number), tag=number if number % 500 == 1 else None)
+    queue.close()
+    assert len(numbers(queue)) == 2000
+    assert len(queue._tags) == 4
+    assert [queue.next_tag() for _ in range(2000)] == [n if n % 500 == 1 else None for n in range(2000)]
+    with pytest.raises(IndexError, match="once for each result"):
+        queue.next_tag()
 
 
 def test_impossible_wishes() -> None:

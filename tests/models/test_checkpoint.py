@@ -2,13 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
+import pytest
 import torch
 
 from asca_pillars.config import Config
+from asca_pillars.errors import TrainingError
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint, save_weights, weights_sha256
+from asca_pillars.models.openpcdet.import_checkpoint import read_foreign
 from asca_pillars.pillar_config import NetworkConfig, PillarModel
 from asca_pillars.schema import to_dict
+from asca_pillars.training.checkpoints import LAST, checkpoint_to_resume
 
 
 def test_weights_at_the_paper_s_width_are_small_and_are_the_same_to_three_digits(tmp_path: Path) -> None:
@@ -37,6 +42,29 @@ def test_a_checkpoint_without_younger_settings_has_their_defaults(tmp_path: Path
     content = {"hyper_parameters": {"config": older}, "global_step": 7, "state_dict": state}
     torch.save(content, tmp_path / "last.ckpt")
     assert load_checkpoint(tmp_path / "last.ckpt").config == config
+
+
+@pytest.mark.parametrize(("steps", "said"), [({}, "no 'global_step'"), ({"global_step": None}, "int")])
+def test_a_checkpoint_without_its_steps_is_one_line(tmp_path: Path, steps: dict[str, None], said: str) -> None:
+    config = Config(model=PillarModel(network=NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)))
+    state = {f"detector.{name}": value for name, value in build_model(config.model).state_dict().items()}
+    path = tmp_path / "last.ckpt"
+    torch.save({"hyper_parameters": {"config": to_dict(config)}, "state_dict": state, **steps}, path)
+    with pytest.raises(TrainingError, match=f"last.ckpt: not a checkpoint of `asca train`, or damaged .*{said}"):
+        load_checkpoint(path)
+
+
+def test_nobody_is_told_to_execute_what_is_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "scan.bin"
+    path.write_bytes(np.arange(40, dtype="<f4").tobytes())  # zeros first: no pickle begins so
+    for read in (load_checkpoint, read_foreign):
+        with pytest.raises(TrainingError, match=r"scan\.bin: .*nothing in it was executed") as refusal:
+            read(path)
+        assert "weights_only" not in str(refusal.value) and "\n" not in str(refusal.value)
+    (tmp_path / LAST).write_bytes(path.read_bytes())
+    with pytest.raises(TrainingError, match="nothing in it was executed") as refusal:
+        checkpoint_to_resume(tmp_path)
+    assert "weights_only" not in str(refusal.value)
 
 
 def test_weights_are_known_by_names_shapes_and_values() -> None:

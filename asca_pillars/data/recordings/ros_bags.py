@@ -32,23 +32,29 @@ class RosBag(Recording):
                 chosen = [one for one in reader.connections if one.topic == topic]
                 for _, time_ns, data in reader.messages(connections=chosen):
                     count += 1
-                    yield Message(time_ns, bytes(data), "ros1" if self.path.suffix == ".bag" else "cdr")
+                    yield Message(time_ns, bytes(data), "ros1" if _is_ros1(self.path) else "cdr")
             except (ScanError, GeneratorExit):
                 raise
             except Exception as error:  # of SQLite, the decompressors, the library
                 self.damage = f"{self.path}: ends early, after {count} messages of {topic} ({reason(error)})"
 
 
+def _is_ros1(path: Path) -> bool:
+    return path.suffix.lower() == ".bag"
+
+
 def _opened(path: Path) -> Any:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
-    reader = (Reader1 if path.suffix == ".bag" else Reader2)(path)
     try:
+        reader = (Reader1 if _is_ros1(path) else Reader2)(path)
         reader.open()
     except Exception as error:
         what, remedy = "rosbag2", "copy or record it again"
-        if path.suffix == ".bag":
+        if path.suffix != path.suffix.lower():  # the library goes by the suffix as it stands
+            remedy = f"rename it to {path.stem}{path.suffix.lower()}"
+        if _is_ros1(path):
             what, remedy = "ROS 1 bag", "copy it again, or mend its index (rosbag reindex)"
         raise ScanError(f"{path}: no readable {what} ({reason(error)}); {remedy}") from None
     return _Closing(reader)

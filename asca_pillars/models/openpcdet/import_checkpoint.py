@@ -10,6 +10,7 @@ from asca_pillars.config import Config
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path
 from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import unread
 from asca_pillars.models.openpcdet.links import convert_state
 from asca_pillars.models.openpcdet.pointpillars_links import pointpillars_links
 from asca_pillars.models.openpcdet.pv_rcnn_links import FIRST_CONVOLUTION, pv_rcnn_links
@@ -43,8 +44,9 @@ def read_foreign(path: str | Path) -> ForeignWeights:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise TrainingError(f"{path}: damaged, or holds more than weights, which is not read ({reason})") from error
+        raise TrainingError(
+            f"{path}: damaged, or holds more than weights, which is not read ({unread(error)})"
+        ) from error
     state = content.get("model_state") if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise TrainingError(f"{path}: has no `model_state` with arrays, as OpenPCDet writes it")

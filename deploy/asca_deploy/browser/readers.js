@@ -61,16 +61,18 @@ function plausible(values, columns) {
 /** PCD 0.7: ascii, binary and binary_compressed. */
 function readPcd(buffer) {
   const { header, body } = splitHeader(new Uint8Array(buffer));
-  const count = Number(header.POINTS ?? Number(header.WIDTH) * Number(header.HEIGHT ?? 1));
-  if (!Number.isInteger(count) || count < 0) throw new Error("POINTS is no whole number");
+  const count = pointCount(header);
   const fields = pcdFields(header);
   const encoding = (header.DATA ?? "").trim().toLowerCase();
   const read = { ascii: asciiColumns, binary: binaryColumns, binary_compressed: compressedColumns }[encoding];
   if (!read) throw new Error(`DATA is '${encoding}'; PCD knows ascii, binary and binary_compressed`);
-  const names = fields.map(({ name }) => name.toLowerCase());
+  const names = fields.map(({ name }) => name.toLowerCase().replace(/^scalar_/, "")); // CloudCompare's scalar_Intensity
   const wanted = ["x", "y", "z"].map((name) => names.indexOf(name));
   if (wanted.includes(-1)) throw new Error(`no field x, y or z among ${names.join(", ")}`);
   const bright = REFLECTANCE.map((name) => names.indexOf(name)).find((index) => index >= 0);
+  for (const index of [...wanted, ...(bright === undefined ? [] : [bright])]) {
+    if (names.indexOf(names[index], index + 1) >= 0) throw new Error(`several fields ${names[index]}; export one`);
+  }
   const [x, y, z, reflectance] = read(body, fields, count, [...wanted, ...(bright === undefined ? [] : [bright])]);
   const bytes = bright !== undefined && fields[bright].type !== "F" && fields[bright].size === 1;
   const integers = bright !== undefined && fields[bright].type !== "F";
@@ -89,6 +91,23 @@ function splitHeader(bytes) {
     position = end + 1;
   }
   return { header, body: bytes.slice(position) };
+}
+
+/** POINTS, which has to be WIDTH times HEIGHT where those are there too. */
+function pointCount(header) {
+  const numbers = {};
+  for (const key of ["POINTS", "WIDTH", "HEIGHT"]) {
+    if (!(key in header)) continue;
+    if (!/^[0-9]{1,18}$/.test(header[key])) throw new Error(`${key} is no whole number; correct the header`);
+    numbers[key] = Number(header[key]);
+  }
+  const { POINTS, WIDTH, HEIGHT = 1 } = numbers;
+  if (POINTS === undefined && WIDTH === undefined) throw new Error("neither POINTS nor WIDTH in the header");
+  const area = WIDTH === undefined ? POINTS : WIDTH * HEIGHT;
+  if (POINTS !== undefined && POINTS !== area) {
+    throw new Error(`POINTS is ${POINTS} and WIDTH times HEIGHT is ${area}; correct the header`);
+  }
+  return area;
 }
 
 function pcdFields(header) {
@@ -127,11 +146,19 @@ function asciiColumns(body, fields, count, wanted) {
   const starts = fields.map((_, index) => fields.slice(0, index).reduce((sum, field) => sum + field.count, 0));
   const width = fields.reduce((sum, field) => sum + field.count, 0);
   const rows = lines.map((line, row) => {
-    const numbers = line.trim().split(/\s+/).map(Number);
+    const numbers = line.trim().split(/\s+/).map(asNumber);
     if (numbers.length !== width) throw new Error(`point ${row} has ${numbers.length} values, not ${width}`);
     return numbers;
   });
   return wanted.map((index) => Float64Array.from(rows, (numbers) => numbers[starts[index]]));
+}
+
+/** A decimal number, nan or inf, as Python reads them; `Number` alone takes 0x10 and makes NaN of any other word. */
+function asNumber(word) {
+  if (/^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?$/i.test(word)) return Number(word);
+  if (/^[+-]?nan$/i.test(word)) return NaN;
+  if (/^[+-]?inf(inity)?$/i.test(word)) return word.startsWith("-") ? -Infinity : Infinity;
+  throw new Error(`'${word.slice(0, 20)}' is no number; ${AGAIN}`);
 }
 
 function binaryColumns(body, fields, count, wanted) {

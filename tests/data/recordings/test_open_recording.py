@@ -49,6 +49,18 @@ def test_compressed_rosbag2(tmp_path: Path, storage: str, mode: str) -> None:
     assert [one.time_ns for one in scans] == times and all(one.scan is not None for one in scans)
 
 
+def test_a_suffix_in_capitals(tmp_path: Path) -> None:
+    path = tmp_path / "DRIVE.BAG"
+    write_recording(tmp_path / "drive.bag", iter([(stamps(1)[0], cloud_points(0))]))
+    (tmp_path / "drive.bag").rename(path)
+    recording = open_recording(path)
+    (one,) = RecordedScans(recording, recording.point_cloud_topic(), 1.0).read()
+    assert is_recording(path) and one.scan is not None and np.array_equal(one.scan.points, cloud_points(0))
+    (tmp_path / "DRIVE.DB3").write_bytes(b"SQLite or not")
+    with pytest.raises(ScanError, match=r"DRIVE\.DB3: no readable rosbag2 .*; rename it to DRIVE\.db3$"):
+        open_recording(tmp_path / "DRIVE.DB3")
+
+
 def test_a_database_alone_and_one_with_its_metadata(tmp_path: Path) -> None:
     write_recording(tmp_path / "bag", iter([(stamps(1)[0], cloud_points(0))]))
     (database,) = (tmp_path / "bag").glob("*.db3")
