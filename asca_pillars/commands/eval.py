@@ -114,7 +114,7 @@ def evaluate(
         raise ConfigError("--around needs labels in every direction: give --protocol iou or distance, too")
     steps.check_arguments(model, data, predictions, labels, gallery, score)
     steps.check_protocol(protocol, data, gallery, score)
-    steps.claim(out)
+    steps.claim(out, json)
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:
         assert frames_of is not None, "checked with the arguments"

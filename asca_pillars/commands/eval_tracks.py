@@ -33,15 +33,16 @@ def evaluate_tracks(
     labels = open_split(data, split)
     if not isinstance(labels, BoxSplit):
         raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")
-    claim(out)
+    claim(out, json_path)
     about = {"data": str(data), "split": split, "predictions": str(predictions)}
     about |= {"environment": json.loads(describe_environment())}
     report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
     tables, notes = [tracking_table(report)], tracking_notes(report)
     print_tables(report.subject, tables, notes, console)
-    for path in (json_path, out / "tracking.json"):
-        if path is not None:
-            write_json(path, tracking_json(report))
+    content = tracking_json(report)
+    write_json(out / "tracking.json", content)
     with atomic_path(out / "tracking.md") as temporary:
         temporary.write_text(markdown_page(report.subject, tables, notes), encoding="utf-8")
+    if json_path is not None:
+        write_json(json_path, content)
     console.print(f"Written to {out}/", highlight=False)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from asca_pillars.cli import app
 from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import BundleError, ConfigError
+from asca_pillars.errors import BundleError, ConfigError, OutputError
 
 Points = NDArray[np.float32]
 
@@ -59,6 +59,14 @@ def test_a_bundle_to_compare_with_is_looked_at_first(
         CliRunner().invoke(
             app, ["bench", "-b", str(tiny_bundle), "--compare", str(tmp_path / "none")], catch_exceptions=False
         )
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_work(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asca_pillars.commands.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
+    with pytest.raises(OutputError, match="is a folder"):
+        CliRunner().invoke(app, ["bench", "-b", str(tiny_bundle), "--json", str(tmp_path)], catch_exceptions=False)
 
 
 def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from asca_pillars.cli import app
 from asca_pillars.commands.eval_tracks import evaluate_tracks
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.evaluation.tracking.tracking_report import TrackingReport, tracking_json, tracking_report
 from asca_pillars.sim.sequences.sequence_files import simulate_sequences
 from asca_pillars.sim.simulation_configs import load_simulation_config
@@ -86,6 +87,11 @@ def test_the_command_prints_and_writes(drives: Path, tmp_path: Path) -> None:
     assert written["classes"]["Car"]["hota"] == pytest.approx(1) and written["frames"] == 12
     assert "| Car |" in (tmp_path / "out" / "tracking.md").read_text()
     assert "environment" in written
+
+
+def test_a_json_that_cannot_be_written_is_told_before_the_work(drives: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="is a folder"):
+        evaluate_tracks(drives, "training", tmp_path / "none", tmp_path / "out", tmp_path, Console())
 
 
 def test_plain_values(drives: Path, tmp_path: Path) -> None:
