@@ -98,8 +98,9 @@ def evaluate(
     if protocol is None:
         protocol = steps.default_protocol(data)
     if protocol == "tracking":
-        from asca_pillars.commands.eval_tracks import evaluate_tracks
+        from asca_pillars.commands.eval_tracks import check_arguments, evaluate_tracks
 
+        check_arguments(model, labels, gallery, score, around=around)
         evaluate_tracks(data, split, predictions, out, json, console)
         return
     if protocol in ("iou", "distance"):

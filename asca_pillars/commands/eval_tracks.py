@@ -20,6 +20,24 @@ from asca_pillars.files import atomic_path, write_json
 from asca_pillars.system import describe_environment
 
 
+def check_arguments(
+    model: Path | None, labels: Path | None, gallery: int | None, score: float | None, *, around: bool
+) -> None:
+    """Refuse options of other protocols, with a ConfigError."""
+    if model is not None:
+        raise ConfigError(f"{model}: --protocol tracking runs no model; give --predictions, of asca detect --track")
+    if around:
+        raise ConfigError("--around runs a model; --protocol tracking scores tracks as they are: leave it out")
+    if labels is not None:
+        raise ConfigError(f"--labels {labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
+    if gallery:
+        raise ConfigError(f"--gallery {gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes")
+    if score is not None:
+        raise ConfigError(
+            f"--score {score:g}: --protocol tracking goes over all tracks; give it to asca detect --track"
+        )
+
+
 def evaluate_tracks(
     data: Path | None, split: str, predictions: Path | None, out: Path, json_path: Path | None, console: Console
 ) -> None:

@@ -112,3 +112,19 @@ def test_what_cannot_be_scored_is_refused(drives: Path, tmp_path: Path) -> None:
         score(drives, tmp_path, [{"scan": "elsewhere.bin", "time_s": 1e9, "boxes": []}])
     with pytest.raises(ConfigError, match="give --data"):
         evaluate_tracks(None, "val", None, tmp_path, None, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["asca_sim"], "asca_sim: --protocol tracking runs no model"),
+        (["--around"], "--around runs a model"),
+        (["--labels", "x"], "--labels x belongs to --protocol kitti and waymo"),
+        (["--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),
+        (["--score", "0.5"], "--score 0.5: --protocol tracking goes over all tracks"),
+    ],
+)
+def test_options_of_other_protocols_are_refused(tmp_path: Path, arguments: list[str], message: str) -> None:
+    where = ["--protocol", "tracking", "--data", str(tmp_path), "--predictions", str(tmp_path)]
+    with pytest.raises(ConfigError, match=message):
+        CliRunner().invoke(app, ["eval", *arguments, *where], catch_exceptions=False)
