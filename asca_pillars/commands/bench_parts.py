@@ -56,7 +56,9 @@ def measure_parts(
     result = report.to_dict()
     lines = show.summary_lines(report)
     if detector.provider in ON_THE_CPU:
-        found = measure_roofline(detector.bundle, report.stages_ms["neck+head"].p50, detector.threads)
+        # All passes of a scan are in the stage, and the backbone's operations are those of one.
+        pass_ms = report.stages_ms["neck+head"].p50 / detector.passes
+        found = measure_roofline(detector.bundle, pass_ms, detector.threads)
         result["roofline"] = asdict(found)
         lines.append(show.roofline_line(found))
     console.print(show.stages_table(report))

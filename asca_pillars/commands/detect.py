@@ -117,6 +117,10 @@ def detect(
     if recordings:
         if cluster is not None or len(scans or ()) > 1:
             raise ConfigError(f"{recordings[0]}: is a recording; give one alone, without --cluster")
+        if pictures:
+            raise ConfigError("--pictures: scans of a recording are not drawn; leave it out, or give --rerun FILE")
+        if columns is not None:
+            raise ConfigError(f"--columns {columns}: is for .bin files, and a recording names its fields; leave it out")
         from asca_pillars.commands.detect_recording import RecordingTask, detect_recording
 
         task = RecordingTask(

@@ -98,8 +98,9 @@ def evaluate(
     if protocol is None:
         protocol = steps.default_protocol(data)
     if protocol == "tracking":
-        from asca_pillars.commands.eval_tracks import evaluate_tracks
+        from asca_pillars.commands.eval_tracks import check_arguments, evaluate_tracks
 
+        check_arguments(model, labels, gallery, score, around=around)
         evaluate_tracks(data, split, predictions, out, json, console)
         return
     if protocol in ("iou", "distance"):
@@ -114,7 +115,7 @@ def evaluate(
         raise ConfigError("--around needs labels in every direction: give --protocol iou or distance, too")
     steps.check_arguments(model, data, predictions, labels, gallery, score)
     steps.check_protocol(protocol, data, gallery, score)
-    steps.claim(out)
+    steps.claim(out, json)
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:
         assert frames_of is not None, "checked with the arguments"

@@ -60,7 +60,7 @@ def check_arguments(
 def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | None, console: Console) -> None:
     """Evaluate by IoU or by distance; print and write the tables, the JSON, and the model's predictions."""
     assert task.data is not None, "checked with the arguments"
-    claim(task.out)
+    claim(task.out, task.json)
     split = open_split(task.data, task.split)
     about: dict[str, Any] = {"data": str(task.data), "split": task.split}
     if predictions is None:
@@ -81,11 +81,11 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     tables, notes = box_tables(report), box_notes(report)
     print_tables(report.title, tables, notes, console)
     content = box_json(report)
-    for path in (task.json, task.out / f"{task.protocol}.json"):
-        if path is not None:
-            write_json(path, content)
+    write_json(task.out / f"{task.protocol}.json", content)
     with atomic_path(task.out / f"{task.protocol}.md") as temporary:
         temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
+    if task.json is not None:
+        write_json(task.json, content)
     console.print(f"Written to {task.out}/", highlight=False)
 
 

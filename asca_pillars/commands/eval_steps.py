@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 from rich.console import Console
 
 from asca_pillars.commands.extras import missing_modules
+from asca_pillars.commands.json_file import require_writable
 from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
@@ -56,16 +57,17 @@ class Task:
     about: dict[str, Any]
 
 
-def claim(out: Path) -> None:
-    """Make sure that nothing but earlier evaluations is in `out`.
+def claim(out: Path, json_path: Path | None) -> None:
+    """Make sure that nothing but earlier evaluations is in `out`, and that `json_path` can be written.
 
     Raises:
-        OutputError: there is; names it.
+        OutputError, OSError: not so; names what is there.
     """
     reports = "report.json", "waymo.json", "iou.json", "distance.json", "tracking.json"
     require_own(out, COMMAND, *reports, f"predictions/{MADE_BY}", text='"')
     for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
         require_replaceable(out / folder, COMMAND, marker)
+    require_writable(json_path)
 
 
 def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: float | None) -> Task:
@@ -185,11 +187,11 @@ def report_waymo(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     tables, notes = [waymo_table(report)], waymo_notes(report)
     print_tables(report.title, tables, notes, console)
     content = waymo_json(report)
-    for path in (json_path, out / "waymo.json"):
-        if path is not None:
-            write_json(path, content)
+    write_json(out / "waymo.json", content)
     with atomic_path(out / "waymo.md") as temporary:
         temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
+    if json_path is not None:
+        write_json(json_path, content)
 
 
 def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
@@ -201,15 +203,15 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     report = EvalReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     print_report(report, console)
     content = to_json(report)
-    for path in (json_path, out / "report.json"):
-        if path is not None:
-            write_json(path, content)
+    write_json(out / "report.json", content)
     with atomic_path(out / "report.md") as temporary:
         temporary.write_text(to_markdown(report), encoding="utf-8")
     if missing_modules("eval"):
         console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
     else:
         write_curves(out / "curves.png", ap.overall, report.title)
+    if json_path is not None:
+        write_json(json_path, content)
 
 
 def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:

@@ -20,6 +20,24 @@ from asca_pillars.files import atomic_path, write_json
 from asca_pillars.system import describe_environment
 
 
+def check_arguments(
+    model: Path | None, labels: Path | None, gallery: int | None, score: float | None, *, around: bool
+) -> None:
+    """Refuse options of other protocols, with a ConfigError."""
+    if model is not None:
+        raise ConfigError(f"{model}: --protocol tracking runs no model; give --predictions, of asca detect --track")
+    if around:
+        raise ConfigError("--around runs a model; --protocol tracking scores tracks as they are: leave it out")
+    if labels is not None:
+        raise ConfigError(f"--labels {labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
+    if gallery:
+        raise ConfigError(f"--gallery {gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes")
+    if score is not None:
+        raise ConfigError(
+            f"--score {score:g}: --protocol tracking goes over all tracks; give it to asca detect --track"
+        )
+
+
 def evaluate_tracks(
     data: Path | None, split: str, predictions: Path | None, out: Path, json_path: Path | None, console: Console
 ) -> None:
@@ -33,15 +51,16 @@ def evaluate_tracks(
     labels = open_split(data, split)
     if not isinstance(labels, BoxSplit):
         raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")
-    claim(out)
+    claim(out, json_path)
     about = {"data": str(data), "split": split, "predictions": str(predictions)}
     about |= {"environment": json.loads(describe_environment())}
     report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
     tables, notes = [tracking_table(report)], tracking_notes(report)
     print_tables(report.subject, tables, notes, console)
-    for path in (json_path, out / "tracking.json"):
-        if path is not None:
-            write_json(path, tracking_json(report))
+    content = tracking_json(report)
+    write_json(out / "tracking.json", content)
     with atomic_path(out / "tracking.md") as temporary:
         temporary.write_text(markdown_page(report.subject, tables, notes), encoding="utf-8")
+    if json_path is not None:
+        write_json(json_path, content)
     console.print(f"Written to {out}/", highlight=False)

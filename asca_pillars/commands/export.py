@@ -94,6 +94,7 @@ def export(
         from asca_pillars.commands.export_runtime import export_for_runtime
 
         of_a_checkpoint = {
+            "--trained-on": trained_on,
             "--score": score,
             "--int8": int8,
             "--calibrate": calibrate,

@@ -8,7 +8,7 @@ import typer
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.options import ClusterOption
 
-FRAMES = 100
+FRAMES, LENGTH = 100, 100
 
 
 def simulate(
@@ -32,7 +32,10 @@ def simulate(
             "identities and velocities. Written as a dataset of boxes without a camera (docs/RECORDINGS.md).",
         ),
     ] = None,
-    length: Annotated[int, typer.Option("--length", min=1, help="Scans of each sequence; 10 make a second.")] = 100,
+    length: Annotated[
+        int | None,
+        typer.Option("--length", min=1, help="With --sequences: scans of each; 10 make a second. Default: 100."),
+    ] = None,
     seed: Annotated[
         int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number of workers.")
     ] = 0,
@@ -113,6 +116,8 @@ def simulate(
 
     if bundle is not None and like is None:
         raise ConfigError(f"--bundle {bundle} scores the objects of a real folder: give --like FOLDER, too")
+    if length is not None and sequences is None:
+        raise ConfigError(f"--length {length} is for drives: give --sequences N, too, or --frames N for single scans")
     if like is not None:
         KittiSplit(like).frame_ids  # noqa: B018 - a wrong folder is named before the work
     console = Console(markup=False)
@@ -125,6 +130,7 @@ def simulate(
         require_own(out, "asca simulate", "simulation.json", text='"length"')
         from asca_pillars.sim.sequences.sequence_files import simulate_sequences
 
+        length = length or LENGTH
         simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share)
         console.print(f"{sequences} sequences of {length} scans below {out}; look at one: asca detect {out}/scans/0000")
         return

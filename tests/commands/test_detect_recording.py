@@ -259,6 +259,10 @@ def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
         detect([sample_scan_path()], out=tmp_path, track=True)
     with pytest.raises(ConfigError, match="give one alone"):
         detect([drive, sample_scan_path()], out=tmp_path)
+    with pytest.raises(ConfigError, match="--pictures: scans of a recording are not drawn"):
+        run(drive, tmp_path, pictures=True)
+    with pytest.raises(ConfigError, match="--columns 7: is for"):
+        run(drive, tmp_path, columns=7)
     before = drive.read_bytes()
     with pytest.raises(OutputError, match=r"drive\.mcap: `asca detect` did not write it"):
         run(drive, tmp_path, foxglove=drive)

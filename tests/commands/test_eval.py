@@ -219,6 +219,16 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("protocol", ["kitti", "waymo"])
+def test_a_json_that_cannot_be_written_is_told_before_the_work(
+    tmp_path: Path, texts: dict[str, Any], protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setattr(f"asca_pillars.commands.eval_steps.report_{protocol}", lambda *_: pytest.fail("too late"))
+    message = refusal(tmp_path, **texts, protocol=protocol, json_path=tmp_path / "folder")
+    assert message == "folder: is a folder; choose a file's name"
+
+
 def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
     theirs = tmp_path / "out" / "predictions"
     shutil.copytree(texts["predictions"], theirs)

@@ -123,6 +123,7 @@ def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_pat
         (["--data", "{root}", "--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),
         (["--data", "{root}", "--labels", "x"], "--labels x belongs to"),
         (["--data", "{root}", "--score", "nan"], "--score nan must be a number"),
+        (["--data", "{root}", "--predictions", "{root}/none.jsonl", "--json", "{root}"], "is a folder"),
         (["--data", "{root}", "--predictions", "{root}/labels.jsonl"], "labels.jsonl:1, box 1: no `score`"),
         (["--data", "{root}", "--predictions", "{root}/none.jsonl"], "none.jsonl: cannot be read"),
     ],

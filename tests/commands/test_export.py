@@ -66,6 +66,7 @@ def test_what_cannot_be_exported_is_one_line(with_weights: Path, scans: Path, tm
         ((tmp_path / "nowhere", *tail), "no such folder"),
         ((with_weights, "--dense-neck", "--int8", *tail), "--dense-neck with --int8"),
         ((with_weights, "--golden", "--dense-neck", "-o", out), "--dense-neck is for a checkpoint"),
+        ((with_weights, "--golden", "--trained-on", "foo", "-o", out), "--trained-on is for a checkpoint"),
     ):
         refused = run_here("export", *arguments)
         assert refused.returncode == 2 and said in refused.stderr, refused.stderr

@@ -76,6 +76,9 @@ def test_sequences_are_written_and_go_with_nothing_of_single_scans(
     command.simulate(tmp_path / "a", sequences=1, length=2, workers=1, config="vlp_16")
     assert "1 sequences of 2 scans below" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "a" / "scans" / "0000").iterdir()} == {"000000.bin", "000001.bin"}
+    with pytest.raises(ConfigError, match="--length 20 is for drives: give --sequences N"):
+        command.simulate(tmp_path / "b", length=20)
+    assert not (tmp_path / "b").exists()
     with pytest.raises(ConfigError, match="leave --frames"):
         command.simulate(tmp_path / "b", sequences=1, frames=3)
     with pytest.raises(AscaError, match="another folder"):

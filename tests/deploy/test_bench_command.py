@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from asca_deploy import Detector
 from asca_pillars.cli import app
 from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import BundleError, ConfigError
+from asca_pillars.errors import BundleError, ConfigError, OutputError
 
 Points = NDArray[np.float32]
 
@@ -59,6 +60,25 @@ def test_a_bundle_to_compare_with_is_looked_at_first(
         CliRunner().invoke(
             app, ["bench", "-b", str(tiny_bundle), "--compare", str(tmp_path / "none")], catch_exceptions=False
         )
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_work(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asca_pillars.commands.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
+    with pytest.raises(OutputError, match="is a folder"):
+        CliRunner().invoke(app, ["bench", "-b", str(tiny_bundle), "--json", str(tmp_path)], catch_exceptions=False)
+
+
+def test_the_roofline_is_that_of_one_pass(tiny_bundle: Path, tmp_path: Path) -> None:
+    command = ["bench", "-b", tiny_bundle, "--around", "--rounds", 1, "--json", tmp_path / "report.json"]
+    result = CliRunner().invoke(app, [str(part) for part in command], catch_exceptions=False)
+    assert result.exit_code == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    passes = Detector(tiny_bundle, view="around").passes
+    per_pass_s = report["stages_ms"]["neck+head"]["p50"] / 1e3 / passes
+    assert passes > 1
+    assert report["roofline"]["achieved_gmac_s"] == pytest.approx(report["roofline"]["gmac"] / per_pass_s)
 
 
 def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:

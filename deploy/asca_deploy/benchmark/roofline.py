@@ -26,7 +26,7 @@ class Roofline:
     gmac: float
     """Multiply-accumulates of the backbone, 1e9."""
     achieved_gmac_s: float
-    """Of neck and head at their p50."""
+    """Of neck and head at their p50, of one pass."""
     gemm_gmac_s: dict[str, float]
     """Measured rate by type, float32 and int8."""
     type: str
@@ -37,7 +37,7 @@ class Roofline:
 
 
 def measure_roofline(bundle: AnyBundle, backbone_ms: float, threads: int) -> Roofline:
-    """Measure the machine and relate `backbone_ms`, the p50 of neck and head, to it; takes up to two seconds.
+    """Measure the machine and relate `backbone_ms` to it, the p50 of neck and head in one pass; up to two seconds.
 
     Args:
         threads: as the detector has.

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from asca_pillars.cli import app
 from asca_pillars.commands.eval_tracks import evaluate_tracks
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.evaluation.tracking.tracking_report import TrackingReport, tracking_json, tracking_report
 from asca_pillars.sim.sequences.sequence_files import simulate_sequences
 from asca_pillars.sim.simulation_configs import load_simulation_config
@@ -88,6 +89,11 @@ def test_the_command_prints_and_writes(drives: Path, tmp_path: Path) -> None:
     assert "environment" in written
 
 
+def test_a_json_that_cannot_be_written_is_told_before_the_work(drives: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="is a folder"):
+        evaluate_tracks(drives, "training", tmp_path / "none", tmp_path / "out", tmp_path, Console())
+
+
 def test_plain_values(drives: Path, tmp_path: Path) -> None:
     json.dumps(tracking_json(score(drives, tmp_path, labels(drives))), allow_nan=False)
 
@@ -106,3 +112,19 @@ def test_what_cannot_be_scored_is_refused(drives: Path, tmp_path: Path) -> None:
         score(drives, tmp_path, [{"scan": "elsewhere.bin", "time_s": 1e9, "boxes": []}])
     with pytest.raises(ConfigError, match="give --data"):
         evaluate_tracks(None, "val", None, tmp_path, None, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["asca_sim"], "asca_sim: --protocol tracking runs no model"),
+        (["--around"], "--around runs a model"),
+        (["--labels", "x"], "--labels x belongs to --protocol kitti and waymo"),
+        (["--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),
+        (["--score", "0.5"], "--score 0.5: --protocol tracking goes over all tracks"),
+    ],
+)
+def test_options_of_other_protocols_are_refused(tmp_path: Path, arguments: list[str], message: str) -> None:
+    where = ["--protocol", "tracking", "--data", str(tmp_path), "--predictions", str(tmp_path)]
+    with pytest.raises(ConfigError, match=message):
+        CliRunner().invoke(app, ["eval", *arguments, *where], catch_exceptions=False)
