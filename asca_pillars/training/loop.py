@@ -20,18 +20,13 @@ from asca_deploy.shipped import find_checkpoint
 from asca_pillars.config import Config, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
+from asca_pillars.files import recover
 from asca_pillars.models.checkpoint import load_checkpoint, save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.bfloat16 import computes_in_bfloat16, has_bfloat16
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
-from asca_pillars.training.checkpoints import (
-    LAST,
-    AtomicCheckpointIO,
-    LastCheckpoint,
-    checkpoint_to_resume,
-    remove_leftovers,
-)
+from asca_pillars.training.checkpoints import LAST, AtomicCheckpointIO, LastCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule
 from asca_pillars.training.run_folder import claim, measure_input
@@ -83,7 +78,7 @@ def train(
     config = replace(config, data=replace(config.data, camera_view=view))
     data = DetectionData(config, data_root)
     claim(out, config)
-    remove_leftovers(checkpoints)
+    recover(checkpoints, again=True)  # another process may have been killed there since
     resumed, damage = checkpoint_to_resume(checkpoints)
     say = rank_zero_only(Console(markup=False, highlight=False).print)
     if damage is not None and resumed is not None:

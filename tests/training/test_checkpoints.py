@@ -10,8 +10,10 @@ import torch
 from asca_pillars.config import Config, DataConfig, TrainConfig
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume, remove_leftovers
+from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume
+from asca_pillars.training.loop import train
 from asca_pillars.training.run_folder import claim, measure_input
+from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
 
@@ -72,12 +74,19 @@ def test_only_damaged_checkpoints_are_one_line_with_a_remedy(tmp_path: Path) -> 
     assert "\n" not in str(caught.value)
 
 
-def test_leftovers_may_be_gone_already(tmp_path: Path) -> None:
-    (tmp_path / ".last-x.ckpt").touch()
-    remove_leftovers(tmp_path)
-    remove_leftovers(tmp_path)
-    remove_leftovers(tmp_path / "nowhere")
-    assert not list(tmp_path.iterdir())
+def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
+    """Jupyter keeps a hidden folder wherever it has opened a file."""
+    folder = tmp_path / "run" / "checkpoints"
+    (folder / ".ipynb_checkpoints").mkdir(parents=True)
+    (folder / ".ipynb_checkpoints" / "notes.ipynb").touch()
+    (folder / ".notes").touch()
+    data = write_dataset(tmp_path / "data", 3)
+    for _ in range(2):
+        (folder / ".last.asca-01234567.ckpt").touch()
+        with pytest.raises(TrainingError, match="devices many"):
+            train(CONFIG, data, tmp_path / "run", devices="many")
+        assert sorted(path.name for path in folder.iterdir()) == [".ipynb_checkpoints", ".notes"]
+    assert (folder / ".ipynb_checkpoints" / "notes.ipynb").exists()
 
 
 def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
