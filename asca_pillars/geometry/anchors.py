@@ -38,6 +38,12 @@ class ClassSpec:
     def __post_init__(self) -> None:
         if not self.name:
             raise ConfigError("a class needs a name")
+        if self.name.split() != [self.name]:  # KITTI's label files have white space between their fields
+            joined = "_".join(self.name.split()) or "Car"
+            raise ConfigError(
+                f"class name `{self.name}`: write it without white space, such as {joined}; "
+                "`asca import --rename OLD=NEW` gives labels another name"
+            )
         for field in ("length_m", "width_m", "height_m"):
             if not 0 < getattr(self, field) <= _MOST_M:
                 raise ConfigError(

@@ -1,6 +1,5 @@
 """A run's checkpoints: written whole, two generations of the last one, and the one to go on from."""
 
-import os
 import pickle
 import shutil
 import zipfile
@@ -87,10 +86,3 @@ def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
             f"with the weights of this one if {folder / BEST} is there: --init {folder / BEST}"
         )
     return None, None
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of a run that was killed while it saved; another process may be doing the same."""
-    if int(os.environ.get("LOCAL_RANK", 0)) == 0:
-        for leftover in folder.glob(".*"):
-            leftover.unlink(missing_ok=True)

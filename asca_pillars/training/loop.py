@@ -20,18 +20,14 @@ from asca_deploy.shipped import find_checkpoint
 from asca_pillars.config import Config, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
+from asca_pillars.files import recover
+from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint, save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.bfloat16 import computes_in_bfloat16, has_bfloat16
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
-from asca_pillars.training.checkpoints import (
-    LAST,
-    AtomicCheckpointIO,
-    LastCheckpoint,
-    checkpoint_to_resume,
-    remove_leftovers,
-)
+from asca_pillars.training.checkpoints import LAST, AtomicCheckpointIO, LastCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule
 from asca_pillars.training.run_folder import claim, measure_input
@@ -57,7 +53,8 @@ def train(
         config: what to train.
         data_root: a dataset's folder, see `data.open_split`.
         out: folder of this run; one run with the same config in it is resumed exactly. With the `step` schedule it
-            may be made longer by more `train.epochs`, and is then what the longer run would have been.
+            may be made longer by more `train.epochs`, and is then what the longer run would have been. A run there
+            that has no checkpoint yet gives way.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
         init: weights that a new run starts from, instead of random ones: a checkpoint, or a bundle that holds its
@@ -81,26 +78,28 @@ def train(
     # What the run records of itself must hold for its checkpoint: without a camera it has seen whole scans.
     view = config.data.camera_view and open_split(data_root).has_camera
     config = replace(config, data=replace(config.data, camera_view=view))
-    data = DetectionData(config, data_root)
-    claim(out, config)
-    remove_leftovers(checkpoints)
+    recover(checkpoints, again=True)  # another process may have been killed there since
     resumed, damage = checkpoint_to_resume(checkpoints)
-    say = rank_zero_only(Console(markup=False, highlight=False).print)
-    if damage is not None and resumed is not None:
-        say(f"{damage}: going on from {resumed}")
-    if config.train.precision == "bf16" and not has_bfloat16():
-        say("train.precision = bf16: this device has no bfloat16 and is many times slower in it; choose auto or fp32")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    L.seed_everything(config.train.seed, verbose=False)
-    module = DetectionModule(config, measure_input(out, data.training_set.frames))
-    if init is not None and resumed is None:
-        _start_from(module, init)
+    # What may be mistyped is looked at before minutes of work, and before the folder is that of this run.
+    weights = None if init is None or resumed is not None else _fitting_weights(config, init)
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
     trainer = _trainer(
         config.train, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes
     )
+    data = DetectionData(config, data_root)
+    claim(out, config)
+    say = rank_zero_only(Console(markup=False, highlight=False).print)
+    if damage is not None and resumed is not None:
+        say(f"{damage}: going on from {resumed}")
+    if config.train.precision == "bf16" and not has_bfloat16():
+        say("train.precision = bf16: this device has no bfloat16 and is many times slower in it; choose auto or fp32")
+    L.seed_everything(config.train.seed, verbose=False)
+    module = DetectionModule(config, measure_input(out, data.training_set.frames))
+    if weights is not None:
+        module.detector.load_state_dict(weights)
     with warnings.catch_warnings(), interrupt.listening():
         # Of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")
@@ -157,9 +156,10 @@ def _trainer(
         raise TrainingError(f"devices {devices} x {num_nodes} nodes: {' '.join(str(error).split())}") from None
 
 
-def _start_from(module: DetectionModule, init: str | Path) -> None:
+def _fitting_weights(config: Config, init: str | Path) -> dict[str, Any]:
+    """The weights that `init` names; TrainingError if they are not of this configuration's network."""
     path = find_checkpoint(init)
-    theirs, ours = load_checkpoint(path).detector.state_dict(), module.detector.state_dict()
+    theirs, ours = load_checkpoint(path).detector.state_dict(), build_model(config.model).state_dict()
     for name in ours | theirs:
         found, wanted = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
         if found != wanted:
@@ -167,4 +167,4 @@ def _start_from(module: DetectionModule, init: str | Path) -> None:
                 f"{path}: weights of another network: {name} is {found} there and {wanted} in this configuration; "
                 "model.spec and model.network have to be like those that it was trained with"
             )
-    module.detector.load_state_dict(theirs)
+    return theirs

@@ -17,6 +17,7 @@ from asca_pillars.schema import to_dict
 from asca_pillars.settings import read_settings
 from asca_pillars.system import describe_environment
 
+EXPECTED_INPUT_FILE = "expected_input.yaml"
 EXPECTED_INPUT_FRAMES = 200
 # Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.
 NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
@@ -25,33 +26,23 @@ NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
 def claim(out: Path, config: Config) -> None:
     """Write what this run is into `out`, or make sure that the run found there is the same one.
 
-    A run of the `step` schedule may be made longer: its steps so far are those of the longer run.
+    A run of the `step` schedule may be made longer: its steps so far are those of the longer run. One without any
+    checkpoint has learnt nothing, so that another takes its place.
 
     Raises:
         TrainingError: the run there is another one.
     """
-    resolved = to_dict(config)
     path = out / "config.yaml"
-    if path.exists():
-        found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
-        found = to_dict(found_config)
-        longer = config.train.epochs > found_config.train.epochs
-        if longer and config.train.schedule == "step":
-            found["train"]["epochs"] = config.train.epochs
-        if difference := _first_difference(found, resolved):
-            if longer and difference.startswith("train.epochs"):
-                raise TrainingError(
-                    f"{path}: the run there was started with {difference}; a one_cycle schedule is planned for its "
-                    f"whole length: start a new run in another --out with --init {out / 'checkpoints' / 'last.ckpt'}"
-                )
-            raise TrainingError(
-                f"{path}: the run there was started with {difference}; choose another --out, or delete it"
-            )
-    else:
+    refusal = _why_another(path, config) if path.exists() else None
+    if refusal and any((out / "checkpoints").glob("*.ckpt")):
+        raise TrainingError(refusal)
+    if refusal:
+        (out / EXPECTED_INPUT_FILE).unlink(missing_ok=True)  # of other frames, perhaps
+    if refusal or not path.exists():
         with atomic_path(out / "environment.json") as temporary:
             temporary.write_text(describe_environment(), encoding="utf-8")
     with atomic_path(path) as temporary:
-        temporary.write_text(yaml.safe_dump(resolved, sort_keys=False), encoding="utf-8")
+        temporary.write_text(yaml.safe_dump(to_dict(config), sort_keys=False), encoding="utf-8")
 
 
 def measure_input(out: Path, frames: TrainingFrames) -> ExpectedInput:
@@ -62,7 +53,7 @@ def measure_input(out: Path, frames: TrainingFrames) -> ExpectedInput:
         TrainingError: no frame has a point.
         ConfigError: what was kept is damaged.
     """
-    path = out / "expected_input.yaml"
+    path = out / EXPECTED_INPUT_FILE
     if path.exists():
         return read_settings(ExpectedInput, path, (), {})
     ids = frames.frame_ids
@@ -76,6 +67,24 @@ def measure_input(out: Path, frames: TrainingFrames) -> ExpectedInput:
     with atomic_path(path) as temporary:
         temporary.write_text(yaml.safe_dump(to_dict(measured)), encoding="utf-8")
     return measured
+
+
+def _why_another(path: Path, config: Config) -> str | None:
+    """In what words `config` is another run than the one that `path` is of; None if it is the same, or longer."""
+    found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
+    found = to_dict(found_config)
+    longer = config.train.epochs > found_config.train.epochs
+    if longer and config.train.schedule == "step":
+        found["train"]["epochs"] = config.train.epochs
+    difference = _first_difference(found, to_dict(config))
+    if difference is None:
+        return None
+    if longer and difference.startswith("train.epochs"):
+        return (
+            f"{path}: the run there was started with {difference}; a one_cycle schedule is planned for its whole "
+            f"length: start a new run in another --out with --init {path.parent / 'checkpoints' / 'last.ckpt'}"
+        )
+    return f"{path}: the run there was started with {difference}; choose another --out, or delete it"
 
 
 def _first_difference(found: Any, wanted: Any, key: str = "") -> str | None:

@@ -55,6 +55,9 @@ def test_kitti_classes() -> None:
     ("settings", "named"),
     [
         ({"name": ""}, "name"),
+        ({"name": "traffic cone"}, "`traffic cone`: write it without white space, such as traffic_cone; .*--rename"),
+        ({"name": "Van "}, "such as Van;"),
+        ({"name": "\t"}, "such as Car;"),
         ({"length_m": 0.0}, "length_m 0 of class Van"),
         ({"width_m": -1.0}, "width_m -1"),
         ({"height_m": math.nan}, "height_m nan"),

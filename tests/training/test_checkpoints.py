@@ -6,17 +6,28 @@ from typing import cast
 
 import pytest
 import torch
+import yaml
 
 from asca_pillars.config import Config, DataConfig, TrainConfig
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume, remove_leftovers
+from asca_pillars.schema import to_dict
+from asca_pillars.training import loop
+from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume
+from asca_pillars.training.loop import train
 from asca_pillars.training.run_folder import claim, measure_input
+from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
 
 def save(folder: Path, step: int, files: AtomicCheckpointIO) -> None:
     files.save_checkpoint({"global_step": step}, folder / "last.ckpt")
+
+
+def learn(run: Path) -> None:
+    """A run has a checkpoint from its first steps on."""
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "checkpoints" / "last.ckpt").touch()
 
 
 def step_of(path: Path | None) -> int:
@@ -72,19 +83,27 @@ def test_only_damaged_checkpoints_are_one_line_with_a_remedy(tmp_path: Path) -> 
     assert "\n" not in str(caught.value)
 
 
-def test_leftovers_may_be_gone_already(tmp_path: Path) -> None:
-    (tmp_path / ".last-x.ckpt").touch()
-    remove_leftovers(tmp_path)
-    remove_leftovers(tmp_path)
-    remove_leftovers(tmp_path / "nowhere")
-    assert not list(tmp_path.iterdir())
+def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
+    """Jupyter keeps a hidden folder wherever it has opened a file."""
+    folder = tmp_path / "run" / "checkpoints"
+    (folder / ".ipynb_checkpoints").mkdir(parents=True)
+    (folder / ".ipynb_checkpoints" / "notes.ipynb").touch()
+    (folder / ".notes").touch()
+    data = write_dataset(tmp_path / "data", 3)
+    for _ in range(2):
+        (folder / ".last.asca-01234567.ckpt").touch()
+        with pytest.raises(TrainingError, match="devices many"):
+            train(CONFIG, data, tmp_path / "run", devices="many")
+        assert sorted(path.name for path in folder.iterdir()) == [".ipynb_checkpoints", ".notes"]
+    assert (folder / ".ipynb_checkpoints" / "notes.ipynb").exists()
 
 
 def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
     claim(tmp_path, CONFIG)
     data = DataConfig(workers=7, prepared=str(tmp_path))
-    train = dataclasses.replace(CONFIG.train, checkpoint_steps=9)
-    claim(tmp_path, dataclasses.replace(CONFIG, data=data, train=train))
+    recipe = dataclasses.replace(CONFIG.train, checkpoint_steps=9)
+    claim(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe))
+    learn(tmp_path)
     with pytest.raises(TrainingError, match=r"data\.min_points = 1, now data\.min_points = 2"):
         claim(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)))
 
@@ -94,14 +113,41 @@ def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> N
         return dataclasses.replace(CONFIG, train=TrainConfig(**recipe))  # type: ignore[arg-type]
 
     claim(tmp_path / "step", of(epochs=2, schedule="step"))
+    learn(tmp_path / "step")
     claim(tmp_path / "step", of(epochs=5, schedule="step"))
     with pytest.raises(TrainingError, match=r"train\.epochs = 5, now train\.epochs = 4; choose another"):
         claim(tmp_path / "step", of(epochs=4, schedule="step"))
     with pytest.raises(TrainingError, match=r"train\.seed = 0, now train\.seed = 1"):
         claim(tmp_path / "step", of(epochs=9, schedule="step", seed=1))
     claim(tmp_path / "cycle", of(epochs=2, schedule="one_cycle"))
+    learn(tmp_path / "cycle")
     with pytest.raises(TrainingError, match=r"one_cycle schedule is planned .*--init .*last\.ckpt"):
         claim(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"))
+
+
+def test_a_run_that_learnt_nothing_gives_way(tmp_path: Path) -> None:
+    """The corrected command may be given again, and nothing of the mistaken one stays."""
+    claim(tmp_path, CONFIG)
+    (tmp_path / "environment.json").write_text("of the mistaken run")
+    (tmp_path / "expected_input.yaml").write_text("of its scans")
+    claim(tmp_path, CONFIG)
+    assert (tmp_path / "expected_input.yaml").exists()  # the same run goes on with what it has
+    other = dataclasses.replace(CONFIG, data=DataConfig(min_points=2))
+    claim(tmp_path, other)
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == to_dict(other)
+    assert "torch" in (tmp_path / "environment.json").read_text()
+    assert not (tmp_path / "expected_input.yaml").exists()
+
+
+@pytest.mark.parametrize("mistake", [{"init": "nosuch.ckpt"}, {"devices": "many"}])
+def test_a_mistyped_start_is_refused_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mistake: dict[str, str]
+) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    monkeypatch.setattr(loop, "DetectionData", lambda *_: pytest.fail("the data were prepared"))
+    with pytest.raises(TrainingError, match="|".join(mistake.values())):
+        train(CONFIG, data, tmp_path / "run", **mistake)  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_damaged_measurement_of_the_input_is_one_line(tmp_path: Path) -> None:

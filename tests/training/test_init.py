@@ -43,3 +43,4 @@ def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.
         with pytest.raises(error, match=message) as caught:
             train(OTHER, data, tmp_path / "refused", init=init)
         assert "\n" not in str(caught.value)
+    assert not (tmp_path / "refused").exists()  # the corrected command finds nothing in its way

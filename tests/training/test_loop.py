@@ -101,6 +101,8 @@ def test_run_folder_and_checkpoint(tmp_path: Path) -> None:
 def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 3)
     claim(tmp_path / "run", CONFIG)
+    (tmp_path / "run" / "checkpoints").mkdir()
+    (tmp_path / "run" / "checkpoints" / "best.ckpt").touch()
     with pytest.raises(TrainingError, match=r"config\.yaml: .* train\.seed = 0, now train\.seed = 1; choose another"):
         train(with_train(seed=1), data, tmp_path / "run")
 

@@ -157,9 +157,9 @@ class BoxSplit:
         return self._levelled(points)
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:
-        """Size and time of the scan, and dataset.yaml."""
+        """Size and time of the scan, and dataset.yaml with the pose that it names."""
         state = self.scan_path(frame_id).stat()
-        return state.st_size, state.st_mtime_ns, zlib.crc32(repr(self.settings).encode())
+        return state.st_size, state.st_mtime_ns, self._settings_crc
 
     def label_types(self, frame_id: str) -> list[str]:
         """The class of each box."""
@@ -184,6 +184,11 @@ class BoxSplit:
             return self.settings.reflectance_scale
         paths = [frame.scan for _, frame in sorted(self._frames.items())]
         return folder_reflectance_scale(paths, columns=self.settings.columns).scale
+
+    @cached_property
+    def _settings_crc(self) -> int:
+        pose = "" if self.settings.pose is None else repr(self.settings.stated_mounting(Path(self.root)).pose)
+        return zlib.crc32(f"{self.settings!r}{pose}".encode())
 
     @cached_property
     def _level(self) -> FrameChange:

@@ -14,11 +14,13 @@ import yaml
 from asca_pillars.data.boxes.box_records import BoxRecords, json_line
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, frame_id_of
 from asca_pillars.data.kitti import write_image_set
-from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict
 
 COMMAND = "asca import"
+MARKER = "# Written by `asca import`, which may replace lists and labels beside it; without this line it does not.\n"
+"""First line of the dataset.yaml of an import: others are written by hand, and so may be the labels beside them."""
 
 
 class ImportedFrame(NamedTuple):
@@ -68,6 +70,21 @@ def renamed(imported: Imported, names: Mapping[str, str]) -> Imported:
     return imported._replace(frames=frames)
 
 
+def require_own_dataset(out: Path) -> None:
+    """Make sure that an import may write into `out`: it is absent, empty, or holds an earlier import.
+
+    Raises:
+        OutputError: it holds something else, such as a dataset that was written by hand.
+    """
+    path = out / DATASET_FILE
+    if path.is_file() and MARKER.strip() not in path.read_text(encoding="utf-8", errors="replace"):
+        raise OutputError(
+            f"{path}: `{COMMAND}` did not write it, and would replace it and the labels beside it; "
+            f"give another OUT, such as {out.parent / out.resolve().name}_imported"
+        )
+    require_own(out, COMMAND, DATASET_FILE)
+
+
 def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCounts:
     """Write dataset.yaml, labels.jsonl, and the lists train and val, which share no recording where there are several.
 
@@ -79,7 +96,7 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
     frames = sorted(imported.frames, key=lambda frame: (frame.recording, frame.scan))
     if not frames:
         raise DatasetError(f"{scans}: no labelled scan there; give the folder that holds the recordings")
-    require_own(out, COMMAND, DATASET_FILE)
+    require_own_dataset(out)
     with atomic_path(out / "labels.jsonl") as temporary, temporary.open("w", encoding="utf-8") as file:
         for frame in frames:
             file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records))
@@ -89,7 +106,7 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
     usual = to_dict(BoxDataset())
     content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
     with atomic_path(out / DATASET_FILE) as temporary:
-        temporary.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        temporary.write_text(MARKER + yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     boxes = Counter(kind for frame in frames for kind in frame.records.types)
     return ImportCounts(len(train), len(val), dict(boxes.most_common()))
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
-from asca_pillars.data.importing.imported import COMMAND, Imported, ImportedFrame
+from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
 from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
 from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path, require_own
+from asca_pillars.files import atomic_path
 
 TOP = 1
 """The roof's sensor."""
@@ -53,9 +53,10 @@ def read_waymo(root: Path, out: Path) -> Imported:
     segments = sorted((root / "lidar").glob("*.parquet"))
     if not segments:
         raise DatasetError(f"{root}: no lidar/*.parquet there; give a folder of Waymo's parquet form")
-    require_own(out, COMMAND, DATASET_FILE)
-    with atomic_path(out / DATASET_FILE):
-        pass  # marks the folder from the start, so that an import that was killed can be given again
+    require_own_dataset(out)
+    with atomic_path(out / DATASET_FILE) as temporary:
+        # It marks the folder from the start, so that an import that was killed can be given again.
+        temporary.write_text(MARKER, encoding="utf-8")
     frames = [frame for path in segments for frame in _frames(root, path, out.resolve() / "scans")]
     return Imported(BoxDataset(sensor_height=0.0, reflectance_scale=1.0, scans=str(out.resolve() / "scans")), frames)
 

@@ -6,11 +6,13 @@ It is built once, by as many processes as are granted, and lies beside the data:
                                .npy        points of all objects, one after the other: (P, 4) float32
                                .npz        boxes, labels, frames, first
 
-The key is a hash of the settings and of the size and time of every file read. Changed data therefore gets another
-name, and what stands under a name never changes. Each file appears whole, the .json last, and two processes that build
-at once write the same bytes. Workers map the points into memory, which they share.
+The key is a hash of the settings, of the size and time of every file read, and of what else the points depend on
+(`points_state`: dataset.yaml). Changed data therefore gets another name, and what stands under a name never changes.
+Each file appears whole, the .json last, and two processes that build at once write the same bytes. Workers map the
+points into memory, which they share.
 """
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
@@ -127,6 +129,8 @@ def _key(split: LabeledSplit, built_from: dict[str, Any]) -> str:
             # A file that is missing is reported, in words, by whoever reads it.
             state = path.stat() if path.exists() else None
             digest.update(f"{path.name} {state and (state.st_size, state.st_mtime_ns)}\n".encode())
+        with contextlib.suppress(FileNotFoundError):
+            digest.update(f"{split.points_state(frame_id)}\n".encode())
     return digest.hexdigest()[:16]
 
 

@@ -18,7 +18,7 @@ from asca_pillars.geometry.detections import Detections
 from asca_pillars.points.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
 from asca_pillars.schema import to_dict
 
-_FORMAT = 1  # of the files; another number lets old ones lie
+_FORMAT = 2  # of the files; another number lets old ones lie
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,8 @@ class ProposalFiles:
 class ProposalCache:
     """Files below `prepared`/proposals-KEY, one for each frame; KEY names the first stage and the settings.
 
+    Each file tells what its frame's points depended on (`points_state`), so that a frame that changed is noticed.
+
     Args:
         prepared: folder of what is computed once per dataset, see `data.insertion.prepared`.
         camera_view: whether the first stage sees only the points in the image.
@@ -68,19 +70,36 @@ class ProposalCache:
         self.files = ProposalFiles(prepared / f"proposals-{key}", stage.spec.class_names)
 
     def fill(self, split: LabeledSplit, *, console: Console | None = None) -> None:
-        """Compute what is missing. Each file appears when it is complete, so that a killed run is simply gone on with.
+        """Compute what is missing or outdated. Each file appears when it is complete, so a killed run just goes on.
 
         Raises:
             DatasetError, ScanError: a frame cannot be read, or a file not written.
         """
-        missing = [frame_id for frame_id in split.frame_ids if not self.files.path(frame_id).is_file()]
-        if missing:
+        todo = [frame_id for frame_id in split.frame_ids if not self._is_current(split, frame_id)]
+        if todo:
             require_writable(self.files.folder)
-        for frame_id in track(missing, "Proposing", console=console, disable=console is None):
+        for frame_id in track(todo, "Proposing", console=console, disable=console is None):
+            stamp = _stamp(split, frame_id)  # before the scan is read: one that changes meanwhile is read again
             points = split.points(frame_id, camera_view=self.camera_view)
             found = propose_on(self.stage, points[np.isfinite(points).all(axis=1)], self.settings)
             with writing(self.files.path(frame_id)) as temporary, temporary.open("wb") as file:
-                np.savez(file, allow_pickle=False, **_arrays(found))
+                np.savez(file, allow_pickle=False, stamp=stamp, **_arrays(found))
+
+    def _is_current(self, split: LabeledSplit, frame_id: str) -> bool:
+        """Whether the frame's file was made from its scan as it is; of the file only the stamp is read."""
+        try:
+            with self.files.path(frame_id).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                return np.array_equal(arrays["stamp"], _stamp(split, frame_id))
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):  # none there, or a damaged one: it is made again
+            return False
+
+
+def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
+    """What tells that the files which the proposals were made from are still the same; empty if one is gone."""
+    try:
+        return np.array(split.points_state(frame_id))
+    except FileNotFoundError:  # reported, in words, by whoever reads it
+        return np.zeros(0, np.int64)
 
 
 def _arrays(found: Proposed) -> dict[str, NDArray[np.generic]]:

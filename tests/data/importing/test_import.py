@@ -13,7 +13,7 @@ from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.nuscenes import read_nuscenes, rotation
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import AscaError, ConfigError, DatasetError, ScanError
+from asca_pillars.errors import AscaError, ConfigError, DatasetError, OutputError, ScanError
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.data.boxes.box_scenes import write_box_dataset
 
@@ -41,6 +41,18 @@ def test_boxes_of_ones_own(tmp_path: Path) -> None:
     assert split.records("000002").track_ids == ("t2",)
     assert split.scan_path("000002").parent == own / "scans"  # referred to, not copied
     run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")  # replaces its own
+
+
+@pytest.mark.parametrize("settings", ["", "axes: y-forward\n"])
+def test_a_dataset_that_was_written_by_hand_stays(tmp_path: Path, settings: str) -> None:
+    """docs/DATA.md tells to write the very files that an import writes, which may be weeks of labels."""
+    own, other = write_box_dataset(tmp_path / "own", 4), write_box_dataset(tmp_path / "other", 2)
+    (own / "dataset.yaml").write_text(settings)
+    before = {path: path.read_bytes() for path in own.rglob("*") if path.is_file()}
+    with pytest.raises(OutputError, match=r"own/dataset\.yaml: .* another OUT, such as /.*/own_imported$") as caught:
+        run(other / "labels.jsonl", own, "--scans", other / "scans")
+    assert "\n" not in str(caught.value)
+    assert {path: path.read_bytes() for path in own.rglob("*") if path.is_file()} == before
 
 
 def test_classes_by_other_names(tmp_path: Path) -> None:

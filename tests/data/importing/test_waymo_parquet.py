@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from asca_pillars.cli import app
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.waymo_parquet import read_waymo
-from asca_pillars.errors import DatasetError
+from asca_pillars.errors import DatasetError, OutputError
 from asca_pillars.geometry.boxes import points_in_boxes
 
 TIMES = (1000, 2000)
@@ -133,13 +133,23 @@ def test_an_import_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert scan.stat().st_mtime_ns == first and (scan.parent / "2000.npy").exists()
 
 
+def test_a_dataset_that_was_written_by_hand_stays(tmp_path: Path) -> None:
+    source = write_segment(tmp_path / "waymo")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "dataset.yaml").write_text("axes: y-forward\n")
+    with pytest.raises(OutputError, match=r"dataset\.yaml: .* give another OUT"):
+        read_waymo(source, tmp_path / "out")
+    assert (tmp_path / "out" / "dataset.yaml").read_text() == "axes: y-forward\n"
+
+
 def test_mistakes_are_named(tmp_path: Path) -> None:
     source = write_segment(tmp_path / "waymo")
     with pytest.raises(DatasetError, match=r"no lidar/\*\.parquet there"):
         read_waymo(tmp_path, tmp_path / "out")
     (source / "lidar_calibration" / "segment.parquet").write_bytes(b"no parquet")
-    with pytest.raises(DatasetError, match=r"lidar_calibration/segment\.parquet: no readable parquet file"):
-        read_waymo(source, tmp_path / "out")
+    for _ in range(2):  # the folder is marked as ours before anything else is read
+        with pytest.raises(DatasetError, match=r"lidar_calibration/segment\.parquet: no readable parquet file"):
+            read_waymo(source, tmp_path / "out")
     (source / "lidar_calibration" / "segment.parquet").write_bytes(
         (source / "lidar_box" / "segment.parquet").read_bytes()
     )

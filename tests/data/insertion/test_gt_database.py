@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion import gt_database
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
 from asca_pillars.data.kitti import KittiObject, KittiSplit, read_labels, write_labels
-from asca_pillars.errors import DatasetError
+from asca_pillars.errors import AscaError, DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
+from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.insertion.simple_streets import TYPES, write_streets
 
 
@@ -79,6 +82,31 @@ def test_it_is_built_once_and_again_when_something_changed(
     assert prepare(split, tmp_path / "prepared").labels.tolist().count(1) == 4
     assert len(set(builds)) == len(builds) == 6
     assert first.labels.tolist().count(1) == 3  # what a run uses stays
+
+
+def test_other_axes_or_another_pose_make_another(tmp_path: Path) -> None:
+    """Scans and labels are the same files, their points and boxes lie elsewhere."""
+    root = write_box_dataset(tmp_path / "own", 2)
+    pose = np.eye(4)
+
+    def boxes(settings: str) -> NDArray[np.float32]:
+        (root / "dataset.yaml").write_text(settings)
+        np.savetxt(root / "pose.txt", pose)
+        return prepare_database(BoxSplit(root), ("Car",), tmp_path / "prepared", camera_view=False).boxes
+
+    straight, turned = boxes(""), boxes("axes: y-forward")
+    assert np.allclose(turned[:, 0], straight[:, 1]) and np.allclose(turned[:, 1], -straight[:, 0])
+    posed = boxes("pose: pose.txt")
+    pose[2, 3] = 1.5
+    assert np.allclose(posed, straight) and np.allclose(boxes("pose: pose.txt")[:, 2], straight[:, 2] + 1.5)
+    assert np.array_equal(boxes(""), straight) and len(list((tmp_path / "prepared").rglob("*.json"))) == 4
+
+
+def test_a_scan_that_is_not_there_is_named(split: KittiSplit, tmp_path: Path) -> None:
+    prepare(split, tmp_path / "prepared")
+    split.scan_path("000001").unlink()
+    with pytest.raises(AscaError, match=r"000001\.bin"):
+        prepare(split, tmp_path / "prepared")
 
 
 def test_it_is_the_same_everywhere(split: KittiSplit, tmp_path: Path) -> None:

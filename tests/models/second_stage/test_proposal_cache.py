@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import DatasetError
+from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.errors import AscaError, DatasetError
 from asca_pillars.models.second_stage.proposal_cache import ProposalCache
 from asca_pillars.points.first_stage import FirstStageSettings, propose_on
+from tests.data.boxes.box_scenes import write_box_dataset
 from tests.models.second_stage.random_stage import SETTINGS, RandomStage
 from tests.scenes import SPEC, write_dataset
 
@@ -40,6 +43,54 @@ def test_only_what_is_missing_is_computed(split: KittiSplit, tmp_path: Path) -> 
     cache.files.path(split.frame_ids[1]).unlink()
     cache.fill(split)
     assert stage.calls == 3
+
+
+def test_frames_that_changed_are_computed_again(split: KittiSplit, tmp_path: Path) -> None:
+    stage = RandomStage()
+    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache.fill(split)
+    write_scan(split.scan_path("000001"), split.points("000000", camera_view=False))
+    cache.fill(split)
+    assert stage.calls == 3
+    found, other = cache.files.read("000001"), cache.files.read("000000")
+    np.testing.assert_array_equal(found.keypoints, other.keypoints)
+    calibration = split.calib_path("000000")
+    calibration.write_text(calibration.read_text() + "\n")
+    cache.fill(split)
+    cache.fill(split)
+    assert stage.calls == 4
+
+
+def test_other_axes_are_other_proposals(tmp_path: Path) -> None:
+    root = write_box_dataset(tmp_path / "own", 2)
+    stage = RandomStage()
+    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache.fill(BoxSplit(root))
+    (root / "dataset.yaml").write_text("axes: y-forward")
+    cache.fill(BoxSplit(root))
+    assert stage.calls == 4
+
+
+def test_a_damaged_file_and_one_that_does_not_tell_are_computed_again(split: KittiSplit, tmp_path: Path) -> None:
+    stage = RandomStage()
+    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache.fill(split)
+    damaged, silent = (cache.files.path(frame_id) for frame_id in split.frame_ids)
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    with np.load(silent) as arrays:
+        kept = {name: arrays[name] for name in arrays.files if name != "stamp"}
+    np.savez(silent, **kept)
+    cache.fill(split)
+    assert stage.calls == 4
+    cache.files.read(split.frame_ids[0])
+
+
+def test_a_scan_that_is_gone_is_named(split: KittiSplit, tmp_path: Path) -> None:
+    cache = ProposalCache(tmp_path, RandomStage(), SETTINGS)
+    cache.fill(split)
+    split.scan_path("000001").unlink()
+    with pytest.raises(AscaError, match=r"000001\.bin"):
+        cache.fill(split)
 
 
 def test_a_killed_run_leaves_no_half_file(split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
