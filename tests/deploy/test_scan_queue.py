@@ -101,7 +101,7 @@ def test_a_stream_after_one_that_failed_has_the_tags_of_its_own_scans(tiny_bundl
     for number in range(5):
         queue.put(make_scan(number)[:, : 3 if number == 1 else 4], tag=number)
     queue.close()
-    tags = []
+    tags: list[int] = []
     with pytest.raises(ScanError):
         tags.extend(queue.next_tag() for _ in detector.stream(queue))
     assert queue.next_tag() == 1, "the scan that failed can be named"
