@@ -104,7 +104,6 @@ def test_a_stream_after_one_that_failed_has_the_tags_of_its_own_scans(tiny_bundl
     tags: list[int] = []
     with pytest.raises(ScanError):
         tags.extend(queue.next_tag() for _ in detector.stream(queue))
-    assert queue.next_tag() == 1, "the scan that failed can be named"
     for detections in detector.stream(queue):
         tags.append(queue.next_tag())
         assert np.array_equal(detections.boxes, detector(make_scan(tags[-1])).boxes)
