@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 from rich.console import Console
 
 from asca_pillars.commands.extras import missing_modules
-from asca_pillars.commands.json_file import require_writable
+from asca_pillars.commands.json_file import require_writable_json
 from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
@@ -67,7 +67,7 @@ def claim(out: Path, json_path: Path | None) -> None:
     require_own(out, COMMAND, *reports, f"predictions/{MADE_BY}", text='"')
     for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
         require_replaceable(out / folder, COMMAND, marker)
-    require_writable(json_path)
+    require_writable_json(json_path)
 
 
 def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: float | None) -> Task:

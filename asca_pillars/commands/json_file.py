@@ -5,7 +5,7 @@ from pathlib import Path
 from asca_pillars.files import atomic_path
 
 
-def require_writable(path: Path | None) -> None:
+def require_writable_json(path: Path | None) -> None:
     """Make sure that minutes of work do not end with a file that cannot be written; None is no file.
 
     Raises:

@@ -20,7 +20,7 @@ def simulate(
             "--frames",
             "-n",
             min=1,
-            help="Frames to write. Default: 100; with --report none where there are scans already.",
+            help=f"Frames to write. Default: {FRAMES}; with --report none where there are scans already.",
         ),
     ] = None,
     sequences: Annotated[
@@ -34,7 +34,7 @@ def simulate(
     ] = None,
     length: Annotated[
         int | None,
-        typer.Option("--length", min=1, help="With --sequences: scans of each; 10 make a second. Default: 100."),
+        typer.Option("--length", min=1, help=f"With --sequences: scans of each; 10 make a second. Default: {LENGTH}."),
     ] = None,
     seed: Annotated[
         int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number of workers.")

@@ -2,7 +2,6 @@
 
 import copy
 import json
-import pickle
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 from asca_pillars.geometry.detections import Detection, Detections
 from tests.cameras import make_calibration
+from tests.sent import sent
 
 THREE = Detections(
     boxes=np.array([[3.0, -4.0, 0, 4, 2, 1.5, 0], [8, 6, 0, 1, 1, 2, 1], [-5, 12, 0, 2, 1, 2, 2]], np.float32),
@@ -100,8 +100,8 @@ def test_no_report_without_a_detector() -> None:
         _ = THREE.report
 
 
-def test_they_survive_pickling_and_copying() -> None:
-    for other in (pickle.loads(pickle.dumps(THREE)), copy.deepcopy(THREE)):  # noqa: S301
+def test_they_can_be_copied_and_sent_to_other_processes() -> None:
+    for other in (sent(THREE), copy.deepcopy(THREE)):
         assert list(other) == list(THREE) and other.class_names == THREE.class_names
 
 
