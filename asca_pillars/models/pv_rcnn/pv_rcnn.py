@@ -112,7 +112,8 @@ class PvRcnn(nn.Module):
         """Voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
         levels = self.voxels(batch.features, batch.levels)
         canvas = self.scatter(levels[-1], batch.levels[-1].cells, len(batch.frame_keypoints))
-        maps: HeadMaps[Tensor] = self.head(self.neck(canvas.permute(0, 3, 1, 2)))
+        # Contiguous, because the backward pass of convolutions with channels last takes twice as long on CPUs.
+        maps: HeadMaps[Tensor] = self.head(self.neck(canvas.permute(0, 3, 1, 2).contiguous()))
         return FirstStageOutputs(levels, canvas, maps)
 
     def scatter(self, features: Tensor, cells: Tensor, frames: int) -> Tensor:
