@@ -138,6 +138,14 @@ VARIANTS = {
         Variant("asp_k3_pooled_cpa_channel_fine", zones=3, cpa="channel", map="pooled", neck="sparse"),
         Variant("cpa_channel_lower_ious", cpa="channel", person_ious=(0.35, 0.2)),
         Variant("cpa_channel_fine_lower_ious", cpa="channel", neck="sparse", person_ious=(0.35, 0.2)),
+        Variant(
+            "asp_k3_pooled_cpa_channel_fine_lower_ious",
+            zones=3,
+            cpa="channel",
+            map="pooled",
+            neck="sparse",
+            person_ious=(0.35, 0.2),
+        ),
         Variant("cpa_channel_fine_atss", cpa="channel", neck="sparse", assigner="atss"),
         Variant("cpa_channel_fine_iou_score", cpa="channel", neck="sparse", score_target="iou"),
         Variant("cpa_channel_fine_atss_iou_score", cpa="channel", neck="sparse", assigner="atss", score_target="iou"),
@@ -158,6 +166,7 @@ PILLARS = Family(
         "Map and neck": (
             *("cpa_channel", "asp_k3_cpa_channel", "asp_k3_pooled_cpa_channel"),
             *("cpa_channel_sub", "cpa_channel_fine", "asp_k3_cpa_channel_fine", "asp_k3_pooled_cpa_channel_fine"),
+            *("cpa_channel_fine_lower_ious", "asp_k3_pooled_cpa_channel_fine_lower_ious"),
         ),
         "Matching, and what scores are to be": (
             *("cpa_channel", "cpa_channel_lower_ious", "cpa_channel_fine", "cpa_channel_fine_lower_ious"),
