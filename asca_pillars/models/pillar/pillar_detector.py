@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.models.map_layers import as_map
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
 from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pillar.loss import detection_loss, targets_at
@@ -137,9 +138,8 @@ class PillarDetector(nn.Module):
         frames, channels = len(frame_cells), features.shape[1]
         frame_starts = cells.new_tensor([frame * rows * columns for frame in range(frames)])
         row = cells + frame_starts.repeat_interleave(cells.new_tensor(frame_cells))
-        # Channels last in memory: a pillar is one contiguous row here, and convolutions on a CPU prefer it.
         canvas = features.new_zeros(frames * rows * columns, channels).index_put((row,), features)
-        return canvas.view(frames, rows, columns, channels).permute(0, 3, 1, 2)
+        return as_map(canvas.view(frames, rows, columns, channels))
 
 
 def build_pillar_detector(model: PillarModel) -> PillarDetector:

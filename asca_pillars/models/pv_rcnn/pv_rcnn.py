@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
+from asca_pillars.models.map_layers import as_map, convolution_block, joined_maps, upsampling
 from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pv_rcnn.adaptive_scales import AdaptiveScales
 from asca_pillars.models.pv_rcnn.deformation import AuthorsDeformation, PaperDeformation, Surroundings
@@ -112,8 +112,7 @@ class PvRcnn(nn.Module):
         """Voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
         levels = self.voxels(batch.features, batch.levels)
         canvas = self.scatter(levels[-1], batch.levels[-1].cells, len(batch.frame_keypoints))
-        # Contiguous, because the backward pass of convolutions with channels last takes twice as long on CPUs.
-        maps: HeadMaps[Tensor] = self.head(self.neck(canvas.permute(0, 3, 1, 2).contiguous()))
+        maps: HeadMaps[Tensor] = self.head(self.neck(as_map(canvas)))
         return FirstStageOutputs(levels, canvas, maps)
 
     def scatter(self, features: Tensor, cells: Tensor, frames: int) -> Tensor:
