@@ -23,7 +23,7 @@ from asca_pillars.config import load_config
 from asca_pillars.evaluation.report import markdown_table
 from asca_pillars.models.build import build_model
 from asca_pillars.system import cpu_model
-from asca_pillars.training.bfloat16 import computes_in_bfloat16
+from asca_pillars.training.bfloat16 import settled
 from asca_pillars.training.dataset import open_dataset
 
 WARM_UP = 3
@@ -42,7 +42,7 @@ def main(
     model = build_model(settings.model).to(device)
     model.train()
     optimizer = torch.optim.Adam(model.parameters(), lr=settings.train.learning_rate)
-    size, in_bfloat16 = settings.train.batch_size, computes_in_bfloat16(settings.train.precision, device)
+    size, in_bfloat16 = settings.train.batch_size, settled(settings.train.precision, device) == "bf16"
     clock = time.process_time if device == "cpu" else time.perf_counter  # other jobs on a CPU do not count
     loading, stepping = [], []
     for number in track(range(batches + WARM_UP), "Measuring"):

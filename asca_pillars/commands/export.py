@@ -112,7 +112,7 @@ def export(
     from rich.console import Console
 
     from asca_deploy.bundle import MANIFEST, AnyBundle
-    from asca_export.exporter import export_bundle
+    from asca_export.exporter import export_bundle, require_maskable
     from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
     from asca_export.refine_exporter import export_refine_bundle
     from asca_pillars.commands.export_steps import (
@@ -140,10 +140,8 @@ def export(
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
     kind = loaded.config.model.kind
-    if dense_neck and kind != "pillar":
-        raise ConfigError(
-            f"--dense-neck: {checkpoint} is of kind {kind}, and only kind pillar has that form; leave it out"
-        )
+    if dense_neck:
+        require_maskable(loaded.config.model, int8=int8)
     kinds: dict[str, Callable[..., AnyBundle]] = {
         "pillar": partial(export_bundle, dense_neck=dense_neck),
         "pillar_refine": export_refine_bundle,

@@ -56,6 +56,7 @@ def inspect(
 
     from asca_pillars.commands import inspect_tables as show
     from asca_pillars.commands.inspect_pictures import draw_frames
+    from asca_pillars.commands.json_file import require_writable_json
     from asca_pillars.commands.propose_config import propose_config
     from asca_pillars.config import load_config
     from asca_pillars.data.inspection.findings import findings
@@ -65,6 +66,7 @@ def inspect(
     from asca_pillars.errors import ConfigError, DatasetError
     from asca_pillars.files import write_json
 
+    require_writable_json(json)
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
     frames_of = open_split(data, settings.data.train_set if split is None else split)

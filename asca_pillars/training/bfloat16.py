@@ -15,6 +15,8 @@ def has_bfloat16(device: str | None = None) -> bool:
     return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())  # oneDNN's own answer, which has no public name
 
 
-def computes_in_bfloat16(precision: Precision, device: str | None = None) -> bool:
-    """What `train.precision` means on a device, see `has_bfloat16`."""
-    return precision == "bf16" or (precision == "auto" and has_bfloat16(device))
+def settled(precision: Precision, device: str | None = None) -> Precision:
+    """`auto` as what suits a device, others as they are, see `has_bfloat16`."""
+    if precision != "auto":
+        return precision
+    return "bf16" if has_bfloat16(device) else "fp32"

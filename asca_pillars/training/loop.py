@@ -25,12 +25,12 @@ from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint, save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
-from asca_pillars.training.bfloat16 import computes_in_bfloat16, has_bfloat16
+from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import LAST, AtomicCheckpointIO, LastCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule
-from asca_pillars.training.run_folder import claim, measure_input
+from asca_pillars.training.run_folder import claim, measure_input, recorded_precision
 
 SANITY_STEPS = 2  # validation batches that run before the first training step
 
@@ -80,6 +80,7 @@ def train(
     config = replace(config, data=replace(config.data, camera_view=view))
     recover(checkpoints, again=True)  # another process may have been killed there since
     resumed, damage = checkpoint_to_resume(checkpoints)
+    config = replace(config, train=_with_settled_precision(config.train, out, resumes=resumed is not None))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     # What may be mistyped is looked at before minutes of work, and before the folder is that of this run.
     weights = None if init is None or resumed is not None else _fitting_weights(config, init)
@@ -95,7 +96,8 @@ def train(
     if damage is not None and resumed is not None:
         say(f"{damage}: going on from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():
-        say("train.precision = bf16: this device has no bfloat16 and is many times slower in it; choose auto or fp32")
+        remedy = "choose auto or fp32" if resumed is None else f"go on where {out} was started, or anew with --init"
+        say(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
     module = DetectionModule(config, measure_input(out, data.training_set.frames))
     if weights is not None:
@@ -116,6 +118,13 @@ def train(
             if trainer.is_global_zero and (checkpoints / LAST).is_file():
                 save_weights(checkpoints / LAST, checkpoints / WEIGHTS)
     return checkpoints / LAST
+
+
+def _with_settled_precision(recipe: TrainConfig, out: Path, *, resumes: bool) -> TrainConfig:
+    """`auto` becomes what the run in `out` computes in, so that it goes on exactly, or what suits the device."""
+    auto = recipe.precision == "auto"
+    precision = recorded_precision(out) if auto and resumes else recipe.precision
+    return replace(recipe, precision=settled(precision))
 
 
 def _trainer(
@@ -139,7 +148,7 @@ def _trainer(
         return L.Trainer(
             default_root_dir=out,
             max_epochs=recipe.epochs,
-            precision="bf16-mixed" if computes_in_bfloat16(recipe.precision) else "32-true",
+            precision="bf16-mixed" if recipe.precision == "bf16" else "32-true",
             gradient_clip_val=recipe.gradient_clip or None,
             num_sanity_val_steps=SANITY_STEPS,
             sync_batchnorm=torch.cuda.is_available(),  # there is no such thing on a CPU

@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 from rich.progress import track
 
-from asca_pillars.config import Config, load_config
+from asca_pillars.config import Config, Precision, load_config
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.measure_input import measure_expected_input
@@ -45,6 +45,11 @@ def claim(out: Path, config: Config) -> None:
         temporary.write_text(yaml.safe_dump(to_dict(config), sort_keys=False), encoding="utf-8")
 
 
+def recorded_precision(out: Path) -> Precision:
+    """Which `train.precision` the run in `out` was started with; `auto` if it is of a version that wrote it down so."""
+    return load_config(out / "config.yaml").train.precision
+
+
 def measure_input(out: Path, frames: TrainingFrames) -> ExpectedInput:
     """What up to EXPECTED_INPUT_FRAMES evenly spaced training scans look like; kept in `out` for a resumed run.
 
@@ -73,6 +78,8 @@ def _why_another(path: Path, config: Config) -> str | None:
     """In what words `config` is another run than the one that `path` is of; None if it is the same, or longer."""
     found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
     found = to_dict(found_config)
+    if found_config.train.precision == "auto":  # of an older version, which did not write down what it became
+        found["train"]["precision"] = config.train.precision
     longer = config.train.epochs > found_config.train.epochs
     if longer and config.train.schedule == "step":
         found["train"]["epochs"] = config.train.epochs

@@ -32,7 +32,7 @@ from asca_export.masked_forms import MarkedEncoder, MaskedBackbone
 from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
-from asca_pillars.config import pillar_spec
+from asca_pillars.config import ModelConfig, pillar_spec
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.errors import ExportError
 from asca_pillars.files import atomic_directory
@@ -86,7 +86,7 @@ def export_bundle(
     if not (isinstance(config.model, PillarModel) and isinstance(detector, PillarDetector)):
         raise ExportError(f"model.kind {config.model.kind}: only pillar detectors can be exported")
     if dense_neck:
-        _require_maskable(config.model.network.neck, calibration)
+        require_maskable(config.model, int8=calibration is not None)
     if calibration is not None:
         calibration_scans(calibration, scans, config.model.spec)  # too few are told before the work, not after it
     progress("Exporting and proving parity")
@@ -114,6 +114,20 @@ def require_parity_scans(scans: Sequence[NDArray[np.float32]]) -> None:
     """
     if len(scans) < MIN_SCANS:
         raise ExportError(f"{len(scans)} scans given to prove parity on, at least {MIN_SCANS} are needed; add --scans")
+
+
+def require_maskable(model: ModelConfig, *, int8: bool) -> None:
+    """Refuse the form of dense convolutions with masks where there is none.
+
+    Raises:
+        ExportError: `model` is not a pillar detector with a sparse neck, or it is to be in 8 bits.
+    """
+    if not isinstance(model, PillarModel):
+        raise ExportError(f"--dense-neck: only kind pillar has that form, this is kind {model.kind}; leave it out")
+    if model.network.neck == "dense":
+        raise ExportError("--dense-neck: the neck of this model is dense; leave it out")
+    if int8:
+        raise ExportError("--dense-neck with --int8: its form is float32 alone; leave one of them out")
 
 
 def draft_bundle(
@@ -187,13 +201,6 @@ def provenance(checkpoint: Checkpoint, trained_on: str, command: str) -> Provena
         machine=cpu_model(),
         weights_sha256=weights_sha256(checkpoint.detector.state_dict()),
     )
-
-
-def _require_maskable(neck: str, calibration: Sequence[NDArray[np.float32]] | None) -> None:
-    if neck == "dense":
-        raise ExportError("--dense-neck: the neck of this model is dense; leave it out")
-    if calibration is not None:
-        raise ExportError("--dense-neck with --int8: its form is float32 alone; leave one of them out")
 
 
 def _export_graphs(

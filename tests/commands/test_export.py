@@ -59,6 +59,11 @@ def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path
     assert weights_sha256(weights) == weights_sha256(kept)
 
 
+def test_what_has_no_masked_form_is_refused_before_scans_are_read(with_weights: Path, tmp_path: Path) -> None:
+    refused = run_here("export", with_weights, "--dense-neck", "--int8", "-o", tmp_path / "out", "--scans", "/nowhere")
+    assert refused.returncode == 2 and "--dense-neck with --int8" in refused.stderr
+
+
 def test_what_cannot_be_exported_is_one_line(with_weights: Path, scans: Path, tmp_path: Path) -> None:
     out, tail = tmp_path / "out", ("-o", tmp_path / "out", "--scans", scans)
     for arguments, said in (

@@ -8,7 +8,7 @@ import torch
 
 from asca_pillars.config import Precision, load_config
 from asca_pillars.training import bfloat16
-from asca_pillars.training.bfloat16 import computes_in_bfloat16, has_bfloat16
+from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.loop import train
 from tests.scenes import write_dataset
 from tests.test_config import CONFIGS
@@ -16,15 +16,15 @@ from tests.training.test_loop import CONFIG
 
 
 @pytest.mark.parametrize(
-    ("precision", "with_it", "without"), [("auto", True, False), ("bf16", True, True), ("fp32", False, False)]
+    ("precision", "with_it", "without"), [("auto", "bf16", "fp32"), ("bf16", "bf16", "bf16"), ("fp32", "fp32", "fp32")]
 )
 def test_auto_follows_the_device(
-    precision: Precision, with_it: bool, without: bool, monkeypatch: pytest.MonkeyPatch
+    precision: Precision, with_it: Precision, without: Precision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: True)
-    assert computes_in_bfloat16(precision) is with_it
+    assert settled(precision) == with_it
     monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: False)
-    assert computes_in_bfloat16(precision) is without
+    assert settled(precision) == without
 
 
 def test_a_gpu_answers_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,6 +52,24 @@ def test_bf16_where_there_is_none_is_said(
     config = replace(CONFIG, train=replace(CONFIG.train, epochs=1, precision="bf16"))
     train(config, write_dataset(tmp_path / "data", 3), tmp_path / "run")
     assert "train.precision = bf16: this device has no bfloat16" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("written", ["fp32", "auto"])  # auto: by an older version
+def test_a_run_goes_on_in_the_precision_it_was_started_in(
+    written: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(CONFIG, train=replace(CONFIG.train, epochs=1, precision="auto"))
+    data, run = write_dataset(tmp_path / "data", 3), tmp_path / "run"
+    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: False)
+    train(config, data, run)
+    path = run / "config.yaml"
+    assert load_config(path).train.precision == "fp32"
+
+    path.write_text(path.read_text().replace("precision: fp32", f"precision: {written}"))
+    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: True)
+    train(replace(config, train=replace(config.train, epochs=2)), data, run)
+
+    assert load_config(path).train.precision == {"fp32": "fp32", "auto": "bf16"}[written]
 
 
 def test_configurations_that_ship_run_anywhere() -> None:

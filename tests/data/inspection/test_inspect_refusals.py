@@ -12,7 +12,7 @@ from asca_pillars.commands.inspect import inspect
 from asca_pillars.config import Config, pillar_spec
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import DatasetError
+from asca_pillars.errors import DatasetError, OutputError
 from asca_pillars.schema import to_dict
 from tests.data.inspection.conftest import FRAMES
 from tests.data.inspection.test_inspect_dataset import CONFIG, change_files, inspected, with_data, with_grid
@@ -87,3 +87,13 @@ def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path)
     split.label_path("000002").unlink()
     with pytest.raises(DatasetError, match=r"calib.000001.txt: not there \(2 of 24 calibration and label files"):
         inspected(data, CONFIG, frames=1)
+
+
+def test_a_json_that_cannot_be_written_is_told_before_the_work(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "asca_pillars.data.inspection.inspect_dataset.inspect_dataset", lambda *_, **__: pytest.fail("too late")
+    )
+    with pytest.raises(OutputError, match="is a folder; choose a file's name"):
+        inspect(data, config=Path("asca_sim"), json=tmp_path)
