@@ -31,11 +31,12 @@ from asca_pillars.commands.scan_input import said_of_scale
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.recordings.odometry import Poses, read_poses
-from asca_pillars.data.recordings.open_recording import open_recording
+from asca_pillars.data.recordings.open_recording import open_recording, recording_files
 from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.data.scan_settings import SAMPLE_SCANS, ScanSettings
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.files import atomic_path, require_own
+from asca_pillars.schema import to_dict
 
 KITTI_FILE = "tracks.txt"
 ABOUT_FILE = "recording.json"
@@ -79,6 +80,7 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     if task.odometry is not None and not task.track:
         raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
     poses = None if task.odometry is None else read_poses(recording, task.odometry)
+    damages = {recording.damage}
     scans = RecordedScans(recording, topic, reading.reflectance_scale)
     said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
     mounting, estimate = reading.mounting(scan.points for scan in scans.first(SAMPLE_SCANS))
@@ -89,7 +91,7 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     births = _thresholds(options.bundle, task.score)
     least = WEAK_SHARE * min(births.values()) if task.track else task.score
     detector = open_detector(options, least, mounting, around=task.around)
-    about = _about(task, reading, detector, topic.name, least)
+    about = _about(task, reading, mounting, detector, topic.name, least)
     with Journal(task.out, about, detector.spec.class_names) as journal:
         if journal.done:
             console.print(f"going on after the {journal.done} scans that {journal.path} holds", soft_wrap=True)
@@ -99,15 +101,17 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
             pass
         seconds = process_time() - start
         tracker = Tracker(birth_score=births) if task.track else None
-        damage = recording.damage
+        damages.add(recording.damage)
         if all(one.detections is None for one in journal.results()):
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{run.first()}")
+        if poses is not None:
+            _check_times(poses, journal, f"{task.path}, {task.odometry}", console)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
         _write(task, results, scans, calibration, about)
         journal.remove()
     _tell(task, run, detector, seconds, console)
-    if damage or run.troubles:
-        raise ScanError("; ".join([*([damage] if damage else []), *run.skipped()]))
+    if told := [*sorted(filter(None, damages)), *run.skipped()]:
+        raise ScanError("; ".join(told))
 
 
 class _Run:
@@ -168,11 +172,29 @@ def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
     return {one.name: one.score_threshold if score is None else score for one in spec.classes}
 
 
+def _check_times(poses: Poses, journal: Journal, place: str, console: Console) -> None:
+    """Say that the odometry does not last as long as the scans; ScanError if it is of another time."""
+    times = [one.time_ns for one in journal.results() if one.detections is not None]
+    outside = [time for time in times if not poses.covers(time)]
+    if not outside:
+        return
+    began, ended = ((int(poses.times_ns[end]) - min(times)) / 1e9 for end in (0, -1))
+    said = f"{place}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {len(outside)} of {len(times)} scans"
+    if len(outside) == len(times):
+        raise ScanError(f"{said} are at other times, as of another clock; leave --odometry out")
+    console.print(f"{said} lie outside, with wrong velocities over ground", style="yellow", soft_wrap=True)
+
+
 def _about(
-    task: RecordingTask, reading: ScanSettings, detector: Detector, topic: str, least: float | None
+    task: RecordingTask,
+    reading: ScanSettings,
+    mounting: Mounting,
+    detector: Detector,
+    topic: str,
+    least: float | None,
 ) -> dict[str, Any]:
     """All that detections depend on: a journal of anything else is not gone on with."""
-    files = sorted(task.path.iterdir()) if task.path.is_dir() else [task.path]
+    files = recording_files(task.path)
     ranges = detector.spec.ranges
     return {
         "recording": str(task.path),
@@ -183,6 +205,7 @@ def _about(
         "score": least,
         "around": task.around,
         "ranges_m": None if task.around else [list(ranges.x_m), list(ranges.y_m)],
+        "mounting": to_dict(mounting),  # what the files that `reading` names had in them
         "reading": {name: None if value is None else str(value) for name, value in asdict(reading).items()},
     }
 

@@ -23,6 +23,7 @@ from asca_pillars.data.boxes.box_records import read_frames
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError, ConfigError, OutputError, ScanError
+from benchmarks.made_recordings import write_recording
 from tests.data.recordings.cloud_recordings import laid_out, odometry_message, stamps, write_mcap
 from tests.in_process import run_here
 from tests.scenes import write_dataset
@@ -78,7 +79,9 @@ def test_tracks_last_and_move(drive: Path, tmp_path: Path) -> None:
     assert len(list(read_frames(tmp_path / "detections.jsonl"))) == SCANS, "other tools read the lines"
 
 
-def test_with_odometry_what_stands_still_has_no_speed(drive: Path, tmp_path: Path) -> None:
+def test_with_odometry_what_stands_still_has_no_speed(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The scans of `drive` are those of a car that drives 5 m/s past things that stand still."""
     messages = [
         (time_ns, laid_out(POINTS - np.array([0.5 * i, 0, 0, 0], np.float32), time_ns=time_ns))
@@ -92,6 +95,13 @@ def test_with_odometry_what_stands_still_has_no_speed(drive: Path, tmp_path: Pat
     lines = run(path, tmp_path / "out", track=True, odometry="/odom")
     speeds = [np.hypot(box["vx_mps"], box["vy_mps"]) for box in lines[-1]["boxes"] if box["class"] == "Car"]
     assert len(speeds) >= 3 and np.median(speeds) < 1
+    late = [(time_ns + 37 * 10**9, odometry_message(time_ns + 37 * 10**9, 0.0)) for time_ns in stamps(SCANS)]
+    other = write_mcap(tmp_path / "other.mcap", {"/lidar": messages}, odometry=late)
+    with pytest.raises(ScanError, match=r"from \+37.0 to \+37.4 s of the first scan; 5 of 5 scans are at other times"):
+        run(other, tmp_path / "other", track=True, odometry="/odom")
+    short = write_mcap(tmp_path / "short.mcap", {"/lidar": messages}, odometry=poses[:2])
+    run(short, tmp_path / "short", track=True, odometry="/odom")
+    assert "2 of 5 scans lie outside" in " ".join(capsys.readouterr().out.split())
     with pytest.raises(ConfigError, match="give --track"):
         run(path, tmp_path / "out", odometry="/odom")
     with pytest.raises(ScanError, match="/lidar holds no nav_msgs/msg/Odometry; there is /odom"):
@@ -213,17 +223,43 @@ def test_after_sigkill(drive: Path, undisturbed: Path, tmp_path: Path) -> None:
     assert outputs(out) == outputs(undisturbed)
 
 
+def _dies(*_: object) -> Iterator[None]:
+    raise KeyboardInterrupt
+
+
 def test_a_journal_of_other_settings_is_not_gone_on_with(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def dies(*_: object) -> Iterator[None]:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "tracked", dies)
+        patch.setattr(steps, "tracked", _dies)
         run(drive, tmp_path, score=0.9)
     assert (tmp_path / JOURNAL_FILE).exists()
     assert min(box["score"] for line in run(drive, tmp_path, score=0.5) for box in line["boxes"]) < 0.9
+
+
+def test_a_journal_of_another_pose_is_not_gone_on_with(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pose = tmp_path / "pose.txt"
+    pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(steps, "tracked", _dies)
+        run(drive, tmp_path / "out", pose=pose)
+    pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0.5\n0 0 0 1\n")
+    detected: list[int] = []
+    add = Journal.add
+    monkeypatch.setattr(Journal, "add", lambda self, result: detected.append(result.number) or add(self, result))
+    run(drive, tmp_path / "out", pose=pose)
+    assert len(detected) == SCANS
+
+
+def test_results_in_the_folder_of_a_bag_are_no_part_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_recording(tmp_path / "bag", iter([(time_ns, POINTS) for time_ns in stamps(2)]))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(steps, "tracked", _dies)
+        run(tmp_path / "bag", tmp_path / "bag" / "results")
+    monkeypatch.setattr(Journal, "add", lambda *_: pytest.fail("begun anew"))
+    assert len(run(tmp_path / "bag", tmp_path / "bag" / "results")) == 2
 
 
 def test_two_runs_at_once_do_not_share_a_folder(drive: Path, tmp_path: Path) -> None:

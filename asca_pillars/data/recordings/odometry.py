@@ -14,6 +14,9 @@ _Doubles = NDArray[np.float64]
 
 ODOMETRY_TYPES = ("nav_msgs/msg/Odometry", "nav_msgs/Odometry")
 
+BEYOND_NS = 200_000_000
+"""How long before the first and after the last pose a scan may be: as long as two at 10 Hz."""
+
 
 @dataclass(frozen=True)
 class Poses:
@@ -25,6 +28,10 @@ class Poses:
     """(N, 3)."""
     quaternions: _Doubles
     """(N, 4) x, y, z, w of length 1, each the nearer one of two to that before."""
+
+    def covers(self, time_ns: int) -> bool:
+        """Whether a time lies between the first and the last pose, or hardly beyond."""
+        return bool(self.times_ns[0] - BEYOND_NS <= time_ns <= self.times_ns[-1] + BEYOND_NS)
 
     def at(self, time_ns: int) -> _Doubles:
         """The (4, 4) matrix, metres, at a time: between two poses by their shares, before and after all the nearest."""

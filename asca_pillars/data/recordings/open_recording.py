@@ -6,7 +6,7 @@ from pathlib import Path
 from asca_pillars.data.recordings.mcap_files import McapRecording
 from asca_pillars.data.recordings.recording import Recording
 from asca_pillars.data.recordings.ros_bags import RosBag
-from asca_pillars.data.scans.find_scans import natural_order
+from asca_pillars.data.scans.find_scans import is_scan, natural_order
 from asca_pillars.errors import ScanError
 
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -20,17 +20,27 @@ def is_recording(path: Path) -> bool:
     return path.suffix.lower() in RECORDING_SUFFIXES
 
 
+def recording_files(path: Path) -> list[Path]:
+    """The files that a recording consists of, sorted; a folder may hold others, such as results."""
+    if not path.is_dir():
+        return [path]
+    names = METADATA_FILE, *(f"*{suffix}*" for suffix in (".mcap", ".db3"))  # compressed ones have two suffixes
+    return sorted(file for name in names for file in path.glob(name) if file.is_file())
+
+
 def open_recording(path: Path) -> Recording:
     """Open a recording.
 
     Raises:
-        ScanError: nothing is there, or it cannot be read.
+        ScanError: nothing is there, it cannot be read, or it lies among scans.
     """
     if not path.exists():
         raise ScanError(f"{path}: no such file or folder; check the path")
     if path.is_dir():
         files = _files(path)
         if not (path / METADATA_FILE).is_file():
+            if scan := next((file for file in sorted(path.iterdir()) if is_scan(Path(file.name))), None):
+                raise ScanError(f"{path}: holds {files[0].name} and scans such as {scan.name}; give one or the other")
             if len(files) == 1:
                 return open_recording(files[0])
             raise ScanError(

@@ -31,7 +31,7 @@ def find_scans(path: str | Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise ScanError(f"{path}: no such file or folder; check the path")
-    scans = [entry for entry in path.rglob("*") if _is_scan(entry.relative_to(path)) and entry.is_file()]
+    scans = [entry for entry in path.rglob("*") if is_scan(entry.relative_to(path)) and entry.is_file()]
     if not scans:
         raise ScanError(f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}")
     return sorted(scans, key=natural_order)
@@ -69,7 +69,8 @@ def _where_shared(names: Sequence[Path], others: Sequence[Path]) -> list[Path]:
     return [other if counts[name] > 1 else name for name, other in zip(names, others, strict=True)]
 
 
-def _is_scan(relative: Path) -> bool:
+def is_scan(relative: Path) -> bool:
+    """Whether it is a scan by its name; `relative` to the folder that is searched."""
     if relative.suffix.lower() == ".feather" and not relative.stem.isdecimal():
         return False  # Argoverse 2 names sweeps by their time; its labels and poses are feather files too
     return relative.suffix.lower() in SCAN_SUFFIXES and not any(part.startswith(".") for part in relative.parts)

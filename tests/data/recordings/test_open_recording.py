@@ -49,6 +49,14 @@ def test_compressed_rosbag2(tmp_path: Path, storage: str, mode: str) -> None:
     assert [one.time_ns for one in scans] == times and all(one.scan is not None for one in scans)
 
 
+def test_a_recording_among_scans_is_refused(tmp_path: Path) -> None:
+    write_recording(tmp_path / "drive.mcap", iter([(stamps(1)[0], cloud_points(0))]))
+    np.save(tmp_path / "a.npy", cloud_points(0))
+    assert is_recording(tmp_path)
+    with pytest.raises(ScanError, match=r"holds drive\.mcap and scans such as a\.npy; give one or the other"):
+        open_recording(tmp_path)
+
+
 def test_a_suffix_in_capitals(tmp_path: Path) -> None:
     path = tmp_path / "DRIVE.BAG"
     write_recording(tmp_path / "drive.bag", iter([(stamps(1)[0], cloud_points(0))]))
