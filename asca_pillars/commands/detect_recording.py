@@ -202,6 +202,7 @@ def _about(
         "topic": topic,
         "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         "runs_on": detector.runs_on,
+        "classes": list(detector.spec.class_names),
         "score": least,
         "around": task.around,
         "ranges_m": None if task.around else [list(ranges.x_m), list(ranges.y_m)],

@@ -85,7 +85,7 @@ def test_scans_of_another_mounting_are_brought_to_the_models(tmp_path: Path) -> 
         (root / "labels.jsonl").write_text(json_line("1.bin", records_from(own, ["Car"])))
         (root / "dataset.yaml").write_text(text)
         run("--data", root, "--split", "training", "--out", tmp_path / f"{name}_out", "--around")
-        ((_, records, _),) = read_frames(tmp_path / f"{name}_out" / "predictions" / "detections.jsonl")
+        ((_, records, *_),) = read_frames(tmp_path / f"{name}_out" / "predictions" / "detections.jsonl")
         found.append(records)
     plain, other = found
     sure = plain.scores > 0.5

@@ -44,11 +44,15 @@ class BoxRecords(NamedTuple):
 
 
 class NamedRecords(NamedTuple):
-    """Records of a frame, the scan that they are said to belong to, and where they stand: FILE:LINE."""
+    """Records of a frame, the scan that they are said to belong to, and where they stand: FILE:LINE.
+
+    `time_s` is the frame's time stamp, None where a line has none.
+    """
 
     scan: str
     records: BoxRecords
     place: str
+    time_s: float | None = None
 
 
 def read_frames(path: Path) -> Iterator[NamedRecords]:
@@ -124,7 +128,9 @@ def _json_lines(path: Path) -> Iterator[NamedRecords]:
         scan = content.get("scan") if isinstance(content, dict) else None
         if not isinstance(scan, str) or not scan:
             raise DatasetError(f'{place}: no "scan"; a line is {{"scan": "NAME.bin", "boxes": [...]}}')
-        yield NamedRecords(scan, _json_records(content, place), place)
+        time_s = content.get("time_s")
+        timed = isinstance(time_s, int | float) and not isinstance(time_s, bool) and math.isfinite(time_s)
+        yield NamedRecords(scan, _json_records(content, place), place, float(time_s) if timed else None)
 
 
 def _json_records(content: Any, place: str) -> BoxRecords:

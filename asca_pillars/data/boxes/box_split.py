@@ -228,7 +228,7 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
     if labels.suffix.lower() == ".csv":
         nothing = records_from(np.zeros((0, 7)), ())
         frames = {frame_id_of(path, scans): BoxFrame(path, labels, nothing) for path in find_scans(scans)}
-    for scan, records, place in read_frames(labels):
+    for scan, records, place, _ in read_frames(labels):
         path = _find_scan(scan, scans, place)
         frame_id = frame_id_of(path, scans)
         if frame_id in places:

@@ -90,7 +90,7 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
 def _by_frame(path: Path, frame_ids: set[str]) -> tuple[dict[str, BoxRecords], Sequence[str]]:
     predictions: dict[str, BoxRecords] = {}
     places: dict[str, str] = {}
-    for scan, records, place in read_frames(path):
+    for scan, records, place, _ in read_frames(path):
         if np.isnan(records.scores).any():
             number = int(np.isnan(records.scores).argmax()) + 1
             raise DatasetError(f"{place}, box {number}: no `score`; every prediction needs one")

@@ -1,14 +1,17 @@
 """Tracking metrics of a run over simulated (or otherwise labelled) sequences: HOTA, MOTA, switches, fragmentations."""
 
 import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from asca_pillars.data.boxes.box_records import NamedRecords, read_frames
 from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.boxes.box_predictions import frame_of_scan
 from asca_pillars.evaluation.report import TextTable
@@ -40,6 +43,8 @@ class TrackingReport:
     scores: Sequence[ClassScore]
     frames: int
     frames_found: int
+    not_scored: dict[str, int]
+    """How many labels there are of each class that is not scored, because the detector does not know it."""
     about: dict[str, Any]
 
 
@@ -59,7 +64,8 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
 
     A line belongs to the frame of its scan's name or, for recordings, of its time. Labelled frames without a line count
     as frames in which nothing was found. Not counted are labels outside the ranges that the predictions' folder notes
-    (recording.json), of fewer than MIN_POINTS points, of unknown occlusion, and of classes that are not predicted.
+    (recording.json), of fewer than MIN_POINTS points and of unknown occlusion. Scored are the detector's classes, which
+    the folder notes, too; without it those that are predicted.
 
     Args:
         split: labels with `track_id`; a frame's folder is its sequence.
@@ -71,18 +77,22 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
         DatasetError: a file cannot be read, boxes have no `track_id`, or no line belongs to a frame.
     """
     path = predictions / "detections.jsonl" if predictions.is_dir() else predictions
-    lines = _by_frame(path, split)
-    names = sorted({box["class"] for line in lines.values() for box in line["boxes"]})
-    ranges = _ranges(path.parent / "recording.json")
+    times = _times(split)
+    found = _by_frame(path, split, times)
+    about_run = _about_run(path.parent / "recording.json")
+    names = about_run.get("classes") or sorted({kind for one in found.values() for kind in one.records.types})
     sequences: dict[str, list[_Frame]] = {}
-    for frame_id in split.frame_ids:
-        frame = _frame(split, frame_id, lines.get(frame_id, {"boxes": []}), names, ranges, path)
+    labelled: Counter[str] = Counter()
+    for frame_id in _in_order(split.frame_ids, times):
+        frame = _frame(split, frame_id, found.get(frame_id), names, about_run.get("ranges_m"))
+        labelled.update(frame.types)
         sequences.setdefault(frame_id.rpartition("/")[0], []).append(frame)
     scores = []
     for name in names:
         frames = [[_of_class(frame, name) for frame in own] for own in sequences.values()]
         scores.append(ClassScore(name, hota(frames), clear_mot(frames, CLEAR_IOU)))
-    return TrackingReport(subject, scores, len(split.frame_ids), len(lines), about)
+    not_scored = {kind: count for kind, count in sorted(labelled.items()) if kind not in names}
+    return TrackingReport(subject, scores, len(split.frame_ids), len(found), not_scored, about)
 
 
 def tracking_table(report: TrackingReport) -> TextTable:
@@ -107,6 +117,9 @@ def tracking_notes(report: TrackingReport) -> list[str]:
             f"{report.frames - report.frames_found} of {report.frames} labelled frames have no predictions and count "
             "as frames in which nothing was found."
         )
+    if report.not_scored:
+        classes = ", ".join(f"{name} ({count})" for name, count in report.not_scored.items())
+        notes.append(f"Labelled and not scored, because no prediction is of such a class: {classes}.")
     return notes
 
 
@@ -128,6 +141,7 @@ def tracking_json(report: TrackingReport) -> dict[str, Any]:
         "subject": report.subject,
         "frames": report.frames,
         "frames_found": report.frames_found,
+        "not_scored": report.not_scored,
         "classes": classes,
     }
 
@@ -145,27 +159,22 @@ def _of_class(frame: _Frame, name: str) -> TrackedFrame:
 
 
 def _frame(
-    split: BoxSplit,
-    frame_id: str,
-    line: dict[str, Any],
-    names: list[str],
-    ranges: tuple[tuple[float, float], tuple[float, float]] | None,
-    path: Path,
+    split: BoxSplit, frame_id: str, found: NamedRecords | None, names: Sequence[str], ranges: Any | None
 ) -> _Frame:
     records = split.records(frame_id)
-    more = _label_records(split, frame_id)
     counted = np.array([kind in names for kind in records.types], bool)
-    for row, record in enumerate(more):
+    for row, record in enumerate(_label_records(split, frame_id)):
         counted[row] &= record.get("points", MIN_POINTS) >= MIN_POINTS
         counted[row] &= record.get("occluded", 0) < UNKNOWN_OCCLUSION
     if ranges is not None:
+        level = split.labeled_boxes(frame_id).boxes  # ranges are the model's, labels may lie in other axes
         for axis, (low, high) in enumerate(ranges):
-            counted &= (records.boxes[:, axis] >= low) & (records.boxes[:, axis] <= high)
+            counted &= (level[:, axis] >= low) & (level[:, axis] <= high)
     labels = Boxes(records.boxes, _ids(records.track_ids, str(split.labels_path)))
-    fields = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
-    boxes = np.array([[box[name] for name in fields] for box in line["boxes"]], np.float32).reshape(-1, 7)
-    found = Boxes(boxes, _ids([box.get("track_id") for box in line["boxes"]], f"{path}, {frame_id}"))
-    return _Frame(labels, records.types, counted, found, tuple(box["class"] for box in line["boxes"]))
+    if found is None:
+        return _Frame(labels, records.types, counted, Boxes(np.empty((0, 7), np.float32), _ids((), "")), ())
+    own = found.records
+    return _Frame(labels, records.types, counted, Boxes(own.boxes, _ids(own.track_ids, found.place)), own.types)
 
 
 def _label_records(split: BoxSplit, frame_id: str) -> list[dict[str, Any]]:
@@ -184,43 +193,50 @@ def _ids(values: Sequence[Any], place: str) -> Any:
     return np.array([int(text) if text.isdecimal() else hash(text) >> 24 for text in texts], np.int64)
 
 
-def _by_frame(path: Path, split: BoxSplit) -> dict[str, dict[str, Any]]:
+def _by_frame(path: Path, split: BoxSplit, times: Mapping[str, float]) -> dict[str, NamedRecords]:
     """The lines of the predictions by the frames that they belong to."""
-    try:
-        lines = [json.loads(text) for text in path.read_text(encoding="utf-8").splitlines() if text.strip()]
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: cannot be read as JSON lines ({str(error)[:80]}); correct the path") from None
     known = set(split.frame_ids)
-    times = _times(split)
-    order = np.array(sorted(times))
-    found: dict[str, dict[str, Any]] = {}
-    for line in lines:
-        frame_id = frame_of_scan(str(line.get("scan", "")), known) or ""
-        if not frame_id and "time_s" in line and len(order):
-            nearest = float(order[np.abs(order - line["time_s"]).argmin()])
-            frame_id = times[nearest] if abs(nearest - line["time_s"]) < _SAME_TIME_S else ""
-        if frame_id:
-            found[frame_id] = line
+    ordered = sorted((time_s, frame_id) for frame_id, time_s in times.items())
+    stamps = np.array([time_s for time_s, _ in ordered])
+    found: dict[str, NamedRecords] = {}
+    for one in read_frames(path):
+        frame_id = frame_of_scan(one.scan, known)
+        if frame_id is None and one.time_s is not None and ordered:
+            nearest = int(np.abs(stamps - one.time_s).argmin())
+            frame_id = ordered[nearest][1] if abs(stamps[nearest] - one.time_s) < _SAME_TIME_S else None
+        if frame_id in found:
+            raise DatasetError(f"{one.place}: frame {frame_id} has predictions in {found[frame_id].place}; join them")
+        if frame_id is not None:
+            found[frame_id] = one
     if not found:
         raise DatasetError(f"{path}: no line belongs to a frame of {split.root}, by name or by time")
     return found
 
 
-def _times(split: BoxSplit) -> dict[float, str]:
-    """Time stamp, seconds -> frame, where labels say it."""
+def _in_order(frame_ids: Sequence[str], times: Mapping[str, float]) -> list[str]:
+    """As they followed each other: by time where every frame has one, else 2 before 10."""
+    if all(frame_id in times for frame_id in frame_ids):
+        return sorted(frame_ids, key=lambda frame_id: times[frame_id])
+    return sorted(frame_ids, key=lambda frame_id: natural_order(Path(frame_id)))
+
+
+def _times(split: BoxSplit) -> dict[str, float]:
+    """Time stamps of frames, seconds, where labels say them."""
     times = {}
     for frame_id in split.frame_ids:
         path = split.labels_path / f"{frame_id}.json"
         if path.is_file():
             content = json.loads(path.read_text(encoding="utf-8"))
             if "time_s" in content:
-                times[float(content["time_s"])] = frame_id
+                times[frame_id] = float(content["time_s"])
     return times
 
 
-def _ranges(path: Path) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Where the detector looked, if its results say so: x and y in metres."""
+def _about_run(path: Path) -> dict[str, Any]:
+    """What `asca detect` notes of itself beside its results: its classes, and x and y in metres where it looked."""
     if not path.is_file():
-        return None
-    ranges = json.loads(path.read_text(encoding="utf-8")).get("ranges_m")
-    return None if ranges is None else (tuple(ranges[0]), tuple(ranges[1]))
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise DatasetError(f"{path}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None

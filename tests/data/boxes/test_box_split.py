@@ -193,7 +193,7 @@ def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
         write_scan(path, level.inverse.points(read_scan(path).points))
     turned = [
         json_line(scan, records_from(level.inverse.boxes(records.boxes), records.types))
-        for scan, records, _ in list(read_frames(root / "labels.jsonl"))
+        for scan, records, *_ in list(read_frames(root / "labels.jsonl"))
     ]
     (root / "labels.jsonl").write_text("".join(turned))
     wrong = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)

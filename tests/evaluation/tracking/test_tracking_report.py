@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
@@ -12,7 +13,12 @@ from asca_pillars.cli import app
 from asca_pillars.commands.eval_tracks import evaluate_tracks
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.errors import ConfigError, DatasetError, OutputError
-from asca_pillars.evaluation.tracking.tracking_report import TrackingReport, tracking_json, tracking_report
+from asca_pillars.evaluation.tracking.tracking_report import (
+    TrackingReport,
+    tracking_json,
+    tracking_notes,
+    tracking_report,
+)
 from asca_pillars.sim.sequences.sequence_files import simulate_sequences
 from asca_pillars.sim.simulation_configs import load_simulation_config
 
@@ -76,6 +82,79 @@ def test_what_the_detector_cannot_see_is_not_counted(drives: Path, tmp_path: Pat
     ahead = score(drives, tmp_path, labels(drives))
     assert 0 < sum(one.clear.labels for one in ahead.scores) < everything
     assert all(one.clear.false_boxes == 0 for one in ahead.scores), "boxes of labels that do not count go with them"
+
+
+def test_a_class_that_is_never_found_is_scored_or_named(drives: Path, tmp_path: Path) -> None:
+    lines = labels(drives)
+    for line in lines:
+        line["boxes"] = [box for box in line["boxes"] if box["class"] != "Pedestrian"]
+    report = score(drives, tmp_path, lines)
+    assert report.not_scored["Pedestrian"] > 0 and "Pedestrian" in tracking_notes(report)[-1]
+    (tmp_path / "recording.json").write_text(json.dumps({"classes": CLASSES}))
+    report = score(drives, tmp_path, lines)
+    missed = next(one for one in report.scores if one.name == "Pedestrian")
+    assert missed.clear.misses == missed.clear.labels > 0 and "Pedestrian" not in report.not_scored
+    (tmp_path / "recording.json").write_text("{")
+    with pytest.raises(DatasetError, match=r"recording\.json: cannot be read"):
+        score(drives, tmp_path, lines)
+
+
+BOX = {"class": "Car", "y_m": 0, "z_m": 0, "length_m": 4, "width_m": 2, "height_m": 1.5, "yaw_rad": 0, "score": 0.9}
+
+
+def street(folder: Path, axes: str, records: list[dict[str, Any]]) -> Path:
+    """Labels of one object in frames 0, 1, 2 ..., and an empty scan for each."""
+    (folder / "scans").mkdir(parents=True)
+    for number in range(len(records)):
+        np.save(folder / "scans" / f"{number}.npy", np.ones((1, 4), np.float32))
+    settings = {"scans": "scans", "labels": "labels.jsonl", "axes": axes, "sensor_height": 1.73}
+    (folder / "dataset.yaml").write_text(json.dumps(settings))
+    lines = [{"scan": f"{number}.npy", "boxes": [record]} for number, record in enumerate(records)]
+    (folder / "labels.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def test_frames_without_times_are_in_natural_order(tmp_path: Path) -> None:
+    """One change of the identity, after the sixth of twelve frames: 10 and 11 do not come before 2."""
+    own = [BOX | {"x_m": 10 + number, "track_id": 1} for number in range(12)]
+    root = street(tmp_path / "own", "x-forward", own)
+    found = [
+        {"scan": f"{number}.npy", "boxes": [record | {"track_id": 1 + (number > 5)}]}
+        for number, record in enumerate(own)
+    ]
+    (car,) = score(root, tmp_path / "out", found).scores
+    assert car.clear.identity_switches == 1 and car.clear.mota == pytest.approx(11 / 12)
+
+
+def test_ranges_are_those_of_the_model_whatever_the_axes(tmp_path: Path) -> None:
+    """y-forward: a car 50 m ahead lies at y = 50."""
+    own = [BOX | {"x_m": 0, "y_m": 50, "track_id": 1}]
+    root = street(tmp_path / "own", "y-forward", own)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "recording.json").write_text(json.dumps({"ranges_m": [[0, 69], [-30, 30]]}))
+    (car,) = score(root, tmp_path / "out", [{"scan": "0.npy", "boxes": own}]).scores
+    assert car.clear.labels == 1 and car.clear.mota == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ([1], 'jsonl:1: no "scan"'),
+        ({"scan": "0.npy"}, 'jsonl:1: no list "boxes"'),
+        ({"scan": "0.npy", "boxes": [{"x_m": 1}]}, "jsonl:1, box 1: no `class`"),
+        ({"scan": "0.npy", "boxes": [BOX]}, "jsonl:1, box 1: no `x_m`"),
+    ],
+)
+def test_malformed_predictions_are_one_line(tmp_path: Path, line: Any, message: str) -> None:
+    root = street(tmp_path / "own", "x-forward", [BOX | {"x_m": 10, "track_id": 1}])
+    with pytest.raises(DatasetError, match=message):
+        score(root, tmp_path / "out", [line])
+
+
+def test_a_frame_with_two_lines_is_refused(drives: Path, tmp_path: Path) -> None:
+    lines = labels(drives)
+    with pytest.raises(DatasetError, match=r"jsonl:13: frame .* has predictions in .*jsonl:1; join them"):
+        score(drives, tmp_path, [*lines, lines[0]])
 
 
 def test_the_command_prints_and_writes(drives: Path, tmp_path: Path) -> None:
