@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from asca_pillars.commands.options import (
+    MIN_SCORE,
     AroundOption,
     PrecisionOption,
     ProviderOption,
@@ -62,7 +63,7 @@ def evaluate(
         typer.Option(
             "--min-score", min=0, max=1, help="Lowest score that a model is run with: AP needs the weak detections too."
         ),
-    ] = 0.05,
+    ] = MIN_SCORE,
     protocol: Annotated[
         Literal["kitti", "waymo", "iou", "distance", "tracking"] | None,
         typer.Option(
@@ -97,6 +98,9 @@ def evaluate(
     console = Console(markup=False)
     if protocol is None:
         protocol = steps.default_protocol(data)
+    options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
+    if predictions is not None:
+        steps.check_of_a_model(predictions, options, min_score)
     if protocol == "tracking":
         from asca_pillars.commands.eval_tracks import check_arguments, evaluate_tracks
 
@@ -107,7 +111,6 @@ def evaluate(
         from asca_pillars.commands import eval_boxes
 
         box_task = eval_boxes.BoxTask(protocol, data, split, out, json, score, min_score, around)
-        options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
         eval_boxes.check_arguments(box_task, model, predictions, labels, gallery)
         eval_boxes.evaluate_boxes(box_task, options, predictions, console)
         return
@@ -125,7 +128,6 @@ def evaluate(
         task = steps.text_task(predictions, labels, frames_of, score)
     else:
         assert frames_of is not None, "checked with the arguments"
-        options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
         opened = open_model(options, min_score)
         scores = steps.fixed_scores(opened, score, min_score) if protocol == "kitti" else {}
         task = steps.run_model(opened, frames_of, labels, scores, out, console)

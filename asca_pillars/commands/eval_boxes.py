@@ -1,14 +1,21 @@
 """The steps of `asca eval --protocol iou` and `distance`: any class, boxes in the LiDAR frame, no camera."""
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_steps import COMMAND, MADE_BY, TEXT_SCORE, claim, warn_of_unlike_scans
+from asca_pillars.commands.eval_steps import (
+    COMMAND,
+    MADE_BY,
+    TEXT_SCORE,
+    check_score,
+    claim,
+    model_scores,
+    warn_of_unlike_scans,
+)
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -53,8 +60,7 @@ def check_arguments(
         raise ConfigError(f"--labels {labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
     if gallery:
         raise ConfigError(f"--gallery {gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes")
-    if task.score is not None and not math.isfinite(task.score):
-        raise ConfigError(f"--score {task.score} must be a number")
+    check_score(task.score)
 
 
 def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | None, console: Console) -> None:
@@ -63,11 +69,13 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     claim(task.out, task.json)
     split = open_split(task.data, task.split)
     about: dict[str, Any] = {"data": str(task.data), "split": task.split}
+    if task.around and split.has_camera:
+        raise ConfigError(f"--around: {task.data} has labels within an angle ahead alone; leave it out")
     if predictions is None:
         model = open_model(options, task.min_score, sensor_height_m=split.mounting.sensor_height_m, around=task.around)
+        scores = model_scores(model, task.score, task.min_score)
         frames = _run(model, split, task, console)
         class_names = model.spec.class_names
-        scores = {one.name: one.score_threshold if task.score is None else task.score for one in model.spec.classes}
         subject, about = f"{model.name} on {task.data}, {task.split}", about | {"model": model.about}
     else:
         frames = read_box_predictions(predictions, split, console=console)

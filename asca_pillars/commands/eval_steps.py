@@ -11,6 +11,7 @@ from rich.console import Console
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.json_file import require_writable_json
 from asca_pillars.commands.models import Model
+from asca_pillars.commands.options import MIN_SCORE, RuntimeOptions
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError
@@ -96,8 +97,25 @@ def check_arguments(
         raise ConfigError(f"--predictions {predictions} needs --labels DIR, or --data ROOT that has the labels")
     if gallery_frames and data is None:
         raise ConfigError(f"--gallery {gallery_frames} draws scans: give --data ROOT that has them")
+    check_score(score)
+
+
+def check_score(score: float | None) -> None:
+    """Refuse a --score that is no number; what predictions from elsewhere call a score may be any."""
     if score is not None and not math.isfinite(score):
         raise ConfigError(f"--score {score} must be a number")
+
+
+def check_of_a_model(predictions: Path, options: RuntimeOptions, min_score: float) -> None:
+    """Refuse what changes a model's boxes, where none is run; ConfigError names the first such option."""
+    plain = RuntimeOptions()
+    given = {
+        f"--provider {options.provider}": options.provider != plain.provider,
+        f"--precision {options.precision}": options.precision != plain.precision,
+        f"--min-score {min_score:g}": min_score != MIN_SCORE,
+    }
+    for option in (name for name, differs in given.items() if differs):
+        raise ConfigError(f"{option} is for running a model; --predictions {predictions} are scored as they are")
 
 
 def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
@@ -138,16 +156,27 @@ def fixed_scores(model: Model, score: float | None, min_score: float) -> dict[st
             f"{model.name} detects {', '.join(item.name for item in model.spec.classes)}; KITTI's protocol scores "
             f"{', '.join(CLASS_NAMES)}: give --protocol waymo, which scores any class"
         )
-    for item in model.spec.classes:
-        if item.name.lower() not in known:
-            continue  # the report names it
-        fixed = item.score_threshold if score is None else score
+    for name, fixed in model_scores(model, score, min_score).items():
+        if name.lower() in known:  # the report names others
+            scores[known[name.lower()]] = fixed
+    return scores
+
+
+def model_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
+    """The same for each of the model's own classes.
+
+    Raises:
+        ConfigError: a score that the model is not run down to.
+    """
+    scores = {item.name: item.score_threshold if score is None else score for item in model.spec.classes}
+    if score is not None and score > 1:
+        raise ConfigError(f"--score {score:g}: no detection of a model has such a score; at most 1")
+    for name, fixed in scores.items():
         if fixed < min_score:
             raise ConfigError(
-                f"score {fixed:g} of {item.name} is below --min-score {min_score:g}, the lowest that {model.name} is "
+                f"score {fixed:g} of {name} is below --min-score {min_score:g}, the lowest that {model.name} is "
                 "run with; lower --min-score"
             )
-        scores[known[item.name.lower()]] = fixed
     return scores
 
 

@@ -23,6 +23,8 @@ BundleOption = Annotated[
         "providers that need one), each also with _int8. Default: asca_sim_int8.",
     ),
 ]
+MIN_SCORE = 0.05  # of `asca eval --min-score`
+
 ProviderOption = Annotated[
     str, typer.Option("--provider", help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")
 ]

@@ -63,6 +63,9 @@ class LabeledSplit(Protocol):
         Without a camera there is nothing to cut.
         """
 
+    def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which of the positions (N, 3), metres, frame of `points`, lie where objects are labelled."""
+
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
         """(N, 4) all of the file, perhaps not finite or with a reflectance beyond 0..1."""
 

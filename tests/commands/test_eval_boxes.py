@@ -105,6 +105,23 @@ def test_kitti_data_is_scored_too(tmp_path: Path) -> None:
     }
 
 
+def test_what_lies_where_nothing_is_labelled_is_neither_right_nor_wrong(
+    root: Path, perfect: Path, tmp_path: Path
+) -> None:
+    """Labels within 40 degrees ahead; predictions everywhere."""
+    boxes = np.array([[20, 0, 0, 4, 2, 1.5, 0], [0, 20, 0, 4, 2, 1.5, 0], [20, 7.5, 0, 4, 2, 1.5, 0]], np.float32)
+    line = json_line("scans/000001.bin", records_from(boxes[[0, 2]], ("Car",) * 2))
+    (root / "labels.jsonl").write_text(line)
+    (root / "dataset.yaml").write_text(f"{(root / 'dataset.yaml').read_text()}\nlabeled_view_deg: 40\n")
+    boxes[2, 1] += 0.2  # its label stands at the edge
+    perfect.write_text(json_line("scans/000001.bin", records_from(boxes, ("Car",) * 3, (0.9,) * 3)))
+    run("--data", root, "--split", "training", "--predictions", perfect, "--out", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "iou.json").read_text())
+    assert {score["ap"] for score in report["iou"] if score["band"] == "all" and score["min_iou"] < 0.7} == {100.0}
+    with pytest.raises(AscaError, match="has labels within an angle ahead alone"):
+        run("--data", root, "--split", "training", "--around", "--out", tmp_path / "out")
+
+
 def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_path: Path) -> None:
     perfect.write_text("".join(line for line in perfect.read_text().splitlines(keepends=True) if "000001" in line))
     assert "evaluated on 1 of 2 frames: no predictions for 000002" in " ".join(
@@ -122,6 +139,12 @@ def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_pat
         (["run.ckpt", "--data", "{root}", "--around"], "--around runs bundles: export the checkpoint first"),
         (["--data", "{root}", "--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),
         (["--data", "{root}", "--labels", "x"], "--labels x belongs to"),
+        (["--data", "{root}", "--min-score", "0.9"], "of Car is below --min-score 0.9"),
+        (["--data", "{root}", "--score", "0.01"], "score 0.01 of Car is below --min-score 0.05"),
+        (["--data", "{root}", "--score", "5"], "--score 5: no detection of a model has such a score"),
+        (["--data", "{root}", "--predictions", "x", "--provider", "y"], "--provider y is for running a model"),
+        (["--data", "{root}", "--predictions", "x", "--precision", "y"], "--precision y is for running a model"),
+        (["--data", "{root}", "--predictions", "x", "--min-score", "0.9"], "--min-score 0.9 is for running a model"),
         (["--data", "{root}", "--score", "nan"], "--score nan must be a number"),
         (["--data", "{root}", "--predictions", "{root}/none.jsonl", "--json", "{root}"], "is a folder"),
         (["--data", "{root}", "--predictions", "{root}/labels.jsonl"], "labels.jsonl:1, box 1: no `score`"),

@@ -145,9 +145,12 @@ class BoxSplit:
     def points(self, frame_id: str, *, camera_view: bool = False) -> NDArray[np.float32]:
         """(N, 4) of the scan, metres, level frame; with `camera_view` those within the labelled angle."""
         points = self._levelled(self._read(self.scan_path(frame_id)))
-        if camera_view and self.has_camera:
-            points = points[_within(points, self.settings.labeled_view_deg)]
-        return points
+        return points[self.in_labeled_view(frame_id, points)] if camera_view else points
+
+    def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which of the positions (N, 3 or more), metres, level frame, lie within the labelled angle."""
+        angles = np.arctan2(positions[:, 1], positions[:, 0])
+        return np.asarray(np.abs(angles) <= np.radians(self.settings.labeled_view_deg / 2))
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
         """(N, 4) all of the file in the level frame; reflectance divided by the dataset's scale."""
@@ -205,10 +208,6 @@ class BoxSplit:
     def _frames(self) -> dict[str, BoxFrame]:
         """Every labelled frame of the dataset, by its id."""
         return find_frames(self.labels_path, self.scans_folder)
-
-
-def _within(points: NDArray[np.float32], view_deg: float) -> NDArray[np.bool_]:
-    return np.abs(np.arctan2(points[:, 1], points[:, 0])) <= np.radians(view_deg / 2)
 
 
 def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:

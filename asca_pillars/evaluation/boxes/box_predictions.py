@@ -17,6 +17,9 @@ from asca_pillars.evaluation.predictions import shortage
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.detections import Detections
 
+NEAR_LABEL_M = 4.0
+"""From an object that is labelled at the edge of the view: the largest distance at which any protocol matches."""
+
 
 @dataclass(frozen=True)
 class BoxFrames:
@@ -62,7 +65,7 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
     """Pair the labels of a split with the predictions of a *.jsonl or *.csv file.
 
     Boxes are in the scan's own frame, as labels are. A line belongs to the frame whose id is the longest end of its
-    scan's path; lines of other frames are left out.
+    scan's path; lines of other frames are left out, and so are boxes where nothing is labelled.
 
     Args:
         path: the file, or a folder that `asca detect` wrote.
@@ -82,9 +85,21 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
         visible = np.asarray(points_in_boxes(points, objects).any(axis=0))
         records = predictions[frame_id]
         found = records.boxes if level.is_identity else level.boxes(records.boxes)
-        frames.append(EvaluatedFrame(frame_id, objects, types, visible, found, records.types, records.scores))
+        kept = np.flatnonzero(_can_be_judged(split, frame_id, objects, found))
+        found_types = tuple(records.types[row] for row in kept)
+        frames.append(EvaluatedFrame(frame_id, objects, types, visible, found[kept], found_types, records.scores[kept]))
     missing = tuple(frame_id for frame_id in split.frame_ids if frame_id not in predictions)
     return BoxFrames(tuple(frames), missing)
+
+
+def _can_be_judged(
+    split: LabeledSplit, frame_id: str, objects: NDArray[np.float32], found: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Of the boxes (N, 7): which stand where objects are labelled, or so near one of `objects` that it may be meant."""
+    if not split.has_camera:
+        return np.ones(len(found), bool)
+    apart = np.linalg.norm(found[:, None, :2] - objects[None, :, :2], axis=2)
+    return np.asarray(split.in_labeled_view(frame_id, found[:, :3]) | (apart < NEAR_LABEL_M).any(axis=1))
 
 
 def _by_frame(path: Path, frame_ids: set[str]) -> tuple[dict[str, BoxRecords], Sequence[str]]:
