@@ -110,6 +110,7 @@ def test_what_lies_where_nothing_is_labelled_is_neither_right_nor_wrong(
 ) -> None:
     """Labels within 40 degrees ahead; predictions everywhere."""
     boxes = np.array([[20, 0, 0, 4, 2, 1.5, 0], [0, 20, 0, 4, 2, 1.5, 0], [20, 7.5, 0, 4, 2, 1.5, 0]], np.float32)
+    write_scan(root / "scans" / "000001.bin", np.hstack([boxes[:, :3], np.zeros((3, 1))]).astype(np.float32))
     line = json_line("scans/000001.bin", records_from(boxes[[0, 2]], ("Car",) * 2))
     (root / "labels.jsonl").write_text(line)
     (root / "dataset.yaml").write_text(f"{(root / 'dataset.yaml').read_text()}\nlabeled_view_deg: 40\n")
