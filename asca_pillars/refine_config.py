@@ -81,7 +81,8 @@ class RefineModel(Strict):
 
     def __post_init__(self) -> None:
         quotas = self.refine.seen.proposals.quotas
-        if len(quotas) != len(self.spec.classes):
+        known = self.first_stage_identity != ""  # before, the spec is not the first stage's yet
+        if known and len(quotas) != len(self.spec.classes):
             raise ConfigError(
                 f"model.refine.seen.proposals.quotas = {list(quotas)}: give one for each of the classes "
                 f"{', '.join(self.spec.class_names)}"

@@ -1,5 +1,6 @@
 """A run's checkpoints: written whole, two generations of the last one, and the one to go on from."""
 
+import contextlib
 import pickle
 import shutil
 import zipfile
@@ -9,13 +10,14 @@ from typing import Any
 import lightning as L  # noqa: N812  (Lightning's own convention)
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
-from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
 from asca_pillars.models.checkpoint import unread
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
+_UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -39,6 +41,26 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                     with atomic_path(path.with_name(PREVIOUS)) as previous:
                         shutil.copyfile(path, previous)  # not renamed: readers find a last.ckpt at every moment
                 self.keep_last = True
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Saves best.ckpt when the validation loss is the lowest so far, over all that the run was stopped and resumed.
+
+    Args:
+        folder: of the checkpoints.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, filename="best", save_top_k=1, enable_version_counter=False, monitor="val/loss")
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Know the loss of the best.ckpt that is there: the last checkpoint may be from before its validation."""
+        super().on_train_start(trainer, pl_module)
+        path = Path(str(self.dirpath)) / BEST
+        if trainer.global_step and path.exists():
+            with contextlib.suppress(*_UNREADABLE):  # then the next validation replaces it
+                states = torch.load(path, map_location="cpu", weights_only=True)["callbacks"]
+                self.load_state_dict(states[self.state_key])
 
 
 class LastCheckpoint(Checkpoint):
@@ -76,7 +98,7 @@ def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
             continue
         try:
             torch.load(path, map_location="cpu", weights_only=True, mmap=False)
-        except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as e:
+        except _UNREADABLE as e:
             damage.append(f"{path} is damaged ({unread(e)})")
         else:
             return path, damage[0] if damage else None

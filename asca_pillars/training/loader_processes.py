@@ -16,5 +16,9 @@ def loader_context() -> ForkServerContext:
 
 
 def leave_interrupts_to_the_loop(_: int) -> None:
-    """Ctrl-C reaches every process of the terminal; a step that is under way still needs its batch."""
+    """Ctrl-C reaches every process of the terminal, SIGTERM of a batch system every one of the job.
+
+    A step that is under way still needs its batch. A second SIGTERM ends the process: it is the loader's own.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: signal.signal(signal.SIGTERM, signal.SIG_DFL) and None)

@@ -11,7 +11,7 @@ import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.fabric.utilities.warnings import PossibleUserWarning
-from lightning.pytorch.callbacks import Checkpoint, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import Checkpoint, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
@@ -27,10 +27,16 @@ from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
-from asca_pillars.training.checkpoints import LAST, AtomicCheckpointIO, LastCheckpoint, checkpoint_to_resume
+from asca_pillars.training.checkpoints import (
+    LAST,
+    AtomicCheckpointIO,
+    BestCheckpoint,
+    LastCheckpoint,
+    checkpoint_to_resume,
+)
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule
-from asca_pillars.training.run_folder import claim, measure_input, recorded_precision
+from asca_pillars.training.run_folder import Seen, claim, measure_input, recorded_precision
 
 SANITY_STEPS = 2  # validation batches that run before the first training step
 
@@ -46,7 +52,7 @@ def train(
 ) -> Path:
     """Train `config` on a dataset, or go on where an interrupted run in `out` stopped.
 
-    `out` receives config.yaml (resolved), environment.json, expected_input.yaml, TensorBoard logs and
+    `out` receives config.yaml (resolved), environment.json, frames.json, expected_input.yaml, TensorBoard logs and
     checkpoints/{last,previous,best,weights}.ckpt.
 
     Args:
@@ -64,8 +70,8 @@ def train(
         The last checkpoint.
 
     Raises:
-        TrainingError: `out` holds a run with another config or only damaged checkpoints, `init` is another network,
-            the devices are not there, or a loss became infinite or NaN.
+        TrainingError: `out` holds a run with another config or on other frames, or only damaged checkpoints, `init` is
+            another network, the devices are not there, or a loss became infinite or NaN.
         TrainingInterruptedError: Ctrl-C; the run is saved.
         DatasetError, ScanError: the data cannot be read.
         BundleError, ExportError, ConfigError: the first stage of two cannot be used, or `init` is a bundle without
@@ -91,7 +97,7 @@ def train(
         config.train, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes
     )
     data = DetectionData(config, data_root)
-    claim(out, config)
+    claim(out, config, Seen.of(data.training_set.frames.frame_ids, trainer.world_size))
     say = rank_zero_only(Console(markup=False, highlight=False).print)
     if damage is not None and resumed is not None:
         say(f"{damage}: going on from {resumed}")
@@ -99,7 +105,8 @@ def train(
         remedy = "choose auto or fp32" if resumed is None else f"go on where {out} was started, or anew with --init"
         say(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
-    module = DetectionModule(config, measure_input(out, data.training_set.frames))
+    keep = resumed is not None or not trainer.is_global_zero  # else it may be of scans that were there before
+    module = DetectionModule(config, measure_input(out, data.training_set.frames, keep=keep))
     if weights is not None:
         module.detector.load_state_dict(weights)
     with warnings.catch_warnings(), interrupt.listening():
@@ -140,7 +147,7 @@ def _trainer(
         RunProgress(),
         LearningRateMonitor("step"),
         *saving,
-        ModelCheckpoint(checkpoints, filename="best", save_top_k=1, enable_version_counter=False, monitor="val/loss"),
+        BestCheckpoint(checkpoints),
     ]
     if recipe.ema:
         callbacks.append(weight_average(recipe.ema))

@@ -1,7 +1,10 @@
 """The folder of a run: what it is, so that only the same run goes on in it."""
 
+import hashlib
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 from rich.progress import track
@@ -12,37 +15,52 @@ from asca_pillars.data.frames import read_frame
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import TrainingError
-from asca_pillars.files import atomic_path
-from asca_pillars.schema import to_dict
+from asca_pillars.files import atomic_path, write_json
+from asca_pillars.schema import parse, to_dict
 from asca_pillars.settings import read_settings
 from asca_pillars.system import describe_environment
 
+FRAMES_FILE = "frames.json"
 EXPECTED_INPUT_FILE = "expected_input.yaml"
 EXPECTED_INPUT_FRAMES = 200
 # Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.
 NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
 
 
-def claim(out: Path, config: Config) -> None:
+class Seen(NamedTuple):
+    """What follows from neither the configuration nor the seed: which frames are drawn from, and by how many."""
+
+    frames: int
+    frames_sha256: str
+    """Of their ids."""
+    processes: int
+
+    @classmethod
+    def of(cls, frame_ids: Sequence[str], processes: int) -> "Seen":
+        """Of training on these frames."""
+        return cls(len(frame_ids), hashlib.sha256("\n".join(frame_ids).encode()).hexdigest(), processes)
+
+
+def claim(out: Path, config: Config, seen: Seen) -> None:
     """Write what this run is into `out`, or make sure that the run found there is the same one.
 
     A run of the `step` schedule may be made longer: its steps so far are those of the longer run. One without any
     checkpoint has learnt nothing, so that another takes its place.
 
     Raises:
-        TrainingError: the run there is another one.
+        TrainingError: the run there is another one, or drew from other frames, or in more or fewer processes.
     """
-    path = out / "config.yaml"
+    path, frames_path = out / "config.yaml", out / FRAMES_FILE
     refusal = _why_another(path, config) if path.exists() else None
+    refusal = refusal or (_why_other_frames(frames_path, seen) if frames_path.exists() else None)
     if refusal and any((out / "checkpoints").glob("*.ckpt")):
         raise TrainingError(refusal)
-    if refusal:
-        (out / EXPECTED_INPUT_FILE).unlink(missing_ok=True)  # of other frames, perhaps
     if refusal or not path.exists():
         with atomic_path(out / "environment.json") as temporary:
             temporary.write_text(describe_environment(), encoding="utf-8")
     with atomic_path(path) as temporary:
         temporary.write_text(yaml.safe_dump(to_dict(config), sort_keys=False), encoding="utf-8")
+    write_json(frames_path, seen._asdict())
 
 
 def recorded_precision(out: Path) -> Precision:
@@ -50,8 +68,8 @@ def recorded_precision(out: Path) -> Precision:
     return load_config(out / "config.yaml").train.precision
 
 
-def measure_input(out: Path, frames: TrainingFrames) -> ExpectedInput:
-    """What up to EXPECTED_INPUT_FRAMES evenly spaced training scans look like; kept in `out` for a resumed run.
+def measure_input(out: Path, frames: TrainingFrames, *, keep: bool) -> ExpectedInput:
+    """What up to EXPECTED_INPUT_FRAMES evenly spaced training scans look like; with `keep` as `out` has it already.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
@@ -59,7 +77,7 @@ def measure_input(out: Path, frames: TrainingFrames) -> ExpectedInput:
         ConfigError: what was kept is damaged.
     """
     path = out / EXPECTED_INPUT_FILE
-    if path.exists():
+    if keep and path.exists():
         return read_settings(ExpectedInput, path, (), {})
     ids = frames.frame_ids
     count = min(len(ids), EXPECTED_INPUT_FRAMES)
@@ -92,6 +110,22 @@ def _why_another(path: Path, config: Config) -> str | None:
             f"length: start a new run in another --out with --init {path.parent / 'checkpoints' / 'last.ckpt'}"
         )
     return f"{path}: the run there was started with {difference}; choose another --out, or delete it"
+
+
+def _why_other_frames(path: Path, seen: Seen) -> str | None:
+    """In what words `seen` is not what `path` says of the run there; None if it is."""
+    found = parse(Seen, json.loads(path.read_text(encoding="utf-8")), str(path))
+    if found.processes != seen.processes:
+        return (
+            f"{path}: the run there was started with {found.processes} process(es), now {seen.processes}: its steps "
+            "would be others; give as many --devices, or start a new run in another --out with --init"
+        )
+    if found[:2] != seen[:2]:
+        return (
+            f"{path}: the run there was started on {found.frames} frames, now there are {seen.frames}, or others; give "
+            "it the same --data and data.train_set, or start a new run in another --out with --init"
+        )
+    return None
 
 
 def _first_difference(found: Any, wanted: Any, key: str = "") -> str | None:

@@ -15,7 +15,7 @@ from asca_pillars.schema import to_dict
 from asca_pillars.training import loop
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume
 from asca_pillars.training.loop import train
-from asca_pillars.training.run_folder import claim, measure_input
+from asca_pillars.training.run_folder import Seen, claim, measure_input
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -98,45 +98,57 @@ def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
     assert (folder / ".ipynb_checkpoints" / "notes.ipynb").exists()
 
 
+SEEN = Seen.of(["a", "b"], 1)
+
+
 def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
-    claim(tmp_path, CONFIG)
+    claim(tmp_path, CONFIG, SEEN)
     data = DataConfig(workers=7, prepared=str(tmp_path))
     recipe = dataclasses.replace(CONFIG.train, checkpoint_steps=9)
-    claim(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe))
+    claim(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe), SEEN)
     learn(tmp_path)
     with pytest.raises(TrainingError, match=r"data\.min_points = 1, now data\.min_points = 2"):
-        claim(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)))
+        claim(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)), SEEN)
+
+
+def test_a_run_goes_on_with_its_own_frames_and_processes_alone(tmp_path: Path) -> None:
+    claim(tmp_path, CONFIG, SEEN)
+    claim(tmp_path, CONFIG, Seen.of(["a", "c"], 1))  # nothing is learnt yet
+    learn(tmp_path)
+    claim(tmp_path, CONFIG, Seen.of(["a", "c"], 1))
+    with pytest.raises(TrainingError, match=r"frames\.json: .* on 2 frames, now there are 3, or others; give"):
+        claim(tmp_path, CONFIG, Seen.of(["a", "b", "c"], 1))
+    with pytest.raises(TrainingError, match=r"started with 1 process\(es\), now 2: .* give as many --devices"):
+        claim(tmp_path, CONFIG, Seen.of(["a", "c"], 2))
+    (tmp_path / "frames.json").unlink()  # an older version wrote none
+    claim(tmp_path, CONFIG, SEEN)
 
 
 def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> None:
     def of(**recipe: object) -> Config:
         return dataclasses.replace(CONFIG, train=TrainConfig(**recipe))  # type: ignore[arg-type]
 
-    claim(tmp_path / "step", of(epochs=2, schedule="step"))
+    claim(tmp_path / "step", of(epochs=2, schedule="step"), SEEN)
     learn(tmp_path / "step")
-    claim(tmp_path / "step", of(epochs=5, schedule="step"))
+    claim(tmp_path / "step", of(epochs=5, schedule="step"), SEEN)
     with pytest.raises(TrainingError, match=r"train\.epochs = 5, now train\.epochs = 4; choose another"):
-        claim(tmp_path / "step", of(epochs=4, schedule="step"))
+        claim(tmp_path / "step", of(epochs=4, schedule="step"), SEEN)
     with pytest.raises(TrainingError, match=r"train\.seed = 0, now train\.seed = 1"):
-        claim(tmp_path / "step", of(epochs=9, schedule="step", seed=1))
-    claim(tmp_path / "cycle", of(epochs=2, schedule="one_cycle"))
+        claim(tmp_path / "step", of(epochs=9, schedule="step", seed=1), SEEN)
+    claim(tmp_path / "cycle", of(epochs=2, schedule="one_cycle"), SEEN)
     learn(tmp_path / "cycle")
     with pytest.raises(TrainingError, match=r"one_cycle schedule is planned .*--init .*last\.ckpt"):
-        claim(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"))
+        claim(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"), SEEN)
 
 
 def test_a_run_that_learnt_nothing_gives_way(tmp_path: Path) -> None:
     """The corrected command may be given again, and nothing of the mistaken one stays."""
-    claim(tmp_path, CONFIG)
+    claim(tmp_path, CONFIG, SEEN)
     (tmp_path / "environment.json").write_text("of the mistaken run")
-    (tmp_path / "expected_input.yaml").write_text("of its scans")
-    claim(tmp_path, CONFIG)
-    assert (tmp_path / "expected_input.yaml").exists()  # the same run goes on with what it has
     other = dataclasses.replace(CONFIG, data=DataConfig(min_points=2))
-    claim(tmp_path, other)
+    claim(tmp_path, other, SEEN)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == to_dict(other)
     assert "torch" in (tmp_path / "environment.json").read_text()
-    assert not (tmp_path / "expected_input.yaml").exists()
 
 
 @pytest.mark.parametrize("mistake", [{"init": "nosuch.ckpt"}, {"devices": "many"}])
@@ -153,4 +165,4 @@ def test_a_mistyped_start_is_refused_before_anything_is_done(
 def test_a_damaged_measurement_of_the_input_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "expected_input.yaml").write_text("points_per_scan: [")
     with pytest.raises(ConfigError, match=r"expected_input\.yaml: not valid YAML: "):
-        measure_input(tmp_path, cast("TrainingFrames", None))  # which is not asked where something was kept
+        measure_input(tmp_path, cast("TrainingFrames", None), keep=True)  # which is not asked where something was kept

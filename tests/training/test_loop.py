@@ -30,7 +30,7 @@ from asca_pillars.training.callbacks import TrainingInterruptedError
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
 from asca_pillars.training.module import DetectionModule
-from asca_pillars.training.run_folder import claim
+from asca_pillars.training.run_folder import Seen, claim
 from tests.scenes import GROUND_Z_M, SPEC, write_dataset
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
@@ -100,7 +100,7 @@ def test_run_folder_and_checkpoint(tmp_path: Path) -> None:
 
 def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 3)
-    claim(tmp_path / "run", CONFIG)
+    claim(tmp_path / "run", CONFIG, Seen.of([], 1))
     (tmp_path / "run" / "checkpoints").mkdir()
     (tmp_path / "run" / "checkpoints" / "best.ckpt").touch()
     with pytest.raises(TrainingError, match=r"config\.yaml: .* train\.seed = 0, now train\.seed = 1; choose another"):
@@ -150,16 +150,39 @@ def test_a_longer_run_is_a_finished_run_made_longer(tmp_path: Path, ema: float) 
         assert not torch.equal(own, content["state_dict"]["detector.head.scores.weight"])
 
 
-def test_a_damaged_scan_is_one_line_from_a_loader_process(tmp_path: Path) -> None:
+def test_the_best_checkpoint_stays_the_best_when_a_run_goes_on(tmp_path: Path) -> None:
+    """last.ckpt is from before the validation that best.ckpt is of."""
+    data, checkpoints = write_dataset(tmp_path / "data", 3), tmp_path / "run" / "checkpoints"
+    train(CONFIG, data, tmp_path / "run")
+    for name, score in (("last.ckpt", 1e9), ("best.ckpt", -1.0)):
+        content = torch.load(checkpoints / name, weights_only=True)
+        (own,) = (state for key, state in content["callbacks"].items() if "'monitor': 'val/loss'" in key)
+        own["best_model_score"] = own["current_score"] = torch.tensor(score)
+        own["best_model_path"], own["kth_value"] = str(checkpoints / "best.ckpt"), torch.tensor(score)
+        own["best_k_models"] = {str(checkpoints / "best.ckpt"): torch.tensor(score)}
+        torch.save(content, checkpoints / name)
+    before = (checkpoints / "best.ckpt").read_bytes()
+    train(with_train(epochs=CONFIG.train.epochs + 1), data, tmp_path / "run")
+    assert (checkpoints / "best.ckpt").read_bytes() == before
+
+
+def test_a_run_that_had_not_begun_measures_its_scans_anew(tmp_path: Path) -> None:
+    data, measured = write_dataset(tmp_path / "data", 3), ExpectedInput((1, 2), (0.1, 0.2), None, camera_view=True)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "expected_input.yaml").write_text(yaml.safe_dump(to_dict(measured)))
+    found = load_checkpoint(train(CONFIG, data, tmp_path / "run")).expected_input
+    assert found is not None and found != measured
+
+
+def test_a_damaged_scan_is_one_line_from_a_loader_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_dataset(tmp_path / "data", 5)
     scan = data / "training" / "velodyne" / "000001.bin"
     scan.write_bytes(b"x" * 33)
     frames = open_dataset(data, CONFIG, training=True)
     assert str(scan) in str(Collate(frames.preparation)([frames[0, 0], frames[0, 1]]))
     config = dataclasses.replace(CONFIG, data=DataConfig(workers=1))
-    claim(tmp_path / "run", config)
     measured = ExpectedInput((1, 2), (0.1, 0.2), None, camera_view=True)
-    (tmp_path / "run" / "expected_input.yaml").write_text(yaml.safe_dump(to_dict(measured)))
+    monkeypatch.setattr("asca_pillars.training.loop.measure_input", lambda *_, **__: measured)
     with pytest.raises(ScanError, match=r"000001\.bin") as caught:
         train(config, data, tmp_path / "run")
     assert "\n" not in str(caught.value)

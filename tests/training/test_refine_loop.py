@@ -145,12 +145,15 @@ def test_what_cannot_be(tmp_path: Path, stage: Path) -> None:
         ("augment.object_shift_m=0.1", r"augment.object_shift_m = 0.1: .* set augment.object_shift_m=0"),
         ("augment.insert.method=rs_aug", "augment.insert.method = rs_aug"),
         ("model.refine.rois=1", "model.refine.rois = 1"),
-        ("model.refine.seen.proposals.quotas=[1, 2]", "give one for each of the classes Car, Pedestrian"),
         ("model.refine.network.dropout=1", "model.refine.network.dropout = 1"),
         ("model.refine.netwrk=1", "did you mean `network`"),
     ):
         with pytest.raises(ConfigError, match=message):
             load_config("asca_refine_sim", [model, override])
+    two = load_config("asca_refine_sim", [model, "model.refine.seen.proposals.quotas=[1, 2]"]).model
+    assert two.kind == "pillar_refine"  # as a first stage of two classes needs it
+    with pytest.raises(ConfigError, match="give one for each of the classes Car, Pedestrian"):
+        with_first_stage(dataclasses.replace(two, first_stage=str(stage)))
     with pytest.raises(ConfigError, match="bev_channels = 0"):
         build_model(tiny_refine_config(stage).model)
     with pytest.raises(TrainingError, match="no such checkpoint"):
