@@ -2,16 +2,24 @@
 
 import json
 from dataclasses import dataclass
+from typing import Any
 
 from asca_pillars.ablation.variants import Family
 from asca_pillars.points.voxel_scan import Deform
-from asca_pillars.pv_rcnn_config import Attention, Gate
+from asca_pillars.pv_rcnn_config import Attention, Gate, PvRcnnModel
+from asca_pillars.schema import to_dict
 
 BASE = "ablation_two_stage"
 """The configuration that ships for these rows; MSAA's row repeats its sources without the points."""
 _KEYPOINTS = 512
 _VECTOR_CELLS = 3
 _SCALES_M, _SCALE_WIDTHS = (0.8, 1.6, 3.2), (16, 32, 32)
+
+_SOURCES: list[dict[str, Any]] = [
+    {"source": "conv2", "radii_m": [0.8, 1.2], "samples": [16, 16]},
+    {"source": "conv3", "radii_m": [1.2, 2.4], "samples": [16, 16]},
+    {"source": "conv4", "radii_m": [2.4, 4.8], "samples": [16, 16]},
+]
 
 
 @dataclass(frozen=True)
@@ -42,16 +50,18 @@ class TwoStageVariant:
             *(self._scales if self.scales else ()),
         )
 
+    def misfit(self, model: PvRcnnModel) -> str | None:
+        """Rows with MSAA state all sources, and those without have the balls of raw points."""
+        points, *others = (to_dict(one) for one in model.settings.sources)
+        if points["source"] != "points":
+            return "has balls of raw points, which the base has not"
+        return "states other sources than the base has" if self.scales and others != _SOURCES else None
+
     @property
     def _scales(self) -> tuple[str, ...]:
         """MSAA takes the place of the balls of raw points."""
-        sources = [
-            {"source": "conv2", "radii_m": [0.8, 1.2], "samples": [16, 16]},
-            {"source": "conv3", "radii_m": [1.2, 2.4], "samples": [16, 16]},
-            {"source": "conv4", "radii_m": [2.4, 4.8], "samples": [16, 16]},
-        ]
         return (
-            f"model.settings.sources={json.dumps(sources)}",
+            f"model.settings.sources={json.dumps(_SOURCES)}",
             f"model.network.source_widths={json.dumps([[16, 16], [32, 32], [32, 32]])}",
             f"model.settings.scale_radii_m={json.dumps(_SCALES_M)}",
             f"model.network.scale_widths={json.dumps(_SCALE_WIDTHS)}",

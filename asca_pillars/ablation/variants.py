@@ -11,17 +11,20 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from rich.progress import track
 
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.anchors import KITTI_CLASSES
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
 from asca_pillars.system import default_threads
+
+_SIZES = 5  # of a class, the first fields: name, sizes and height, which thresholds do not change
 
 
 class Row(Protocol):
@@ -42,6 +45,9 @@ class Row(Protocol):
     @property
     def components(self) -> tuple[str, ...]:
         """Cells of the table's first columns."""
+
+    def misfit(self, model: Any) -> str | None:
+        """Why the row would change more of a base's `model` than its cells say; None if it would not."""
 
 
 class Family(NamedTuple):
@@ -101,6 +107,11 @@ class Variant:
         if self.person_ious is not None:
             matching = " / ".join(f"{iou:g}" for iou in self.person_ious)
         return zones, cpa, insert, neck, matching, self.score_target or "-"
+
+    def misfit(self, model: PillarModel) -> str | None:
+        """Rows with other thresholds state all classes."""
+        sizes = [[astuple(one)[:_SIZES] for one in classes] for classes in (KITTI_CLASSES, model.spec.classes)]
+        return "states KITTI's classes" if self.person_ious is not None and sizes[0] != sizes[1] else None
 
     @property
     def _learnt(self) -> tuple[str, ...]:

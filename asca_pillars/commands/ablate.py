@@ -43,7 +43,15 @@ def ablate(
 
     from asca_pillars.ablation.ablation_table import read_results, tables
     from asca_pillars.ablation.variants import evaluate_runs, runs, train_runs
-    from asca_pillars.commands.ablate_steps import claim, family_of, parse_seeds, parse_variants, setup, time_variants
+    from asca_pillars.commands.ablate_steps import (
+        check,
+        claim,
+        family_of,
+        parse_seeds,
+        parse_variants,
+        setup,
+        time_variants,
+    )
     from asca_pillars.commands.prepare import prepare
     from asca_pillars.config import load_config
     from asca_pillars.files import atomic_path
@@ -53,7 +61,9 @@ def ablate(
     overrides = override or []
     base = load_config(config, overrides)
     family = family_of(base)
-    todo = runs(out, parse_seeds(seeds), parse_variants(variants, family))
+    rows = parse_variants(variants, family)
+    todo = runs(out, parse_seeds(seeds), rows)
+    check(rows, config, overrides, data)
     claim(out, {"config": to_dict(base), "data": str(data)})
     if any(one.variant.insert != "none" and not one.trained.exists() for one in todo):
         # Once, not by every run that finds nothing there.

@@ -13,9 +13,10 @@ from rich.progress import track
 from asca_pillars.ablation.ablation_table import Speed
 from asca_pillars.ablation.two_stage_variants import TWO_STAGE
 from asca_pillars.ablation.variants import PILLARS, Family, Row, Run
-from asca_pillars.config import Config
+from asca_pillars.config import Config, load_config
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.data.open_split import open_split
+from asca_pillars.errors import ConfigError, DatasetError, TrainingError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.system import command_line, cpu_model, package_versions
 
@@ -73,9 +74,12 @@ def parse_seeds(text: str) -> list[int]:
         ConfigError: it is something else.
     """
     try:
-        return [int(part) for part in text.split(",")]
+        seeds = [int(part) for part in text.split(",")]
     except ValueError:
-        raise ConfigError(f"--seeds {text}: whole numbers with commas between them, such as 0,1") from None
+        seeds = [-1]
+    if min(seeds) < 0 or len(set(seeds)) < len(seeds):
+        raise ConfigError(f"--seeds {text}: different whole numbers with commas between them, such as 0,1")
+    return seeds
 
 
 def family_of(config: Config) -> Family:
@@ -94,14 +98,39 @@ def parse_variants(text: str, family: Family) -> list[Row]:
     """Names with commas between them, or `all`.
 
     Raises:
-        ConfigError: there is no such variant.
+        ConfigError: there is no such variant, or one is there twice.
     """
     variants = family.variants
     names = list(variants) if text == "all" else text.split(",")
     for name in names:
         if name not in variants:
             raise ConfigError(f"--variants {name}: no such variant; there are {', '.join(variants)}")
+        if names.count(name) > 1:
+            raise ConfigError(f"--variants {text}: {name} is there twice")
     return [variants[name] for name in names]
+
+
+def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: Path) -> None:
+    """Find before hours of training what would end them.
+
+    Raises:
+        ConfigError: a row does not go with the base.
+        DatasetError: the data have no camera, or fewer validation frames than parity is proven on.
+    """
+    from asca_export.exporter import MIN_SCANS
+
+    base = load_config(config, overrides)
+    for variant in variants:
+        if reason := variant.misfit(base.model):
+            raise ConfigError(f"--variants {variant.name}: {reason}; leave it out, or give a base that fits")
+        load_config(config, (*overrides, *variant.overrides))
+    split = open_split(data, "val")
+    if not isinstance(split, KittiSplit):
+        raise DatasetError(f"{data}: the ablation's table is KITTI's AP, which needs a camera; give data in its layout")
+    if len(split.frame_ids) < MIN_SCANS:
+        raise DatasetError(
+            f"{data}: {len(split.frame_ids)} frames in ImageSets/val.txt; at least {MIN_SCANS} are needed to export on"
+        )
 
 
 def time_variants(todo: Sequence[Run], family: Family, data: Path, console: Console) -> dict[str, Speed]:

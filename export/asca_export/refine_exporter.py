@@ -148,6 +148,6 @@ def _first_bundle(
 ) -> Path:
     """Folder of the first stage, with `calibration` in 8 bits; a checkpoint is exported to `temporary`."""
     if Path(source).suffix != CHECKPOINT_SUFFIX:
-        return find_bundle(source if calibration is None else f"{source}_int8")
+        return find_bundle(source if calibration is None else f"{source.rstrip('/')}_int8")
     export_bundle(load_checkpoint(source), temporary, scans, calibration=calibration, progress=progress)
     return temporary

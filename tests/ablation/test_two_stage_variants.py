@@ -8,7 +8,7 @@ import yaml
 
 from asca_pillars.ablation.two_stage_variants import BASE, TWO_STAGE
 from asca_pillars.commands.ablate import ablate
-from asca_pillars.commands.ablate_steps import family_of, parse_variants
+from asca_pillars.commands.ablate_steps import check, family_of, parse_variants
 from asca_pillars.config import load_config
 from asca_pillars.errors import ConfigError
 from asca_pillars.models.build import build_model
@@ -65,6 +65,18 @@ def test_names_are_those_of_the_base_s_family() -> None:
         ConfigError, match=r"model\.kind = pillar_refine: no variants; give a base of kind pillar or pv_rcnn"
     ):
         family_of(load_config("asca_refine_sim"))
+
+
+@pytest.mark.parametrize(
+    ("config", "row", "message"),
+    [
+        ("pv_rcnn_kitti", "msaa", "states other sources than the base has"),
+        ("afe_rcnn_kitti", "gate", "has balls of raw points, which the base has not"),
+    ],
+)
+def test_a_base_that_a_row_would_change_otherwise_is_refused(config: str, row: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"--variants {row}: {message}"):
+        check([TWO_STAGE.variants[row]], config, (), Path("nowhere"))
 
 
 @pytest.mark.usefixtures("in_turn")

@@ -15,7 +15,7 @@ from asca_pillars.ablation.variants import VARIANTS, Variant, evaluate_runs, run
 from asca_pillars.commands import ablate_steps
 from asca_pillars.commands.ablate import ablate
 from asca_pillars.config import load_config, pillar_spec
-from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.errors import AscaError, ConfigError, TrainingError
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import shipped_configs
@@ -74,6 +74,34 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: py
         ablate(config, data=data, out=out, seeds="0", variants="baseline")
 
 
+LONG_CARS = (
+    "model.spec.classes=[{name: Car, length_m: 4.5, width_m: 1.8, height_m: 1.6, z_m: -1, positive_iou: 0.6, "
+    "negative_iou: 0.45}]"
+)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seeds": "0,0"}, "--seeds 0,0: different whole numbers"),
+        ({"seeds": "-1"}, "--seeds -1: different whole numbers"),
+        ({"variants": "baseline,baseline"}, "baseline is there twice"),
+        ({"override": ["model.spec.grid.x_range_m=[0, 61.0]"]}, "x_range_m"),
+        ({"override": [LONG_CARS]}, "--variants cpa_channel_lower_ious: states KITTI's classes"),
+        ({}, "3 frames in ImageSets/val.txt; at least 8 are needed"),
+    ],
+)
+def test_what_would_end_an_ablation_ends_it_before_anything_is_trained(
+    tmp_path: Path, config: str, options: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = write_dataset(tmp_path / "data", 6, val_frames=3)
+    monkeypatch.setattr(variants, "_asca", lambda *_: pytest.fail("too late"))
+    given = {"seeds": "0", "variants": "baseline,cpa_channel_lower_ious"} | options
+    with pytest.raises(AscaError, match=message):
+        ablate(config, data=data, out=tmp_path / "out", **given)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.usefixtures("in_turn")
 def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(tmp_path: Path, config: str) -> None:
     data, names = write_dataset(tmp_path / "data", 14, val_frames=8), "asp_k3_pooled_cpa_channel_fine"
@@ -113,7 +141,7 @@ def test_runs_of_a_seed_come_before_the_next_seed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("seeds", "variants"), [("zero", "all"), ("0", "asp_k9")])
 def test_what_does_not_exist_is_one_line(tmp_path: Path, config: str, seeds: str, variants: str) -> None:
-    with pytest.raises(ConfigError, match=f"{seeds}: whole numbers|{variants}: no such variant"):
+    with pytest.raises(ConfigError, match=f"{seeds}: different whole numbers|{variants}: no such variant"):
         ablate(config, data=tmp_path, out=tmp_path / "out", seeds=seeds, variants=variants)
 
 

@@ -68,7 +68,6 @@ def test_a_checkpoint_runs_both_stages(tmp_path: Path, stage: Path) -> None:
     np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-6)
     assert len(ScanDetector(detector, model.spec)(np.empty((0, 4), np.float32))) == 0
     write_first_stage(stage, cpa="none")
-    open_first_stage.cache_clear()
     with pytest.raises(ConfigError, match=r"first\.ckpt: other weights are there"):
         ScanDetector(load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").detector, model.spec)(points)
 

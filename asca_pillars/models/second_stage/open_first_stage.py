@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from asca_deploy.bundle import MANIFEST
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -15,13 +16,18 @@ from asca_pillars.refine_config import RefineModel
 CHECKPOINT_SUFFIX = ".ckpt"
 
 
-@lru_cache(maxsize=2)
 def open_first_stage(source: str) -> FirstStage:
     """A bundle (folder, or name of one that ships) or a checkpoint.
 
     Raises:
         AscaError: it is missing, damaged, of another family or not in float32; one line.
     """
+    file = Path(source) if Path(source).suffix == CHECKPOINT_SUFFIX else Path(source) / MANIFEST
+    return _open_first_stage(source, file.stat().st_mtime_ns if file.is_file() else 0)
+
+
+@lru_cache(maxsize=2)
+def _open_first_stage(source: str, _changed_ns: int) -> FirstStage:
     if Path(source).suffix == CHECKPOINT_SUFFIX:
         from asca_pillars.models.second_stage.checkpoint_first_stage import CheckpointFirstStage
 
