@@ -44,7 +44,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     target = _prepare(path)
     if target.exists() and not target.is_file():
         raise OutputError(f"{path}: is {'a folder' if target.is_dir() else 'no regular file'}; choose a file's name")
-    with _temporary(target, f".{target.stem}.asca-", target.suffix, folder=False) as temporary, _naming(path):
+    with _naming(path), _temporary(target, f".{target.stem}.asca-", target.suffix, folder=False) as temporary:
         yield temporary
         _sync(temporary)
         temporary.replace(target)
@@ -66,7 +66,7 @@ def atomic_directory(path: str | Path, command: str, marker: str) -> Iterator[Pa
     """
     target = _prepare(path)
     require_replaceable(target, command, marker)
-    with _temporary(target, f".{target.name}.asca-", "", folder=True) as temporary, _naming(path):
+    with _naming(path), _temporary(target, f".{target.name}.asca-", "", folder=True) as temporary:
         yield temporary
         for folder, _, names in os.walk(temporary, topdown=False):
             for name in names:
@@ -133,8 +133,10 @@ def require_own(folder: str | Path, command: str, *markers: str, text: str = "")
     entries = _entries(folder)
     for marker in markers:
         path = folder / marker
-        if path.is_file() and text in path.read_text(encoding="utf-8", errors="replace"):
-            return
+        if path.is_file():
+            content = path.read_text(encoding="utf-8", errors="replace")
+            if text in content or not content:  # nothing was written yet, and nothing can be lost
+                return
     if entries:
         raise OutputError(
             f"{folder}: holds {entries[0].name} and nothing that `{command}` wrote; choose another folder, or empty it"
@@ -243,11 +245,12 @@ def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """Give the name of `path` to an error of the system that names no file, as those of a full disk do."""
+    """Give the name of `path` to an error of the system that names no file, as of a full disk, or the temporary one."""
     try:
         yield
     except OSError as error:
-        if error.filename is not None or isinstance(error, OutputError):
+        named = error.filename is not None and not _TEMPORARY.fullmatch(Path(str(error.filename)).name)
+        if named or isinstance(error, OutputError):
             raise
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
 

@@ -46,12 +46,13 @@ def check_threads(threads: int | None) -> int:
     """The number of CPU threads to use: as asked for, or `default_threads` for None.
 
     Raises:
-        ConfigError: less than one, or more than four for each CPU of the machine, which only wait for each other.
+        ConfigError: no whole number, less than one, or more than four for each CPU of the machine, which only wait for
+            each other.
     """
     if threads is None:
         return default_threads()
     cpus = os.cpu_count() or 1
-    if not 1 <= threads <= 4 * cpus:
+    if not isinstance(threads, int) or not 1 <= threads <= 4 * cpus:
         raise ConfigError(f"threads {threads} must lie between 1 and {4 * cpus}: this machine has {cpus} CPUs")
     return threads
 

@@ -191,6 +191,18 @@ def test_a_full_disk_names_the_file(tmp_path: Path, code: int) -> None:
     assert names(tmp_path) == []
 
 
+def test_a_folder_that_takes_no_file_is_told_by_the_file_s_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *_: object) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(PermissionError) as caught, atomic_path(tmp_path / "a.json"):
+        pass
+    assert caught.value.filename == str(tmp_path / "a.json")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 def test_files_and_folders_are_synced_before_they_get_their_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

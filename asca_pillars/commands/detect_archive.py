@@ -19,7 +19,7 @@ from asca_deploy.manifest import load_any_bundle
 from asca_deploy.shipped import find_bundle
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
-from asca_pillars.commands.detect_files import RUN_FILE, as_line, scan_content
+from asca_pillars.commands.detect_files import RUN_FILE, RUN_MARK, as_line, scan_content
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions
@@ -133,7 +133,8 @@ def detect_archive(
     require("cluster")
     if options.provider == "auto":
         raise ConfigError("--provider auto: each machine would choose its own; name one provider with --cluster")
-    require_own(out, "asca detect", RUN_FILE, f"{SHARDS}/{RUN_SETTINGS}")
+    if not (out / SHARDS / RUN_SETTINGS).is_file():
+        require_own(out, "asca detect", RUN_FILE, text=RUN_MARK)
     console = Console(markup=False)
     for line in scan_input.said:
         console.print(line, style="yellow", soft_wrap=True)

@@ -19,6 +19,7 @@ from asca_pillars.files import atomic_path, require_own, write_json
 from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 
 RUN_FILE = "detections.jsonl"
+RUN_MARK = '"scan": '  # in each of its lines
 
 
 class ResultWriter:
@@ -40,7 +41,7 @@ class ResultWriter:
         """What could not be drawn or written, and why; for the user."""
 
     def __enter__(self) -> "ResultWriter":
-        require_own(self.out, "asca detect", RUN_FILE)
+        require_own(self.out, "asca detect", RUN_FILE, text=RUN_MARK)
         return self
 
     def __exit__(

@@ -19,7 +19,7 @@ from asca_deploy import Detector, find_bundle
 from asca_deploy.manifest import load_any_bundle
 from asca_deploy.tracker import Tracker
 from asca_pillars.commands import detect_tables as show
-from asca_pillars.commands.detect_files import RUN_FILE
+from asca_pillars.commands.detect_files import RUN_FILE, RUN_MARK
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.foxglove_file import FoxgloveFile, require_own_file
 from asca_pillars.commands.models import open_detector
@@ -74,7 +74,7 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     if task.foxglove is not None:
         require_own_file(task.foxglove)
     calibration = None if task.calib is None else read_calibration(task.calib)
-    require_own(task.out, "asca detect", RUN_FILE, JOURNAL_FILE)
+    _claim(task.out)
     recording = open_recording(task.path)
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:
@@ -112,6 +112,12 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     _tell(task, run, detector, seconds, console)
     if told := [*sorted(filter(None, damages)), *run.skipped()]:
         raise ScanError("; ".join(told))
+
+
+def _claim(out: Path) -> None:
+    """Make sure that nothing but results and journals of ours is in `out`; OutputError names what is."""
+    if not (out / JOURNAL_FILE).is_file():
+        require_own(out, "asca detect", RUN_FILE, text=RUN_MARK)
 
 
 class _Run:

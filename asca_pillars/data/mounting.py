@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.geometry.frame_change import FrameChange, is_rigid
 from asca_pillars.schema import Strict
 
 Row: TypeAlias = tuple[float, float, float, float]
@@ -64,11 +64,9 @@ class Mounting(Strict):
         if self.axes != "x-forward":
             raise ConfigError(f"axes {self.axes} and a pose: the pose turns the axes already; give one of them")
         pose = np.array(self.pose, np.float64)
-        turn = pose[:3, :3]
-        rigid = np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=1e-3)
-        if not rigid or np.linalg.det(turn) < 0 or not np.allclose(pose[3], [0, 0, 0, 1]):
+        if not is_rigid(pose):
             raise ConfigError("pose: must be a rotation and a shift, the last row 0 0 0 1")
-        return FrameChange(turn, pose[:3, 3])
+        return FrameChange(pose[:3, :3], pose[:3, 3])
 
     def to_model(self, trained_height_m: float | None) -> FrameChange:
         """From the scan to the model's frame.

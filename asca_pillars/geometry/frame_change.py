@@ -68,3 +68,10 @@ class FrameChange:
         arrows = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) @ self.axes[:2, :2].T
         turned = wrap_angle(np.arctan2(arrows[:, 1], arrows[:, 0]).astype(np.float32))
         return np.concatenate([centers, boxes[:, 3:6], turned[:, None]], axis=1).astype(np.float32)
+
+
+def is_rigid(matrix: NDArray[np.float64]) -> bool:
+    """Whether a (4, 4) matrix is a rotation, not a mirror image, and a shift: its last row is 0 0 0 1."""
+    turn = matrix[:3, :3]
+    orthogonal = bool(np.isfinite(matrix).all() and np.allclose(turn @ turn.T, np.eye(3), atol=1e-3))
+    return orthogonal and bool(np.linalg.det(turn) > 0) and np.allclose(matrix[3], [0, 0, 0, 1])

@@ -111,14 +111,24 @@ class SceneConfig:
     __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
     def __post_init__(self) -> None:
-        normal = ("slope_x", "slope_y", "box_lift_m", "level_band_m")  # no bounds of a draw
+        normal = ("slope_x", "slope_y", "level_band_m")  # no bounds of a draw
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, tuple):
+            if item.name == "box_lift_m":
+                if min(deviation for _, deviation in value) < 0:
+                    raise ConfigError(f"{item.name} is {value}: deviations must not be negative")
+            elif isinstance(value, tuple):
                 if item.name not in normal and value[0] > value[1]:
                     raise ConfigError(f"{item.name} is {value}: the lower bound comes first")
+                if value[1 if item.name in normal else 0] < 0 and item.name != "embankment_slope":
+                    what = "the second number" if item.name in normal else "the lower bound"
+                    raise ConfigError(f"{item.name} is {value}: {what} must not be negative")
             elif value < 0:
                 raise ConfigError(f"{item.name} is {value}: it must not be negative")
+        if self.sensor_height_m[0] <= 0:
+            raise ConfigError(f"sensor_height_m is {self.sensor_height_m}: the sensor is above the ground")
+        if self.reach_m <= 2:
+            raise ConfigError(f"reach_m is {self.reach_m}: objects stand beyond 2 m")
         if self.people_dispersion <= 0:
             raise ConfigError(f"people_dispersion is {self.people_dispersion}: it must be positive")
         kinds = self.residential + self.urban + self.rural + self.campus + self.road + self.alley

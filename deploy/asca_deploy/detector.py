@@ -121,6 +121,8 @@ class Detector:
             _log.info(auto.summary(self.runs_on, self.candidates))
         if view not in get_args(View):
             raise ConfigError(f"view {view}: give {' or '.join(get_args(View))}")
+        if not isinstance(mounting, Mounting | None):
+            raise ConfigError(f"mounting {mounting!r:.40}: give Mounting(...), such as Mounting(sensor_height_m=1.8)")
         expected = self.bundle.expected_input
         self.view, self.mounting = view, mounting or Mounting()
         self._to_model = self.mounting.to_model(expected.sensor_height_m)

@@ -17,7 +17,7 @@ from asca_deploy.tracks import Tracks
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.assignment import UNMATCHED, best_assignments
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.geometry.frame_change import FrameChange, is_rigid
 from asca_pillars.geometry.overlap import paired_bev_intersection
 
 _Doubles = NDArray[np.float64]
@@ -30,6 +30,8 @@ ACCELERATION_MPS2 = 3.0
 GATE = 9.21  # squared distance over its variance: 99 % of a track's own detections in the plane
 FADE_PER_S = 1.0  # of a track's score that nothing confirms
 MAX_SCORE = 0.98  # so that the best tracks end, too
+MAX_SCAN_GAP_S = 2.0  # between two scans of one drive
+MAX_UNLOOKED_FADE_S = 0.2  # of the time until the first scan after a detection, in which nobody looked
 
 
 @dataclass
@@ -68,7 +70,8 @@ class Tracker:
             name. With several classes, those that are not named take the lowest.
         report_score: a track is reported from this score on: at once if it begins so well, else after a second look.
         death_score: a track ends below it. Unseen, it loses `FADE_PER_S` of its score per second.
-        max_unseen_s: a track that nothing confirmed for so long ends, whatever its score.
+        max_unseen_s: a track that nothing confirmed for so long ends, whatever its score. One that the last scan
+            confirmed waits for this scan, if the two are at most `MAX_SCAN_GAP_S` apart.
 
     Raises:
         ConfigError: a score lies outside 0..1, or a time is not positive.
@@ -114,7 +117,7 @@ class Tracker:
             The detections that belong to a track which is sure enough, with its identity and velocity.
 
         Raises:
-            ConfigError: `time_s` is not finite, or the pose no 4x4 matrix of finite numbers.
+            ConfigError: `time_s` is not finite, or the pose no rotation and shift.
         """
         pose = _checked_pose(ego_pose)
         if not np.isfinite(time_s):
@@ -145,9 +148,10 @@ class Tracker:
     def _predict(self, elapsed_s: float) -> None:
         """Move all tracks on, and drop those that faded."""
         state = self._state
-        state.scores = state.scores - FADE_PER_S * elapsed_s
+        seen = (state.unseen_s == 0) & (elapsed_s <= MAX_SCAN_GAP_S)
+        state.scores = state.scores - FADE_PER_S * np.where(seen, min(elapsed_s, MAX_UNLOOKED_FADE_S), elapsed_s)
         state.unseen_s = state.unseen_s + elapsed_s
-        state = state.chosen((state.scores >= self._death_score) & (state.unseen_s <= self._max_unseen_s))
+        state = state.chosen((state.scores >= self._death_score) & (seen | (state.unseen_s <= self._max_unseen_s)))
         state.boxes[:, :2] += elapsed_s * state.velocities
         place, both, speed = state.covariance.T
         noise = ACCELERATION_MPS2**2 * np.array([elapsed_s**4 / 4, elapsed_s**3 / 2, elapsed_s**2])
@@ -210,4 +214,6 @@ def _checked_pose(pose: NDArray[np.floating[Any]] | None) -> _Doubles:
     matrix = np.asarray(pose, np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ConfigError(f"ego_pose of shape {matrix.shape}: give a 4x4 matrix of finite numbers, scan to world")
+    if not is_rigid(matrix):
+        raise ConfigError("ego_pose: must be a rotation and a shift in metres, the last row 0 0 0 1, scan to world")
     return matrix

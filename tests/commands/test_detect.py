@@ -70,6 +70,10 @@ def test_a_folder_of_other_files_is_refused_and_one_of_an_earlier_run_is_not(tmp
     with pytest.raises(OutputError, match=r"holds 1\.json and nothing that `asca detect` wrote"):
         detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
     assert (tmp_path / "mine" / "1.json").read_text() == "mine"
+    (tmp_path / "mine" / "1.json").unlink()
+    (tmp_path / "mine" / "detections.jsonl").write_text('{"mine": 1}')
+    with pytest.raises(OutputError, match=r"holds detections\.jsonl and nothing that `asca detect` wrote"):
+        detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
     for scans in (tmp_path / "scans", tmp_path / "scans" / "2.bin"):
         detect([scans], out=tmp_path / "out", threads=1, pictures=False)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "2.json", "detections.jsonl"}

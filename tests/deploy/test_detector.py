@@ -160,6 +160,9 @@ def test_score_threshold_overrides_every_class(tiny_bundle: Path, scan: Points) 
     ("options", "name"),
     [
         ({"score_threshold": 1.5}, "score_threshold 1.5"),
+        ({"score_threshold": "0.5"}, "score_threshold '0.5': give a number"),
+        ({"mounting": {"axes": "x-forward"}}, r"mounting {'axes': .*: give Mounting"),
+        ({"threads": 2.0}, "threads 2.0 must lie between 1 and"),
         ({"threads": 0}, "threads 0 must lie between 1 and"),
         ({"threads": 100_000}, "threads 100000 must lie between 1 and"),
         ({"threads": 99_999_999_999}, "threads 99999999999 must lie"),

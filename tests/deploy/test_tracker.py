@@ -69,6 +69,15 @@ def test_a_track_survives_a_gap_and_ends_after_a_longer_one() -> None:
     assert tracker(found((32, 0, 0.9, 0)), 2.2).track_ids.tolist() == [1]
 
 
+def test_at_one_scan_per_second_what_every_scan_finds_is_one_track() -> None:
+    tracker, weak = Tracker(), Tracker(birth_score=0.4)
+    for step in range(5):
+        assert tracker(found((10, 0, 0.9, 0)), float(step)).track_ids.tolist() == [0]
+        assert weak(found((10, 0, 0.55, 0)), float(step)).track_ids.tolist() == ([0] if step else [])
+    tracker(found(), 5.0)
+    assert tracker(found((10, 0, 0.9, 0)), 6.0).track_ids.tolist() == [1], "it was looked for, and not found"
+
+
 def test_births_and_reports_by_score() -> None:
     tracker = Tracker(birth_score={"Car": 0.3, "Pedestrian": 0.5}, report_score=0.4)
     weak = found((10, 0, 0.35, 0), (10, 9, 0.4, 1))
@@ -135,5 +144,8 @@ def test_impossible_settings_are_refused(values: dict) -> None:
 def test_wrong_poses_and_times_are_refused(wrong: np.ndarray) -> None:
     with pytest.raises(ConfigError, match="4x4"):
         Tracker()(found(), 0.0, wrong)
+    for shifted in (pose(5).T, 1000 * pose(), np.diag([1, -1, 1, 1])):
+        with pytest.raises(ConfigError, match="must be a rotation and a shift in metres"):
+            Tracker()(found(), 0.0, shifted)
     with pytest.raises(ConfigError, match="time nan"):
         Tracker()(found(), float("nan"))

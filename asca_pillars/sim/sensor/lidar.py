@@ -7,7 +7,7 @@ The scan is taken as if the car stood still: KITTI's scans are corrected for the
 a scan is taken, but the laser sweeps over one in some milliseconds, in which it moves less than its label box is loose.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +91,12 @@ class Lidar:
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise ConfigError(f"{name} is {low, high}: the lower bound comes first, and is not negative")
+        if self.zero_power[0] == 0:  # its logarithm is drawn
+            raise ConfigError(f"zero_power is {self.zero_power}: must be positive")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, int | float) and value < 0:
+                raise ConfigError(f"{item.name} is {value}: must not be negative")
 
     @property
     def rings(self) -> int:
