@@ -49,6 +49,7 @@ class ScanQueue:
         self._next = 0  # the scan whose tag is asked for next, counted as `taken`
         self._changed = threading.Condition()
         self._closed = False
+        self._stream = 0  # the iterator that scans are for, counted; one before it ends
         self.dropped = self.taken = 0
 
     def put(self, points: NDArray[Any], tag: Any = None) -> bool:
@@ -76,6 +77,12 @@ class ScanQueue:
             self._closed = True
             self._changed.notify_all()
 
+    def interrupt(self) -> None:
+        """End the iterator that is under way; what waits stays for the next one. A stream that is left calls it."""
+        with self._changed:
+            self._stream += 1
+            self._changed.notify_all()
+
     def next_tag(self) -> Any:
         """The tag of the oldest scan that was handed out: call it once for each result of the stream.
 
@@ -96,10 +103,14 @@ class ScanQueue:
             # Scans that an earlier stream took and never handed out have no result that could ask for their tags.
             self._tags.clear()
             self._next = self.taken
+            self._stream += 1
+            return self._scans(self._stream)
+
+    def _scans(self, stream: int) -> Iterator[NDArray[Any]]:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._waiting)
-                if not self._waiting:
+                self._changed.wait_for(lambda: self._closed or self._waiting or self._stream != stream)
+                if not self._waiting or self._stream != stream:
                     return
                 points, tag = self._waiting.popleft()
                 if tag is not None:

@@ -27,7 +27,8 @@ def overlapped(
 
     `scans` is read in a thread of its own, so that reading files or waiting for a sensor overlaps too, and never more
     than one scan ahead of the one that is asked for. Closing the iterator waits for the stages that run, and for the
-    scan if one is being read, and ends both threads.
+    scan if one is being read, and ends both threads. A source that may wait for ever has a method `interrupt`, which is
+    called first and lets its iterator end (`scan_queue.ScanQueue`).
 
     Args:
         scans: read in the host's thread.
@@ -52,7 +53,7 @@ class _Ahead(Generic[Scan, Ready, Maps]):
     """Two threads, each of which does its own stage of scan after scan."""
 
     def __init__(self, scans: Iterable[Scan], prepare: Callable[[Scan], Ready], infer: Callable[[Ready], Maps]) -> None:
-        self._scans = iter(scans)
+        self._source, self._scans = scans, iter(scans)
         self._prepare, self._infer = prepare, infer
         self._ended = False
         self._host = ThreadPoolExecutor(1, "asca-host")
@@ -62,6 +63,9 @@ class _Ahead(Generic[Scan, Ready, Maps]):
         return self
 
     def __exit__(self, *_: object) -> None:
+        interrupt = getattr(self._source, "interrupt", None)
+        if interrupt is not None:
+            interrupt()
         # The host first: the network's thread may be waiting for it.
         self._host.shutdown(cancel_futures=True)
         self._network.shutdown(cancel_futures=True)

@@ -1,5 +1,6 @@
 """Scans that come too fast are dropped and counted, or waited for."""
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -120,6 +121,33 @@ def test_tags_keep_their_places_among_scans_without_and_those_leave_nothing_behi
     assert [queue.next_tag() for _ in range(2000)] == [n if n % 500 == 1 else None for n in range(2000)]
     with pytest.raises(IndexError, match="once for each result"):
         queue.next_tag()
+
+
+@pytest.mark.parametrize("way", ["left", "error"])
+def test_a_stream_over_a_silent_sensor_can_be_left(
+    tiny_bundle: Path, started: list[threading.Thread], way: str
+) -> None:
+    """The sensor stops without a word; leaving the loop does not wait for it, and a new stream goes on."""
+    queue, detector = ScanQueue("wait", size=3), Detector(tiny_bundle)
+    for number in range(2):
+        queue.put(make_scan(number), tag=number)
+    left = threading.Event()
+
+    def drive() -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            for _ in detector.stream(queue):
+                if way == "left":
+                    break
+                raise KeyboardInterrupt
+        left.set()
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    assert left.wait(PATIENCE_S)
+    started.append(thread)
+    queue.put(make_scan(2), tag=2)
+    queue.close()
+    assert [queue.next_tag() for _ in detector.stream(queue)][-1] == 2
 
 
 def test_impossible_wishes() -> None:
