@@ -18,7 +18,7 @@ from asca_deploy.shipped import find_bundle
 from asca_export import graphs
 from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import draft_bundle, export_bundle, require_parity_scans, write_proven
-from asca_export.int8 import MAX_LOGIT_ERROR, logit_error, write_quantized
+from asca_export.int8 import MAX_LOGIT_ERROR, calibration_scans, logit_error, write_quantized
 from asca_export.neck_output import add_neck_output, add_neck_steps, scale_bev
 from asca_export.refine_graph import export_refine
 from asca_export.refine_parity import prove_refine_parity
@@ -60,6 +60,8 @@ def export_refine_bundle(
         raise ExportError(f"model.kind {config.model.kind}: not a second stage")
     model = with_first_stage(dataclasses.replace(detector.model, spec=pillar_spec(config)))
     stage = open_first_stage(model.first_stage)
+    if calibration is not None:  # too few are told before the work, not after it
+        calibration = calibration_scans(calibration, scans, model.spec).used
     with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, "asca export", MANIFEST) as folder:
         first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, progress)
         proposing = load_bundle(first)

@@ -117,6 +117,8 @@ def test_eight_bits_of_other_weights_are_refused(tmp_path: Path, monkeypatch: py
     detector = build_model(config.model)
     assert isinstance(detector, RefineDetector)
     checkpoint = Checkpoint(config, detector.eval(), 0)
+    with pytest.raises(ExportError, match="0 scans with points on the grid given to calibrate on, at least 8"):
+        export_refine_bundle(checkpoint, "out", SCANS, calibration=SCANS)
     with pytest.raises(BundleError, match="first_int8: no such folder"):
         export_refine_bundle(checkpoint, "out", SCANS, calibration=CALIBRATION)
     other = tiny_checkpoint("channel")
