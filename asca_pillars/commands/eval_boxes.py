@@ -18,6 +18,7 @@ from asca_pillars.commands.eval_steps import (
 )
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError
@@ -69,7 +70,7 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     claim(task.out, task.json)
     split = open_split(task.data, task.split)
     about: dict[str, Any] = {"data": str(task.data), "split": task.split}
-    if task.around and split.has_camera:
+    if task.around and isinstance(split, BoxSplit) and split.has_camera:
         raise ConfigError(f"--around: {task.data} has labels within an angle ahead alone; leave it out")
     if predictions is None:
         model = open_model(options, task.min_score, sensor_height_m=split.mounting.sensor_height_m, around=task.around)

@@ -135,11 +135,13 @@ class KittiSplit:
     def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
         """(N, 4) of the scan, LiDAR frame; with `camera_view` those that the camera sees."""
         points = read_scan(self.scan_path(frame_id)).points
-        return points[self.in_labeled_view(frame_id, points)] if camera_view else points
+        if camera_view:
+            points = points[in_image(points, self.calibration(frame_id), self.image_size_wh(frame_id))]
+        return points
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which of the positions (N, 3 or more), metres, LiDAR frame, the camera sees."""
-        return in_image(positions, self.calibration(frame_id), self.image_size_wh(frame_id))
+        """(N,) all of the positions: the layout does not say whether labels stand beyond the camera's view, too."""
+        return np.ones(len(positions), bool)
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
         """(N, 4) x, y, z in metres, LiDAR frame, and reflectance, as the file has them."""

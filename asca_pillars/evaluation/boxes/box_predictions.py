@@ -96,8 +96,6 @@ def _can_be_judged(
     split: LabeledSplit, frame_id: str, objects: NDArray[np.float32], found: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """Of the boxes (N, 7): which stand where objects are labelled, or so near one of `objects` that it may be meant."""
-    if not split.has_camera:
-        return np.ones(len(found), bool)
     apart = np.linalg.norm(found[:, None, :2] - objects[None, :, :2], axis=2)
     return np.asarray(split.in_labeled_view(frame_id, found[:, :3]) | (apart < NEAR_LABEL_M).any(axis=1))
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from asca_deploy.bundle import MANIFEST
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -22,8 +21,8 @@ def open_first_stage(source: str) -> FirstStage:
     Raises:
         AscaError: it is missing, damaged, of another family or not in float32; one line.
     """
-    file = Path(source) if Path(source).suffix == CHECKPOINT_SUFFIX else Path(source) / MANIFEST
-    return _open_first_stage(source, file.stat().st_mtime_ns if file.is_file() else 0)
+    path = Path(source)  # of a bundle the folder, which an export replaces as a whole
+    return _open_first_stage(source, path.stat().st_mtime_ns if path.exists() else 0)
 
 
 @lru_cache(maxsize=2)
