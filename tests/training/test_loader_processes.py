@@ -36,11 +36,11 @@ def test_it_outlives_the_first_sigterm_of_its_job() -> None:
     here, there = context.Pipe()
     process = context.Process(target=answer, args=(there,))
     process.start()
-    assert here.recv() == "ready" and process.pid is not None
+    assert here.poll(30) and here.recv() == "ready" and process.pid is not None
     for number in (signal.SIGINT, signal.SIGTERM):
         os.kill(process.pid, number)
         here.send(None)
-        assert here.recv() == "still here"
+        assert here.poll(30) and here.recv() == "still here"
     process.terminate()
     process.join(30)
     assert process.exitcode == -signal.SIGTERM
