@@ -73,11 +73,9 @@ def parse_seeds(text: str) -> list[int]:
     Raises:
         ConfigError: it is something else.
     """
-    try:
-        seeds = [int(part) for part in text.split(",")]
-    except ValueError:
-        seeds = [-1]
-    if min(seeds) < 0 or len(set(seeds)) < len(seeds):
+    parts = [part.strip() for part in text.split(",")]
+    seeds = [int(part) for part in parts if part.isdecimal()]
+    if len(set(seeds)) < len(parts):
         raise ConfigError(f"--seeds {text}: different whole numbers with commas between them, such as 0,1")
     return seeds
 

@@ -114,8 +114,10 @@ def check_of_a_model(predictions: Path, options: RuntimeOptions, min_score: floa
         f"--precision {options.precision}": options.precision != plain.precision,
         f"--min-score {min_score:g}": min_score != MIN_SCORE,
     }
-    for option in (name for name, differs in given.items() if differs):
-        raise ConfigError(f"{option} is for running a model; --predictions {predictions} are scored as they are")
+    if options_given := [name for name, differs in given.items() if differs]:
+        raise ConfigError(
+            f"{options_given[0]} is for running a model; --predictions {predictions} are scored as they are"
+        )
 
 
 def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:

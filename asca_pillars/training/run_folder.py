@@ -1,7 +1,6 @@
 """The folder of a run: what it is, so that only the same run goes on in it."""
 
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path, write_json
-from asca_pillars.schema import parse, to_dict
+from asca_pillars.schema import to_dict
 from asca_pillars.settings import read_settings
 from asca_pillars.system import describe_environment
 
@@ -64,8 +63,9 @@ def claim(out: Path, config: Config, seen: Seen) -> None:
 
 
 def recorded_precision(out: Path) -> Precision:
-    """Which `train.precision` the run in `out` was started with; `auto` if it is of a version that wrote it down so."""
-    return load_config(out / "config.yaml").train.precision
+    """Which `train.precision` the run in `out` was started with; `auto` where that is not written down."""
+    path = out / "config.yaml"
+    return load_config(path).train.precision if path.exists() else "auto"
 
 
 def measure_input(out: Path, frames: TrainingFrames, *, keep: bool) -> ExpectedInput:
@@ -114,7 +114,7 @@ def _why_another(path: Path, config: Config) -> str | None:
 
 def _why_other_frames(path: Path, seen: Seen) -> str | None:
     """In what words `seen` is not what `path` says of the run there; None if it is."""
-    found = parse(Seen, json.loads(path.read_text(encoding="utf-8")), str(path))
+    found = read_settings(Seen, path, (), {})
     if found.processes != seen.processes:
         return (
             f"{path}: the run there was started with {found.processes} process(es), now {seen.processes}: its steps "

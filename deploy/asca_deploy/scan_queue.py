@@ -49,7 +49,7 @@ class ScanQueue:
         self._next = 0  # the scan whose tag is asked for next, counted as `taken`
         self._changed = threading.Condition()
         self._closed = False
-        self._stream = 0  # the iterator that scans are for, counted; one before it ends
+        self._stream = 0  # number of the iterator that gets the scans; iterators of other numbers end
         self.dropped = self.taken = 0
 
     def put(self, points: NDArray[Any], tag: Any = None) -> bool:

@@ -24,7 +24,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError, ConfigError, OutputError, ScanError
 from benchmarks.made_recordings import write_recording
-from tests.data.recordings.cloud_recordings import laid_out, odometry_message, stamps, write_mcap
+from tests.data.recordings.cloud_recordings import laid_out, stamps, write_mcap
 from tests.in_process import run_here
 from tests.scenes import write_dataset
 
@@ -77,35 +77,6 @@ def test_tracks_last_and_move(drive: Path, tmp_path: Path) -> None:
         assert after["x_m"] - before["x_m"] == pytest.approx(-0.5 * (SCANS - 1), abs=0.4)
     assert np.median([after["vx_mps"] for _, after in both]) == pytest.approx(-5, abs=1)
     assert len(list(read_frames(tmp_path / "detections.jsonl"))) == SCANS, "other tools read the lines"
-
-
-def test_with_odometry_what_stands_still_has_no_speed(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The scans of `drive` are those of a car that drives 5 m/s past things that stand still."""
-    messages = [
-        (time_ns, laid_out(POINTS - np.array([0.5 * i, 0, 0, 0], np.float32), time_ns=time_ns))
-        for i, time_ns in enumerate(stamps(SCANS))
-    ]
-    poses = [
-        (time_ns - 10**7, odometry_message(time_ns - 10**7, 100 + 0.5 * i - 0.05))
-        for i, time_ns in enumerate(stamps(SCANS + 1))
-    ]
-    path = write_mcap(tmp_path / "drive.mcap", {"/lidar": messages}, odometry=poses)
-    lines = run(path, tmp_path / "out", track=True, odometry="/odom")
-    speeds = [np.hypot(box["vx_mps"], box["vy_mps"]) for box in lines[-1]["boxes"] if box["class"] == "Car"]
-    assert len(speeds) >= 3 and np.median(speeds) < 1
-    late = [(time_ns + 37 * 10**9, odometry_message(time_ns + 37 * 10**9, 0.0)) for time_ns in stamps(SCANS)]
-    other = write_mcap(tmp_path / "other.mcap", {"/lidar": messages}, odometry=late)
-    with pytest.raises(ScanError, match=r"from \+37.0 to \+37.4 s of the first scan; 5 of 5 scans are at other times"):
-        run(other, tmp_path / "other", track=True, odometry="/odom")
-    short = write_mcap(tmp_path / "short.mcap", {"/lidar": messages}, odometry=poses[:2])
-    run(short, tmp_path / "short", track=True, odometry="/odom")
-    assert "2 of 5 scans lie outside" in " ".join(capsys.readouterr().out.split())
-    with pytest.raises(ConfigError, match="give --track"):
-        run(path, tmp_path / "out", odometry="/odom")
-    with pytest.raises(ScanError, match="/lidar holds no nav_msgs/msg/Odometry; there is /odom"):
-        run(path, tmp_path / "out", track=True, odometry="/lidar")
 
 
 def test_foxglove_file_is_read_back(drive: Path, tmp_path: Path) -> None:

@@ -120,6 +120,9 @@ def test_a_run_goes_on_with_its_own_frames_and_processes_alone(tmp_path: Path) -
         claim(tmp_path, CONFIG, Seen.of(["a", "b", "c"], 1))
     with pytest.raises(TrainingError, match=r"started with 1 process\(es\), now 2: .* give as many --devices"):
         claim(tmp_path, CONFIG, Seen.of(["a", "c"], 2))
+    (tmp_path / "frames.json").write_text("{")
+    with pytest.raises(ConfigError, match=r"frames\.json: not valid YAML"):
+        claim(tmp_path, CONFIG, SEEN)
     (tmp_path / "frames.json").unlink()  # an older version wrote none
     claim(tmp_path, CONFIG, SEEN)
 

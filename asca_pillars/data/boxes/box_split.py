@@ -149,6 +149,8 @@ class BoxSplit:
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which of the positions (N, 3 or more), metres, level frame, lie within the labelled angle."""
+        if not self.has_camera:  # rounded, the angle straight behind is more than half a turn
+            return np.ones(len(positions), bool)
         angles = np.arctan2(positions[:, 1], positions[:, 0])
         return np.asarray(np.abs(angles) <= np.radians(self.settings.labeled_view_deg / 2))
 

@@ -202,3 +202,12 @@ def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
     (root / "dataset.yaml").write_text("axes: y,-x,z\n")
     mended = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
     assert [finding.about for finding in mended] == [finding.about for finding in right]
+
+
+def test_labels_all_around_leave_nothing_out(tmp_path: Path) -> None:
+    """Straight behind: rounded to float32, half a turn is more than half a turn."""
+    split = BoxSplit(write_box_dataset(tmp_path / "own", 2))
+    behind = np.array([[-5, 0, 0, 0.1]], np.float32)
+    assert split.in_labeled_view("000000", behind).all()
+    write_scan(split.scan_path("000000"), behind)
+    assert len(split.points("000000", camera_view=True)) == 1
