@@ -24,8 +24,9 @@ class VoxelSpec(DetectorSpec):
 
     Attributes:
         grid: of the voxels.
-        last_stride: of conv4 seen from above. With 1 the map has cells of four voxels instead of eight; along z conv4
-            always halves.
+        last_stride: of conv4 seen from above; along z it always halves. With 1 the map has cells of four voxels instead
+            of eight, and conv4's first convolution has a kernel along z alone: one that kept the resolution and grew
+            sideways would more than double the active cells.
         anchor_places: `ends`: anchors stand evenly from one end of the range to the other, both included, as in the
             published PV-RCNN; `cells`: at the centers of the map's cells.
 
@@ -57,8 +58,9 @@ class VoxelSpec(DetectorSpec):
     def strided(self) -> tuple[Convolution, ...]:
         """The convolutions from level to level: conv2, conv3, conv4, conv_out."""
         *first, fourth, out = PV_RCNN_STRIDED
-        last = self.last_stride
-        return *first, Convolution(fourth.kernel, (fourth.stride[0], last, last), fourth.padding), out
+        if self.last_stride == 1:
+            fourth = Convolution((fourth.kernel[0], 1, 1), (fourth.stride[0], 1, 1), (fourth.padding[0], 0, 0))
+        return *first, fourth, out
 
     @cached_property
     def level_shapes(self) -> tuple[Shape, ...]:

@@ -26,6 +26,16 @@ def test_a_map_of_finer_cells() -> None:
     np.testing.assert_allclose(spec.map_places_m()[0][:2], [0.0, 0.4])
 
 
+def test_a_level_that_keeps_its_resolution_does_not_grow_sideways() -> None:
+    spec = VoxelSpec(grid=VoxelGrid((0.0, 6.4), (-3.2, 3.2), size_m=(0.1, 0.1, 0.1)), last_stride=1)
+    builder = spec.table_builder()
+    voxelize(np.array([[1.0, 0.0, -1.0, 0.5], [5.0, 2.0, 0.3, 0.5]], np.float32), spec.grid, builder.maps[0])
+    levels = builder.build()
+    above = [set(level.cells // shape[0]) for level, shape in zip(levels, spec.level_shapes, strict=True)]
+    assert above[2] == above[3] == above[4], "conv4 and conv_out have the columns of conv3"
+    assert levels[3].strided.shape[1] == levels[4].strided.shape[1] == 3
+
+
 def test_centers_of_coarse_voxels_hold_their_points() -> None:
     rng = np.random.default_rng(0)
     spec = VoxelSpec(grid=VoxelGrid((0.0, 6.4), (-3.2, 3.2), size_m=(0.1, 0.1, 0.1)))
