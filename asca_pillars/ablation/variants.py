@@ -217,11 +217,19 @@ def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Row]) -> list
     return [Run(variant, seed, Path(out) / variant.name / f"seed{seed}") for seed in seeds for variant in variants]
 
 
-def train_runs(todo: Sequence[Run], config: str, data: str | Path, jobs: int, overrides: Sequence[str] = ()) -> None:
+def train_runs(
+    todo: Sequence[Run],
+    config: str,
+    data: str | Path,
+    jobs: int,
+    overrides: Sequence[str] = (),
+    init: Path | None = None,
+) -> None:
     """Train what is not trained yet, `jobs` processes at a time that share the cores.
 
     Args:
         overrides: of every run, in the form of `asca train -s`; those of the variant win over them.
+        init: weights that every run starts from, see `asca train --init`.
 
     Raises:
         TrainingError: a training failed; the message names its log.
@@ -230,7 +238,8 @@ def train_runs(todo: Sequence[Run], config: str, data: str | Path, jobs: int, ov
 
     def train(run: Run) -> None:
         settings = (*overrides, *run.variant.overrides, f"train.seed={run.seed}")
-        where = ("--data", str(data), "--out", str(run.folder), "--devices", "1")
+        start = () if init is None else ("--init", str(init))
+        where = ("--data", str(data), "--out", str(run.folder), "--devices", "1", *start)
         seconds = _asca(run, ("train", config, *where, *(part for text in settings for part in ("-s", text))), threads)
         with atomic_path(run.trained) as temporary:
             temporary.write_text(json.dumps({"seconds": round(seconds), "threads": threads}), encoding="utf-8")

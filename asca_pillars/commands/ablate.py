@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from asca_pillars.commands.extras import require
-from asca_pillars.commands.options import OverridesOption
+from asca_pillars.commands.options import InitOption, OverridesOption
 
 
 def ablate(
@@ -23,6 +23,7 @@ def ablate(
     override: OverridesOption = None,
     seeds: Annotated[str, typer.Option("--seeds", help="Seeds of every variant, with commas between them.")] = "0,1",
     variants: Annotated[str, typer.Option("--variants", help="Names with commas between them, or all.")] = "all",
+    init: InitOption = None,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Trainings at a time; they share the CPU cores.")] = 1,
 ) -> None:
     """Train and compare: with and without ASP, CPA, GT-Aug and RS-Aug, other K, the readings of CPA; write one table.
@@ -36,6 +37,9 @@ def ablate(
     asca ablate ablation_small --data data/ablation --out runs/ablation --seeds 0,1,2
 
     asca ablate ablation_two_stage --data data/ablation --out runs/two_stage --variants pv_rcnn,deform_paper
+
+    asca ablate ablation_two_stage --data data/ablation --out runs/second -s model.train_first_stage=false --init
+    runs/pvrcnn/checkpoints/last.ckpt --variants pv_rcnn,deform_paper
     """
     require("train")
     from rich.console import Console
@@ -63,12 +67,12 @@ def ablate(
     family = family_of(base)
     rows = parse_variants(variants, family)
     todo = runs(out, parse_seeds(seeds), rows)
-    check(rows, config, overrides, data)
-    claim(out, {"config": to_dict(base), "data": str(data)})
+    check(rows, config, overrides, data, init)
+    claim(out, {"config": to_dict(base), "data": str(data)} | ({} if init is None else {"init": str(init)}))
     if any(one.variant.insert != "none" and not one.trained.exists() for one in todo):
         # Once, not by every run that finds nothing there.
         prepare(Path(config), data=data, override=overrides, workers=default_threads())
-    train_runs(todo, config, data, jobs, overrides)
+    train_runs(todo, config, data, jobs, overrides, init)
     evaluate_runs(todo, data, jobs)
     console = Console(markup=False)
     speeds = time_variants(todo, family, data, console)

@@ -46,7 +46,10 @@ def claim(out: Path, base: dict[str, Any]) -> None:
             "configuration and data, or choose another --out"
         ) from None
     if noted != base:
-        raise TrainingError(f"{path}: the runs there have another base configuration or data; choose another --out")
+        raise TrainingError(
+            f"{path}: the runs there have another base configuration or data, or other initial weights; choose another "
+            "--out"
+        )
 
 
 def setup(todo: Sequence[Run], config: str, data: Path, jobs: int) -> str:
@@ -108,20 +111,25 @@ def parse_variants(text: str, family: Family) -> list[Row]:
     return [variants[name] for name in names]
 
 
-def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: Path) -> None:
+def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: Path, init: Path | None = None) -> None:
     """Find before hours of training what would end them.
 
     Raises:
         ConfigError: a row does not go with the base.
+        TrainingError, BundleError: the weights `init` do not go with a row.
         DatasetError: the data have no camera, or fewer validation frames than parity is proven on.
     """
     from asca_export.exporter import MIN_SCANS
+    from asca_pillars.training.initial_weights import initial_weights
 
     base = load_config(config, overrides)
     for variant in variants:
         if reason := variant.misfit(base.model):
             raise ConfigError(f"--variants {variant.name}: {reason}; leave it out, or give a base that fits")
-        load_config(config, (*overrides, *variant.overrides))
+        try:
+            initial_weights(load_config(config, (*overrides, *variant.overrides)), init)
+        except TrainingError as error:
+            raise TrainingError(f"--variants {variant.name}: {error}") from None
     split = open_split(data, "val")
     if not isinstance(split, KittiSplit):
         raise DatasetError(f"{data}: the ablation's table is KITTI's AP, which needs a camera; give data in its layout")

@@ -50,6 +50,14 @@ OverridesOption = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20"),
 ]
+InitOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--init",
+        help="Weights that a new run starts from: a checkpoint, or a bundle that holds its own (folder, or name of one "
+        "that ships). Where model.train_first_stage is false, its first stage alone is taken.",
+    ),
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write everything measured to this file.")]
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from asca_pillars.commands.extras import require
-from asca_pillars.commands.options import ConfigArgument, DataOption, OverridesOption
+from asca_pillars.commands.options import ConfigArgument, DataOption, InitOption, OverridesOption
 
 INTERRUPTED = 130  # what a shell says of a command that Ctrl-C ended
 
@@ -21,14 +21,7 @@ def train(
     num_nodes: Annotated[
         int, typer.Option("--num-nodes", min=1, help="Machines that train together (torchrun or SLURM starts each).")
     ] = 1,
-    init: Annotated[
-        Path | None,
-        typer.Option(
-            "--init",
-            help="Weights that a new run starts from, to go on with other data: a checkpoint, or a bundle that holds "
-            "its own (folder, or name of one that ships).",
-        ),
-    ] = None,
+    init: InitOption = None,
 ) -> None:
     """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder.
 

@@ -16,13 +16,11 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from asca_deploy.bundle import WEIGHTS
-from asca_deploy.shipped import find_checkpoint
 from asca_pillars.config import Config, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import recover
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import load_checkpoint, save_weights
+from asca_pillars.models.checkpoint import save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.bfloat16 import has_bfloat16, settled
@@ -34,6 +32,7 @@ from asca_pillars.training.checkpoints import (
     LastCheckpoint,
     checkpoint_to_resume,
 )
+from asca_pillars.training.initial_weights import initial_weights
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule
 from asca_pillars.training.run_folder import Seen, claim, measure_input, recorded_precision
@@ -63,15 +62,15 @@ def train(
             that has no checkpoint yet gives way.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
-        init: weights that a new run starts from, instead of random ones: a checkpoint, or a bundle that holds its
-            own (folder, or name of one that ships).
+        init: weights that a new run starts from, see `initial_weights`.
 
     Returns:
         The last checkpoint.
 
     Raises:
         TrainingError: `out` holds a run with another config or on other frames, or only damaged checkpoints, `init` is
-            another network, the devices are not there, or a loss became infinite or NaN.
+            another network, or missing where it is needed, the devices are not there, or a loss became infinite or
+            NaN.
         TrainingInterruptedError: Ctrl-C; the run is saved.
         DatasetError, ScanError: the data cannot be read.
         BundleError, ExportError, ConfigError: the first stage of two cannot be used, or `init` is a bundle without
@@ -89,7 +88,7 @@ def train(
     config = replace(config, train=_with_settled_precision(config.train, out, resumes=resumed is not None))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     # What may be mistyped is looked at before minutes of work, and before the folder is that of this run.
-    weights = None if init is None or resumed is not None else _fitting_weights(config, init)
+    weights = {} if resumed is not None else initial_weights(config, init)
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
@@ -107,8 +106,7 @@ def train(
     L.seed_everything(config.train.seed, verbose=False)
     keep = resumed is not None or not trainer.is_global_zero  # else it may be of scans that were there before
     module = DetectionModule(config, measure_input(out, data.training_set.frames, keep=keep))
-    if weights is not None:
-        module.detector.load_state_dict(weights)
+    module.detector.load_state_dict(module.detector.state_dict() | weights)
     with warnings.catch_warnings(), interrupt.listening():
         # Of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")
@@ -170,17 +168,3 @@ def _trainer(
         )
     except (MisconfigurationException, TypeError, ValueError) as error:
         raise TrainingError(f"devices {devices} x {num_nodes} nodes: {' '.join(str(error).split())}") from None
-
-
-def _fitting_weights(config: Config, init: str | Path) -> dict[str, Any]:
-    """The weights that `init` names; TrainingError if they are not of this configuration's network."""
-    path = find_checkpoint(init)
-    theirs, ours = load_checkpoint(path).detector.state_dict(), build_model(config.model).state_dict()
-    for name in ours | theirs:
-        found, wanted = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
-        if found != wanted:
-            raise TrainingError(
-                f"{path}: weights of another network: {name} is {found} there and {wanted} in this configuration; "
-                "model.spec and model.network have to be like those that it was trained with"
-            )
-    return theirs

@@ -2,18 +2,22 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 import yaml
 
 from asca_pillars.ablation.two_stage_variants import BASE, TWO_STAGE
 from asca_pillars.commands.ablate import ablate
 from asca_pillars.commands.ablate_steps import check, family_of, parse_variants
 from asca_pillars.config import load_config
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.schema import to_dict
+from asca_pillars.training.loop import train
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SETTINGS, tiny_config
 from tests.scenes import write_dataset
 
@@ -82,10 +86,30 @@ def test_a_base_that_a_row_would_change_otherwise_is_refused(config: str, row: s
 @pytest.mark.usefixtures("in_turn")
 def test_from_training_to_the_table(tmp_path: Path) -> None:
     data, base = write_dataset(tmp_path / "data", 10, val_frames=8), tmp_path / "tiny.yaml"
-    base.write_text(yaml.safe_dump(to_dict(tiny_config(FEW_BALLS, epochs=1))))
-    ablate(
-        str(base), data=data, out=tmp_path / "out", seeds="0", variants="deform_gate"
-    )  # graphs of VectorPool take half a minute
+    config = tiny_config(FEW_BALLS, epochs=1)
+    base.write_text(yaml.safe_dump(to_dict(config)))
+    first = train(config, data, tmp_path / "first")
+    options: dict[str, Any] = {
+        "data": data,
+        "out": tmp_path / "out",
+        "seeds": "0",
+        "override": ["model.train_first_stage=false"],
+        "init": first,
+    }
+    with pytest.raises(
+        TrainingError, match=r"--variants rda: .*: weights of another network: network\.neck\.attention"
+    ):
+        ablate(str(base), variants="deform_gate,rda", **options)
+    assert not (tmp_path / "out").exists()
+    ablate(str(base), variants="deform_gate", **options)  # graphs of VectorPool take half a minute
     text = (tmp_path / "out" / "results.md").read_text()
     assert "| paper | yes | balls | - | balls | - | 512 |" in text and "2 frames for training" in text
     assert "(AV PV-RCNN, Tables 5 and 6)" in text and "AFE-RCNN" not in text
+    trained = tmp_path / "out" / "deform_gate" / "seed0" / "checkpoints" / "last.ckpt"
+    voxels = [
+        load_checkpoint(path).detector.state_dict()["network.voxels.down.0.convolution.weight"]
+        for path in (first, trained)
+    ]
+    assert torch.equal(*voxels), "of the first stage that was given"
+    with pytest.raises(TrainingError, match="another base configuration or data"):
+        ablate(str(base), variants="deform_gate", **(options | {"init": trained}))

@@ -1,5 +1,6 @@
 """PV-RCNN through the same training as the other families: resume, evaluation of a checkpoint, what is refused."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,13 @@ import torch
 
 from asca_pillars.config import Config, load_config, pillar_spec
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import ConfigError
+from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.schema import parse, to_dict
 from asca_pillars.training.loop import train
-from tests.models.pv_rcnn.tiny_pv_rcnn import SPEC, tiny_config
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SPEC, tiny_config
 from tests.scenes import write_dataset
 
 
@@ -32,6 +34,27 @@ def test_a_run_made_longer_is_the_longer_run(tmp_path: Path) -> None:
     found = detect(points)
     assert len(found) > 0 and np.isfinite(found.boxes).all()
     assert len(detect(np.empty((0, 4), np.float32))) == 0
+
+
+def test_the_second_stage_alone_on_a_trained_first_one(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 5)
+    both = train(tiny_config(epochs=1), data, tmp_path / "both")
+    network = dataclasses.replace(NETWORK, hidden=16)
+    alone = tiny_config(dataclasses.replace(MODEL, network=network, train_first_stage=False), epochs=1)
+    with pytest.raises(TrainingError, match=r"train_first_stage = false: .* give .* --init"):
+        train(alone, data, tmp_path / "second")
+    weights = load_checkpoint(train(alone, data, tmp_path / "second", init=both)).detector.state_dict()
+    given = load_checkpoint(both).detector.state_dict()
+    kept = [name for name in weights if name.split(".")[1] in PvRcnnModel.FIRST_STAGE]
+    assert {name.split(".")[1] for name in kept} == {"voxels", "neck", "head"}
+    assert all(torch.equal(weights[name], given[name]) for name in kept)
+    assert weights["network.refine.confidence.0.weight"].shape != given["network.refine.confidence.0.weight"].shape
+    train(alone, data, tmp_path / "second")  # a run that is there has its first stage
+
+    wider = dataclasses.replace(network, voxel_channels=(4, 6, 8, 8, 16))
+    alone = tiny_config(dataclasses.replace(MODEL, network=wider, train_first_stage=False), epochs=1)
+    with pytest.raises(TrainingError, match=r"another network: network\.voxels\..* in this configuration"):
+        train(alone, data, tmp_path / "other", init=both)
 
 
 def test_a_configuration_comes_back_from_its_file() -> None:

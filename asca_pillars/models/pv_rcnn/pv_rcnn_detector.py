@@ -53,6 +53,17 @@ class PvRcnnDetector(nn.Module):
         self.network = network
         self.preparation = VoxelPreparation(model.spec, model.settings)
         self.loss_weights = LossConfig()
+        self._kept = () if model.train_first_stage else tuple(getattr(network, name) for name in model.FIRST_STAGE)
+        for part in self._kept:
+            part.requires_grad_(requires_grad=False)
+        self.train()  # Lightning gives back the modes that it found
+
+    def train(self, mode: bool = True) -> "PvRcnnDetector":
+        """As of `torch.nn.Module`; a first stage that is not trained keeps its statistics."""
+        super().train(mode)
+        for part in self._kept:
+            part.eval()
+        return self
 
     def predict(self, batch: LabeledVoxels) -> PvRcnnOutputs:
         """Head maps, proposals and their refinements; training draws the proposals that it learns from."""
@@ -66,16 +77,16 @@ class PvRcnnDetector(nn.Module):
         return PvRcnnOutputs(first.maps, found, proposals)
 
     def loss(self, outputs: PvRcnnOutputs, batch: LabeledVoxels) -> Mapping[str, Tensor]:
-        """The terms of both stages by name, see `detection_loss` and `refine_loss`, all of weight 1."""
+        """The terms of what is trained by name, see `detection_loss` and `refine_loss`, all of weight 1."""
         device = outputs.found.confidence.device
-        first = detection_loss(outputs.maps, batch.anchors, self.loss_weights)
+        first = {} if self._kept else detection_loss(outputs.maps, batch.anchors, self.loss_weights)._asdict()
         targets, learnt = _roi_targets(outputs.proposals, batch)
         counted = torch.from_numpy(learnt).to(device)
         found = outputs.found
         confidence, positive, residuals, sizes = (torch.from_numpy(part[learnt]).to(device) for part in targets)
         wanted = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
         kept = Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits)
-        terms = first._asdict() | refine_loss(kept, wanted)._asdict()
+        terms = first | refine_loss(kept, wanted)._asdict()
         if self.model.box_loss == "va":
             boxes = (kept.residuals[positive].float(), residuals[positive], sizes[positive])
             distance_iou = distance_iou_loss(*boxes).sum() / max(len(boxes[0]), 1)

@@ -112,12 +112,27 @@ def test_every_weight_learns_and_the_same_each_time(changes: dict[str, Any]) -> 
     detector = tiny_detector(training_proposals=EVERY_ANCHOR, **changes)
     with torch.no_grad():
         for weight in detector.network.head.parameters():
-            weight *= 0.1  # proposals stay at their anchors, some of which are objects
+            weight.mul_(0.1)  # proposals stay at their anchors, some of which are objects
     inputs = batch(detector, on_anchors(), frame(1))
     first, again = gradients(detector, inputs), gradients(detector, inputs)
     assert set(first) == {name for name, _ in detector.named_parameters()}
     assert not [name for name, gradient in first.items() if not gradient.any()]
     assert all(torch.equal(gradient, again[name]) for name, gradient in first.items())
+
+
+def test_a_first_stage_that_is_not_trained_stays_as_it_is() -> None:
+    detector = tiny_detector(training_proposals=EVERY_ANCHOR, train_first_stage=False)
+    before = {name: array.clone() for name, array in detector.state_dict().items()}
+    inputs = batch(detector, on_anchors(), frame(1))
+    optimizer = torch.optim.Adam(detector.parameters(), lr=1e-2, weight_decay=0.1, decoupled_weight_decay=True)
+    detector.train()
+    terms = detector.loss(detector.predict(inputs), inputs)
+    assert set(terms) == {"confidence", "residuals", "corners", "keypoints"}
+    torch.stack(list(terms.values())).sum().backward()
+    optimizer.step()
+    first = ("network.voxels.", "network.neck.", "network.head.")
+    changed = {name for name, array in detector.state_dict().items() if not torch.equal(array, before[name])}
+    assert changed and not [name for name in changed if name.startswith(first)]
 
 
 def test_training_draws_from_the_step_s_seed() -> None:
