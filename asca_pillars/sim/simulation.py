@@ -155,10 +155,16 @@ def simulate(
     else:
         for_each(job, todo, workers, progress=progress)
     names = [frame_id(index) for index in range(frames)]
-    first_val = frames - round(frames * val_share)
+    first_val = frames - held_out(frames, val_share)
     write_image_set(root, "train", names[:first_val])
     write_image_set(root, "val", names[first_val:])
     return root
+
+
+def held_out(count: int, share: float) -> int:
+    """How many of so many frames or sequences are for validation: one at least, where one is left to train on."""
+    wanted = round(count * share)
+    return min(max(wanted, 1), count - 1) if 0 < share < 1 and count > 1 else wanted
 
 
 def frame_id(index: int) -> str:

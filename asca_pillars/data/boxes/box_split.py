@@ -28,7 +28,7 @@ from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scan_settings import ScanSettings, sample_points
-from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, find_scans
+from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans
 from asca_pillars.data.scans.scan_reader import ReflectanceScale, read_scan
 from asca_pillars.data.scans.stored_scans import folder_reflectance_scale, stored_points
 from asca_pillars.errors import ConfigError, DatasetError
@@ -162,7 +162,7 @@ class BoxSplit:
         return self._levelled(points)
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:
-        """Size and time of the scan, and dataset.yaml with the pose that it names."""
+        """Size and time of the scan, and dataset.yaml with the pose that it names and the scale that it leaves open."""
         state = self.scan_path(frame_id).stat()
         return state.st_size, state.st_mtime_ns, self._settings_crc
 
@@ -193,7 +193,8 @@ class BoxSplit:
     @cached_property
     def _settings_crc(self) -> int:
         pose = "" if self.settings.pose is None else repr(self.settings.stated_mounting(Path(self.root)).pose)
-        return zlib.crc32(f"{self.settings!r}{pose}".encode())
+        scale = self._reflectance_scale if self.settings.reflectance_scale == "auto" else ""
+        return zlib.crc32(f"{self.settings!r}{pose}{scale}".encode())
 
     @cached_property
     def _level(self) -> FrameChange:
@@ -222,13 +223,18 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
     Raises:
         DatasetError: labels that are missing, wrong, given twice, or of a scan that is not there.
     """
+    if not scans.is_dir():
+        raise DatasetError(f"{scans}: no such folder; give the one that the scans are below as `scans`")
     if labels.is_dir():
         return _frames_of_folder(labels, scans)
     frames: dict[str, BoxFrame] = {}
     places: dict[str, str] = {}
     if labels.suffix.lower() == ".csv":
         nothing = records_from(np.zeros((0, 7)), ())
-        frames = {frame_id_of(path, scans): BoxFrame(path, labels, nothing) for path in find_scans(scans)}
+        for path in find_scans(scans):
+            same = frames.setdefault(frame_id_of(path, scans), BoxFrame(path, labels, nothing)).scan
+            if same != path:
+                raise DatasetError(f"{same} and {path}: both would be frame {frame_id_of(path, scans)}; rename one")
     for scan, records, place, _ in read_frames(labels):
         path = _find_scan(scan, scans, place)
         frame_id = frame_id_of(path, scans)
@@ -258,7 +264,7 @@ def _find_scan(scan: str, scans: Path, place: str) -> Path:
 
 def _frames_of_folder(labels: Path, scans: Path) -> dict[str, BoxFrame]:
     frames: dict[str, BoxFrame] = {}
-    for path in sorted(entry for entry in labels.rglob("*") if entry.suffix.lower() in (".json", ".csv")):
+    for path in sorted(entry for entry in files_below(labels) if entry.suffix.lower() in (".json", ".csv")):
         frame_id = frame_id_of(path, labels)
         there = [scan for suffix in SCAN_SUFFIXES if (scan := scans / f"{frame_id}{suffix}").is_file()]
         if len(there) != 1:

@@ -12,6 +12,7 @@ from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.scans.feather import feather_table
+from asca_pillars.data.scans.find_scans import files_below
 from asca_pillars.errors import DatasetError
 
 AXLE_HEIGHT_M = 0.33
@@ -28,11 +29,12 @@ def read_argoverse2(root: Path) -> Imported:
         DatasetError: no log, or a file that is not of this format.
         AscaError: pyarrow is not installed.
     """
-    logs = sorted(path.parent for path in root.rglob("annotations.feather"))
+    root = root.resolve()  # scans keep their names below it, where they are links too
+    logs = sorted(path.parent for path in files_below(root) if path.name == "annotations.feather")
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
     frames = [frame for log in logs for frame in _frames(log)]
-    settings = BoxDataset(sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root.resolve()))
+    settings = BoxDataset(sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root))
     return Imported(settings, frames)
 
 
@@ -54,5 +56,5 @@ def _frames(log: Path) -> list[ImportedFrame]:
             continue  # a part of a log may have been downloaded
         own = table["timestamp_ns"] == stamp
         records = records_from(boxes[own], table["category"][own].tolist(), None, table["track_uuid"][own].tolist())
-        frames.append(ImportedFrame(scan.resolve(), records, log.name))
+        frames.append(ImportedFrame(scan, records, log.name))
     return frames

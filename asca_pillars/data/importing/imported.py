@@ -14,6 +14,7 @@ import yaml
 from asca_pillars.data.boxes.box_records import BoxRecords, json_line
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, frame_id_of
 from asca_pillars.data.kitti import write_image_set
+from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict
@@ -93,7 +94,9 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
         OutputError: `out` holds something else.
     """
     scans = Path(imported.settings.scans)
-    frames = sorted(imported.frames, key=lambda frame: (frame.recording, frame.scan))
+    frames = sorted(
+        imported.frames, key=lambda frame: (natural_order(Path(frame.recording)), natural_order(frame.scan))
+    )
     if not frames:
         raise DatasetError(f"{scans}: no labelled scan there; give the folder that holds the recordings")
     require_own_dataset(out)
@@ -118,5 +121,7 @@ def _lists(frames: list[ImportedFrame], val_share: float) -> tuple[list[Imported
         held_out = set(recordings[len(recordings) - max(1, math.floor(val_share * len(recordings))) :])
         val = [frame for frame in frames if frame.recording in held_out]
         return [frame for frame in frames if frame.recording not in held_out], val
-    first = len(frames) - math.ceil(val_share * len(frames))
-    return (frames[:first], frames[first:]) if first else (frames, frames)
+    if len(frames) == 1:  # both lists need a frame
+        return frames, frames
+    first = max(1, len(frames) - math.ceil(val_share * len(frames)))
+    return frames[:first], frames[first:]

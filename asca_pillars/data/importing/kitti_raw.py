@@ -16,6 +16,7 @@ from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG
+from asca_pillars.data.scans.find_scans import files_below
 from asca_pillars.errors import DatasetError
 
 LABELS = "tracklet_labels.xml"
@@ -35,7 +36,7 @@ def read_kitti_raw(root: Path) -> Imported:
     Raises:
         DatasetError: no drive, or a file that is not of this format.
     """
-    drives = sorted(path.parent for path in root.resolve().rglob(LABELS))
+    drives = sorted(path.parent for path in files_below(root.resolve()) if path.name == LABELS)
     if not drives:
         raise DatasetError(f"{root}: no {LABELS} below; give a folder of KITTI's drives, with their tracklets")
     frames = [frame for drive in drives for frame in _frames(drive)]

@@ -55,7 +55,7 @@ def read_nuscenes(root: Path) -> Imported:
     try:
         height_m = _sensor_height_m(tables)
         frames = _frames(tables, data)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DatasetError(f"{tables}: the tables do not fit together (at {error}); download them again") from None
     settings = BoxDataset(sensor_height=height_m, axes="y-forward", reflectance_scale=255.0, columns=5, scans=str(data))
     return Imported(settings, frames)
@@ -85,6 +85,8 @@ def _frames(tables: Path, data: Path) -> list[ImportedFrame]:
         if not row["is_key_frame"] or channels[sensor["sensor_token"]] != CHANNEL or not scan.is_file():
             continue
         records = _records(labels.get(row["sample_token"], []), poses[row["ego_pose_token"]], sensor, kinds)
+        if not (np.isfinite(records.boxes).all() and (records.boxes[:, 3:6] > 0).all()):
+            raise ValueError(f"sample {row['sample_token']}: a box with a number that is not finite or no size")
         frames.append(ImportedFrame(scan, records, scenes[samples[row["sample_token"]]["scene_token"]]["name"]))
     return frames
 
@@ -107,8 +109,11 @@ def _records(
 
 
 def rotation(quaternion: list[float]) -> _Doubles:
-    """Unitless rotation matrix (3, 3) of the quaternion w, x, y, z."""
-    w, x, y, z = np.array(quaternion, np.float64) / np.linalg.norm(quaternion)
+    """Unitless rotation matrix (3, 3) of the quaternion w, x, y, z; ValueError if that is none."""
+    norm = np.linalg.norm(quaternion)
+    if not 0 < norm < np.inf:
+        raise ValueError(f"rotation {quaternion}")
+    w, x, y, z = np.array(quaternion, np.float64) / norm
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -144,6 +144,9 @@ def _holding(spec: InspectedSpec, boxes: _Floats) -> InspectedSpec:
 
 def _around(span_m: tuple[float, float], centers: _Floats, outside: float, step_m: float) -> tuple[float, float]:
     """As `_widened`, the same ahead and behind."""
+    if span_m[0] == -span_m[1] and _widened(span_m, centers, outside, step_m) == span_m:
+        half = math.ceil(round(2 * span_m[1] / step_m, 6)) * step_m / 2  # whole steps, which may have changed
+        return -half, half
     reach_m = float(np.quantile(np.abs(centers), 1 - outside))
     half = math.ceil(2 * reach_m / step_m) * step_m / 2
     return -half, half

@@ -145,7 +145,7 @@ class KittiSplit:
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
         """(N, 4) x, y, z in metres, LiDAR frame, and reflectance, as the file has them."""
-        return stored_points(self.scan_path(frame_id))
+        return stored_points(self.scan_path(frame_id), columns=None)
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:
         """Size of the image; size and time of scan and calibration."""

@@ -1,8 +1,9 @@
 """Which files are scans, and under which name the results of each are written."""
 
+import contextlib
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ class NamedScan(NamedTuple):
 def find_scans(path: str | Path) -> list[Path]:
     """The scan at `path`, or those in the folder at `path`, to any depth, in natural order (2.bin before 10.bin).
 
-    Hidden files and folders are left out.
+    Hidden files and folders are left out, links to folders are followed.
 
     Raises:
         ScanError: there is no scan.
@@ -31,10 +32,24 @@ def find_scans(path: str | Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise ScanError(f"{path}: no such file or folder; check the path")
-    scans = [entry for entry in path.rglob("*") if is_scan(entry.relative_to(path)) and entry.is_file()]
+    scans = [entry for entry in files_below(path) if is_scan(entry.relative_to(path)) and entry.is_file()]
     if not scans:
         raise ScanError(f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}")
     return sorted(scans, key=natural_order)
+
+
+def files_below(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[Path]:
+    """Every file below a folder, to any depth, in any order; links to folders are followed.
+
+    Folders that may not be read are left out, and links that lead to a folder which they are in (`above`).
+    """
+    here = above | {folder.resolve()}
+    with contextlib.suppress(PermissionError):
+        for entry in folder.iterdir():
+            if not entry.is_dir():
+                yield entry
+            elif entry.resolve() not in here:
+                yield from files_below(entry, here)
 
 
 def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:

@@ -28,7 +28,7 @@ from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
 from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
-from asca_pillars.sim.simulation import SimulationConfig, take_scan
+from asca_pillars.sim.simulation import SimulationConfig, held_out, take_scan
 
 RATE_HZ = 10.0
 PAUSE_S = 5.0  # from the last scan of a sequence to the first of the next, in the time stamps
@@ -132,7 +132,7 @@ def simulate_sequences(
     todo = [(one, index) for one in range(sequences) for index in range(length)]
     todo = [item for item in todo if not _scan_path(root, *item).exists()]
     for_each(partial(_write_frame, root, plan), todo, workers, progress=progress)
-    first_val = sequences - round(sequences * val_share)
+    first_val = sequences - held_out(sequences, val_share)
     for name, own in (("train", range(first_val)), ("val", range(first_val, sequences))):
         write_image_set(root, name, [f"{one:04d}/{index:06d}" for one in own for index in range(length)])
     with atomic_path(root / DATASET_FILE) as temporary:

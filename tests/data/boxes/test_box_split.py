@@ -71,6 +71,29 @@ def test_with_a_csv_scans_without_a_row_are_frames_without_objects(root: Path) -
     assert [len(split.labeled_boxes(frame_id).boxes) for frame_id in split.frame_ids] == [0, 0, 1]
 
 
+def test_scans_that_are_no_folder_or_of_one_name_are_named(root: Path) -> None:
+    (root / "labels.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n000002.bin,Car,10,0,-1,4,2,1.5,0\n")
+    (root / "dataset.yaml").write_text("labels: labels.csv\nscans: scans/000000.bin\n")
+    with pytest.raises(DatasetError, match=r"000000\.bin: no such folder"):
+        BoxSplit(root).frame_ids  # noqa: B018
+    (root / "dataset.yaml").write_text("labels: labels.csv\n")
+    np.save(root / "scans" / "000001.npy", np.zeros((5, 4), np.float32))
+    with pytest.raises(DatasetError, match=r"000001\.bin and .*000001\.npy: both would be frame 000001; rename one"):
+        BoxSplit(root).frame_ids  # noqa: B018
+
+
+def test_a_scale_left_open_is_part_of_what_points_depend_on(root: Path) -> None:
+    (root / "dataset.yaml").write_text("reflectance_scale: auto\n")
+    before = BoxSplit(root).points_state("000000")
+    assert BoxSplit(root).points_state("000000") == before
+    for path in sorted((root / "scans").iterdir())[1:]:
+        points = read_scan(path).points
+        points[:, 3] = np.linspace(0, 255, len(points)).round()
+        write_scan(path, points)
+    after = BoxSplit(root)
+    assert after.points("000000")[:, 3].max() < 0.1 and after.points_state("000000") != before
+
+
 def test_a_line_may_name_its_scan_from_elsewhere(root: Path) -> None:
     labels = root / "labels.jsonl"
     labels.write_text(labels.read_text().replace('"scan": "', f'"scan": "{root}/scans/'))

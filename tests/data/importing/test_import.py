@@ -65,6 +65,24 @@ def test_classes_by_other_names(tmp_path: Path) -> None:
             run(*source, "--rename", text)
 
 
+def test_the_end_of_a_recording_is_its_last_scans(tmp_path: Path) -> None:
+    own = write_box_dataset(tmp_path / "own", 12)
+    for number in range(12):  # as text, 10 comes before 2
+        (own / "scans" / f"{number:06d}.bin").rename(own / "scans" / f"{number}.bin")
+    (tmp_path / "boxes.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n3.bin,Car,9,0,0,4,2,1,0\n")
+    source = (tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")
+    run(*source, "--val-share", 0.25)
+    assert set(BoxSplit(tmp_path / "out", "val").frame_ids) == {"9", "10", "11"}
+    assert not {"9", "10", "11"} & set(BoxSplit(tmp_path / "out", "train").frame_ids)
+
+
+def test_of_two_scans_one_is_for_validation(tmp_path: Path) -> None:
+    own = write_box_dataset(tmp_path / "own", 2)
+    run(own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.6)
+    assert BoxSplit(tmp_path / "out", "train").frame_ids == ("000000",)
+    assert BoxSplit(tmp_path / "out", "val").frame_ids == ("000001",)
+
+
 def test_recordings_are_not_torn_apart(tmp_path: Path) -> None:
     own = write_box_dataset(tmp_path / "own", 4)
     for number, folder in enumerate("aabb"):
@@ -108,6 +126,19 @@ def test_argoverse2(tmp_path: Path) -> None:
     # The sweeps are scans for every command, labels and poses beside them are not.
     assert [path.stem for path in find_scans(source)] == ["315966265259836000"] * 2
     assert len(read_scan(find_scans(source)[0]).points) == 50
+
+
+def test_argoverse2_of_links(tmp_path: Path) -> None:
+    source = write_argoverse2(tmp_path / "av2")
+    lidar = source / "val" / "log_a" / "sensors" / "lidar"
+    lidar.rename(tmp_path / "elsewhere")
+    lidar.symlink_to(tmp_path / "elsewhere")
+    (source / "val" / "log_b").rename(tmp_path / "log_b")
+    (source / "val" / "log_b").symlink_to(tmp_path / "log_b")
+    run(source, tmp_path / "out", "--from", "argoverse2")
+    assert BoxSplit(tmp_path / "out").frame_ids == tuple(
+        f"val/{log}/sensors/lidar/315966265259836000" for log in ("log_a", "log_b")
+    )
 
 
 def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:
@@ -206,6 +237,24 @@ def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"v1\.0-mini: the tables do not fit together \(at 'translation'\)"):
         read_nuscenes(source)
     poses.write_text(whole)
+    for name, old, new, message in (
+        (
+            "sample_annotation",
+            "[2.0, 4.5, 1.6]",
+            "[0, 4.5, 1.6]",
+            "sample sa: a box with a number that is not finite or",
+        ),
+        ("ego_pose", json.dumps(quaternion(POSE_YAW)), "[0, 0, 0, 0]", r"at rotation \[0, 0, 0, 0\]"),
+        ("calibrated_sensor", "[0.9, 0.0, 1.8]", "[0, 0]", "the tables do not fit together"),
+    ):
+        path = source / "v1.0-mini" / f"{name}.json"
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        with pytest.raises(DatasetError, match=message) as caught:
+            read_nuscenes(source)
+        assert "\n" not in str(caught.value)
+        path.write_text(text)
     table = source / "v1.0-mini" / "scene.json"
     table.write_text("[7]")
     with pytest.raises(DatasetError, match=r"scene\.json: no table of nuScenes"):

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from asca_pillars.cli import app
 from asca_pillars.config import Config, DataConfig, load_config, pillar_spec
-from asca_pillars.data.boxes.box_records import json_line, records_from
+from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
@@ -78,6 +78,23 @@ def test_a_range_that_holds_the_boxes_stays(tmp_path: Path) -> None:
     proposal = propose(split, CONFIG)
     assert proposal.config.model.spec.grid == SPEC.grid
     assert [item.name for item in proposal.config.model.spec.classes] == ["Car", "Forklift"]
+
+
+def test_a_range_to_the_sides_that_holds_the_boxes_stays_where_boxes_stand_behind(tmp_path: Path) -> None:
+    """A corridor: 20 m ahead and behind, hardly any to the sides."""
+    root = write_around(tmp_path, 40, reach_m=20)
+    lines = []
+    for number, (_, records, *_) in enumerate(read_frames(root / "labels.jsonl")):
+        boxes = records.boxes * [1, 0.2, 1, 1, 1, 1, 1]
+        lines.append(json_line(f"{number}.bin", records_from(boxes, records.types)))
+        points = np.column_stack([np.repeat(boxes[:, :3], 20, axis=0), np.full(40, 0.5)])
+        write_scan(root / "scans" / f"{number}.bin", points)
+    (root / "labels.jsonl").write_text("".join(lines))
+    wide = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-15.36, 15.36), v_max_m=0.32, zones=2)
+    config = replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=wide)))
+    grid = pillar_spec(propose(BoxSplit(root), config).config).grid
+    assert grid.x_range_m[0] == -grid.x_range_m[1] and grid.x_range_m[1] > 15
+    assert grid.y_range_m == wide.y_range_m
 
 
 def test_a_range_ahead_is_widened_to_legal_ones(tmp_path: Path) -> None:

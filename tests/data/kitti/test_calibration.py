@@ -11,6 +11,7 @@ from asca_pillars.data.kitti.calibration import (
     read_calibration,
     write_calibration,
 )
+from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import corners
 from tests.cameras import assert_one_line, make_calibration
 
@@ -95,6 +96,15 @@ def test_calibration_round_trip_and_all_seven_lines(tmp_path):
     assert [len(line) - 1 for line in lines] == [12, 12, 12, 12, 9, 12, 12]
     points = np.array([[10.0, 2, -1], [40, -7, 0.5]])
     np.testing.assert_allclose(back.lidar_from_rect(back.rect_from_lidar(points)), points, atol=1e-9)
+
+
+def test_a_projection_that_sees_nothing_is_named(tmp_path):
+    path = tmp_path / "000000.txt"
+    write_calibration(path, make_calibration(1.0, 2.0, -1.0, (0.1, -0.08, -0.27)))
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join("P2: " + "0 " * 12 if line.startswith("P2") else line for line in lines))
+    with pytest.raises(DatasetError, match=r"000000\.txt: P2 is no projection"):
+        read_calibration(path)
 
 
 def test_calibration_in_the_tracking_benchmarks_spelling(tmp_path):

@@ -56,6 +56,16 @@ def test_missing_parts_of_a_dataset_are_named(root, tmp_path):
     assert_one_line(nowhere / "training/velodyne", ["<root>"], lambda: KittiSplit(nowhere).frame_ids)
 
 
+def test_scans_of_five_columns_are_stored_as_they_are_read(root):
+    """With the number of the beam after the reflectance; 5 points are no whole number of points of four columns."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-20, 20, (5, 3)), rng.random(5)]).astype("<f4")
+    split = KittiSplit(root)
+    np.column_stack([points, np.arange(5)]).astype("<f4").tofile(split.scan_path("000001"))
+    np.testing.assert_array_equal(split.stored_points("000001"), points)
+    np.testing.assert_array_equal(split.points("000001", camera_view=False), points)
+
+
 def test_image_size_is_read_from_the_png_or_assumed(root):
     split = KittiSplit(root)
     assert split.image_size_wh("000001") == DEFAULT_IMAGE_SIZE_WH

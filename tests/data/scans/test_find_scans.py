@@ -30,6 +30,15 @@ def test_folders_are_searched_to_any_depth(tmp_path: Path) -> None:
     assert names(tmp_path) == ["0", "drive2/a/1", "drive10/1"]
 
 
+def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> None:
+    real = touch(tmp_path / "real", "b/1.bin", "b/2.bin")
+    scans = touch(tmp_path / "scans", "a/1.bin")
+    (scans / "b").symlink_to(real / "b")
+    (scans / "again").symlink_to(scans)
+    (real / "b" / "home").symlink_to(scans)
+    assert [scan.relative_to(scans).as_posix() for scan in find_scans(scans)] == ["a/1.bin", "b/1.bin", "b/2.bin"]
+
+
 def test_what_is_no_scan_is_said(tmp_path: Path) -> None:
     with pytest.raises(ScanError, match="no such file or folder"):
         find_scans(tmp_path / "missing")
