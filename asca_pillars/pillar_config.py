@@ -81,6 +81,10 @@ class LossConfig(Strict):
             )
 
 
+TRACED_PILLARS = 6
+"""Of the example that an export traces the encoder with."""
+
+
 @dataclass(frozen=True)
 class PillarModel(Strict):
     """ASCA-PointPillars and PointPillars: one stage on pillars.
@@ -96,3 +100,10 @@ class PillarModel(Strict):
     spec: PillarSpec = field(default_factory=PillarSpec)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+
+    def __post_init__(self) -> None:
+        if self.network.cpa == "paper" and self.spec.limits.max_pillars < TRACED_PILLARS:
+            raise ConfigError(
+                f"model.spec.limits.max_pillars = {self.spec.limits.max_pillars}: must be at least {TRACED_PILLARS} "
+                "with cpa paper, which has weights for so many pillars and no more"
+            )

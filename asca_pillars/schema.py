@@ -35,13 +35,28 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
         ConfigError: an unknown key (the nearest one that exists is named), a missing or an unusable value.
     """
     try:
-        return _adapter(type_).validate_python(data)  # type: ignore[arg-type]  # types are hashable
+        parsed: T = _adapter(type_).validate_python(data)  # type: ignore[arg-type]  # types are hashable
     except ConfigError as error:  # a dataclass that checks its own values
         raise ConfigError(f"{source}: {error}") from None
     except pydantic.ValidationError as error:
         # A misspelt key is reported twice, as missing and as unknown; the latter helps.
         first = min(error.errors(), key=lambda item: item["type"] not in _UNKNOWN_KEY)
         raise ConfigError(f"{source}: {_explain(type_, first)}") from None
+    if (flag := _flag_for_number(data, to_dict(parsed))) is not None:
+        raise ConfigError(f"{source}: `{flag[0]}` = {str(flag[1]).lower()}: input should be a number") from None
+    return parsed
+
+
+def _flag_for_number(given: Any, taken: Any, path: str = "") -> tuple[str, bool] | None:
+    """Where true or false was given and a number was taken, as pydantic does; None: nowhere."""
+    if isinstance(given, dict) and isinstance(taken, dict):
+        pairs = [(key, given[key], taken[key]) for key in given if key in taken]
+    elif isinstance(given, list | tuple) and isinstance(taken, list):
+        pairs = [(index, *pair) for index, pair in enumerate(zip(given, taken, strict=False))]
+    else:
+        return (path, given) if isinstance(given, bool) and not isinstance(taken, bool | str | None) else None
+    found = (_flag_for_number(own, other, f"{path}.{key}".lstrip(".")) for key, own, other in pairs)
+    return next((flag for flag in found if flag is not None), None)
 
 
 def to_dict(settings: Any) -> dict[str, Any]:

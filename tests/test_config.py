@@ -223,6 +223,7 @@ model:
         ("augment.object_reflectance_gain", "[2, 0.5]", "must be two positive numbers, the smaller first"),
         ("train.ema", "1", "must be at least 0 and less than 1"),
         ("train.ema", ".nan", "should be a finite number"),
+        ("train.batch_size", "true", "should be a number"),
         ("augment.scale", "[1.05, 0.95]", "must be two positive numbers, the smaller first"),
         ("augment.scale", "[0, 1]", "must be two positive numbers, the smaller first"),
         ("augment.scale", "[.nan, 1]", "should be a finite number"),
@@ -243,6 +244,17 @@ def test_impossible_numbers(tmp_path: Path, key: str, value: str, message: str) 
     *parents, name = key.split(".")
     path = write(tmp_path, "".join(f"{parent}: {{" for parent in parents) + f"{name}: {value}" + "}" * len(parents))
     assert re.fullmatch(rf"{re.escape(str(path))}: `?{re.escape(key)}.* = .+: .*{message}.*", refusal(path))
+
+
+def test_a_reading_with_weights_for_each_pillar_needs_some(tmp_path: Path) -> None:
+    path = write(tmp_path, "model: {network: {cpa: paper}, spec: {limits: {max_pillars: 5}}}")
+    assert "max_pillars = 5: must be at least 6 with cpa paper" in refusal(path)
+
+
+def test_names_of_classes_differ_by_more_than_case(tmp_path: Path) -> None:
+    car = "length_m: 9, width_m: 2.5, height_m: 3.2, z_m: -0.2, positive_iou: 0.6, negative_iou: 0.45"
+    path = write(tmp_path, f"model: {{spec: {{classes: [{{name: Car, {car}}}, {{name: car, {car}}}]}}}}")
+    assert "classes Car, car must have different names" in refusal(path)
 
 
 @pytest.mark.parametrize(

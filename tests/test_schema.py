@@ -89,6 +89,11 @@ def test_unknown_keys(data: dict[str, Any], message: str) -> None:
         ({"name": "van", "notes": {1: "x"}}, "`notes.1` = 1: input should be a valid string"),
         ({"name": "van", 3: 4}, "`3` = 3: keys should be strings"),
         ({"name": "van", "engine": {"power_kw": 0}}, "power_kw 0 must be positive"),
+        ({"name": "van", "engine": {"power_kw": True}}, "`engine.power_kw` = true: input should be a number"),
+        (
+            {"name": "van", "wheels": [{"radius_m": 0.3}, {"radius_m": 0.3, "spokes": False}]},
+            "`wheels.1.spokes` = false: input should be a number",
+        ),
     ],
 )
 def test_missing_and_wrong_values(data: dict[str, Any], message: str) -> None:

@@ -52,9 +52,10 @@ class TwoStageVariant:
 
     def misfit(self, model: PvRcnnModel) -> str | None:
         """Rows with MSAA state all sources, and those without have the balls of raw points."""
-        points, *others = (to_dict(one) for one in model.settings.sources)
-        if points["source"] != "points":
+        sources = [to_dict(one) for one in model.settings.sources]
+        if not sources or sources[0]["source"] != "points":
             return "has balls of raw points, which the base has not"
+        others = sources[1:]
         return "states other sources than the base has" if self.scales and others != _SOURCES else None
 
     @property

@@ -69,8 +69,8 @@ def notes(results: Iterable[Result]) -> Iterator[str]:
     names: dict[str, list[str]] = defaultdict(list)
     for path, notes, _, report in results:
         found = [*notes.remarks, *report.warnings]
-        if dropped := notes.dropped_points + report.non_finite_points:
-            found.append(f"{dropped} points are not finite and were dropped")
+        if notes.dropped_points:  # when the file was read; what the detector dropped is among its warnings
+            found.append(f"{notes.dropped_points} points are not finite and were dropped")
         if notes.clipped_reflectances:
             found.append(f"{notes.clipped_reflectances} reflectances lie outside 0..1 and were set to the nearer end")
         for text in found:

@@ -2,7 +2,10 @@
 
 from dataclasses import dataclass
 
+from asca_pillars.errors import ConfigError
 from asca_pillars.schema import Strict
+
+_HIGHEST_M = 100.0  # ground below or above a sensor; farther, it is no measurement
 
 
 @dataclass(frozen=True)
@@ -18,6 +21,18 @@ class ExpectedInput(Strict):
     showed it."""
     camera_view: bool
     """Whether the scans were cropped to the points in the camera's image."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("points_per_scan", 0, 2**53),
+            ("reflectance_mean", 0, 1),
+            ("ground_z_m", -_HIGHEST_M, _HIGHEST_M),
+        ):
+            ends = getattr(self, name)
+            if ends is not None and not low <= ends[0] <= ends[1] <= high:
+                raise ConfigError(
+                    f"expected_input.{name} = {list(ends)}: must be lowest and highest in {low:g}..{high:g}"
+                )
 
     @property
     def sensor_height_m(self) -> float | None:

@@ -76,6 +76,9 @@ def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInp
             f"(--reflectance-scale {scale:g} for files)"
         )
         return InputWarning("reflectance", text)
+    if largest == 0 < low:
+        text = "the scan has no reflectance, all are 0: the model was trained with it, so export it with intensity"
+        return InputWarning("reflectance", text)
     if not low / 3 <= mean <= high * 3:
         text = (
             f"mean reflectance is {mean:.3g}, in training it was {low:.3g} to {high:.3g}: rescale it to 0..1 "

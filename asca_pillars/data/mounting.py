@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import TypeAlias
 
@@ -48,8 +49,12 @@ class Mounting(Strict):
 
     def __post_init__(self) -> None:
         height = self.sensor_height_m
-        if height is not None and not abs(height) <= MAX_HEIGHT_M:  # NaN too
+        if not isinstance(height, Real | None):
+            raise ConfigError(f"sensor height {height!r:.40}: give metres; `measured_mounting(scans)` estimates them")
+        if height is not None and not abs(float(height)) <= MAX_HEIGHT_M:  # NaN too
             raise ConfigError(f"sensor height {height:g}: give metres above the ground, at most {MAX_HEIGHT_M:g}")
+        if self.pose is not None:
+            object.__setattr__(self, "pose", _rows(self.pose))
         if abs(self.level.axes[2, 2]) < MIN_UPRIGHT:
             what = f"axes {self.axes}" if self.pose is None else "pose"
             raise ConfigError(
@@ -63,7 +68,7 @@ class Mounting(Strict):
             return FrameChange(_signed_axes(self.axes), np.zeros(3))
         if self.axes != "x-forward":
             raise ConfigError(f"axes {self.axes} and a pose: the pose turns the axes already; give one of them")
-        pose = np.array(self.pose, np.float64)
+        pose = np.array(self.pose)
         if not is_rigid(pose):
             raise ConfigError("pose: must be a rotation and a shift, the last row 0 0 0 1")
         return FrameChange(pose[:3, :3], pose[:3, 3])
@@ -93,12 +98,25 @@ def read_pose(path: str | Path) -> tuple[Row, Row, Row, Row]:
         raise ConfigError(f"{path}: cannot be read as a pose ({error}); write 16 numbers, row by row") from None
     if len(numbers) != 16:
         raise ConfigError(f"{path}: holds {len(numbers)} numbers; a pose has 16, row by row")
-    first, second, third, last = ((a, b, c, d) for a, b, c, d in np.reshape(numbers, (4, 4)).tolist())
+    return _rows(np.reshape(numbers, (4, 4)))
+
+
+def _rows(pose: object) -> tuple[Row, Row, Row, Row]:
+    """A pose as plain numbers, which compare and hash; ConfigError if it is no 4x4 matrix."""
+    try:
+        matrix = np.asarray(pose, np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"pose {pose!r:.40}: give a 4x4 matrix; `read_pose(path)` reads one of a file") from None
+    if matrix.shape != (4, 4):
+        raise ConfigError(f"pose of shape {matrix.shape}: give a 4x4 matrix from the scan to the level frame")
+    first, second, third, last = ((a, b, c, d) for a, b, c, d in matrix.tolist())
     return first, second, third, last
 
 
 def _signed_axes(text: str) -> NDArray[np.float64]:
     """(3, 3) rows forward, left, up in the scan's frame."""
+    if not isinstance(text, str):
+        raise ConfigError(f"axes {text!r:.40}: give {_EXAMPLES}")
     names = [name.strip().lstrip("+") for name in _NAMED_AXES.get(text, text).split(",")]
     if sorted(name.lstrip("-") for name in names) != ["x", "y", "z"] or any(len(name) > 2 for name in names):
         raise ConfigError(f"axes {text[:40]}: give {_EXAMPLES}")

@@ -1,6 +1,7 @@
 """Head maps -> Detections: threshold, decode, non-maximum suppression. The last stop of every runtime."""
 
 import math
+import reprlib
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -21,6 +22,10 @@ KERNELS = "asca_pillars.geometry.nms_kernels"
 _NMS_BLOCK = 64
 
 
+MOST = 2**31 - 1
+"""Of anything that is counted in settings: what an index of 32 bits can name."""
+
+
 @dataclass(frozen=True)
 class PostProcess:
     """How head maps become detections."""
@@ -38,8 +43,8 @@ class PostProcess:
         if not 0 <= self.nms_iou <= 1:
             raise ConfigError(f"nms_iou {self.nms_iou:g} must lie between 0 and 1")
         for name in ("candidates", "max_detections"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} {getattr(self, name)} must be at least 1")
+            if not 1 <= getattr(self, name) <= MOST:
+                raise ConfigError(f"{name} {reprlib.repr(getattr(self, name))} must lie between 1 and {MOST}")
 
 
 Map = TypeVar("Map")

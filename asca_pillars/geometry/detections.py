@@ -191,6 +191,7 @@ class Detections:
             points = self._source() if self._source is not None else None
         if points is None:
             points = np.empty((0, 4), np.float32)
+        points = np.asarray(points)
         found = replace(self, boxes=self._level_boxes())
         if self._level is not None:
             points = self._level.points(points)

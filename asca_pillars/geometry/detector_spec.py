@@ -32,7 +32,7 @@ class DetectorSpec(ABC):
     def __post_init__(self) -> None:
         if not self.classes:
             raise ConfigError("classes is empty: a detector needs at least one class")
-        if len(set(self.class_names)) < len(self.classes):
+        if len({name.casefold() for name in self.class_names}) < len(self.classes):  # evaluations fold case
             raise ConfigError(f"classes {', '.join(self.class_names)} must have different names")
 
     @property

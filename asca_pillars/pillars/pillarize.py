@@ -4,6 +4,7 @@ Pillars are flat: the kept points of all pillars stand one after another, and `p
 is. Nothing is padded, so nothing needs to be masked later.
 """
 
+import reprlib
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.decode import MOST
 from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.grid import PillarGrid
@@ -34,8 +36,8 @@ class PillarLimits:
 
     def __post_init__(self) -> None:
         for name in ("max_pillars", "max_points"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} {getattr(self, name)} must be at least 1")
+            if not 1 <= getattr(self, name) <= MOST:
+                raise ConfigError(f"{name} {reprlib.repr(getattr(self, name))} must lie between 1 and {MOST}")
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,15 @@ def reported_detections(
     Args:
         proposals: R of them.
         confidence: (R,) logits.
-        residuals: (R, 7), see `decode_refinement`. Rows that are not finite are left out and counted.
+        residuals: (R, 7), see `decode_refinement`. Rows that are not finite are left out, and counted with what the
+            first stage left out.
     """
     finite = np.isfinite(confidence) & np.isfinite(residuals).all(axis=1)
     scores = sigmoid(np.where(finite, confidence, 0))
     thresholds = np.array([item.score_threshold for item in spec.classes])
     kept = np.flatnonzero(finite & (scores >= thresholds[proposals.labels]))
     found = refined_detections(proposals[kept], scores[kept], residuals[kept], spec.post)
-    return replace(found, non_finite=int((~finite).sum()))
+    return replace(found, non_finite=proposals.non_finite + int((~finite).sum()) + found.non_finite)
 
 
 def reported_frames(
@@ -42,7 +43,7 @@ def reported_frames(
 def refined_detections(
     proposals: Detections, scores: NDArray[np.float32], residuals: NDArray[np.float32], post: PostProcess
 ) -> Detections:
-    """Refined boxes, best first, after rotated suppression within each class.
+    """Refined boxes, best first, after rotated suppression within each class; those not finite are counted.
 
     Args:
         proposals: R of them.
@@ -58,4 +59,5 @@ def refined_detections(
         kept.append(own[rotated_nms(boxes[own], scores[own], post.nms_iou, post.max_detections)])
     survivors = np.concatenate(kept)
     best = survivors[np.argsort(-scores[survivors], kind="stable")[: post.max_detections]]
-    return Detections(boxes[best], scores[best].astype(np.float32), proposals.labels[best], proposals.class_names)
+    found = Detections(boxes[best], scores[best].astype(np.float32), proposals.labels[best], proposals.class_names)
+    return replace(found, non_finite=int((~usable).sum()))

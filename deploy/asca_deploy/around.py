@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.ground_height import fit_ground_plane
+from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import rotated_nms
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
@@ -41,9 +42,18 @@ def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...
     Args:
         ranges: of the model.
         camera_view: whether it was trained on what a camera sees.
+
+    Raises:
+        ConfigError: the model does not see straight ahead and to both sides, so no turns show every direction.
     """
     field = CAMERA_FIELD_RAD if camera_view else _HALF_TURN_RAD
     enough_m = min(ranges.x_m[1], -ranges.y_m[0], ranges.y_m[1])
+    if enough_m <= 0:
+        (x_min, x_max), (y_min, y_max) = ranges.x_m, ranges.y_m
+        raise ConfigError(
+            f"view around: the model looks from x {x_min:g} to {x_max:g} m and from y {y_min:g} to {y_max:g} m, and "
+            "turning needs one that sees ahead and to both sides; choose view ahead"
+        )
     passes = 1
     while _HALF_TURN_RAD / passes > field + 1e-9 or not _sees(ranges, _HALF_TURN_RAD / passes, enough_m):
         passes += 1

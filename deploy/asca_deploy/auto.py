@@ -157,7 +157,7 @@ def _try(
 def _left_out(provider: str, elapsed_s: float) -> str | None:
     if provider in SLOW_START:
         return "left out, it takes up to minutes to start: ask for it by name"
-    return f"left out after {BUDGET_S:g} s" if elapsed_s > BUDGET_S else None
+    return f"not tried, {BUDGET_S:g} s were over: ask for it by name" if elapsed_s > BUDGET_S else None
 
 
 def _median_ms(detect: Callable[[Network], Detections], network: Network, clock: Callable[[], float]) -> float:

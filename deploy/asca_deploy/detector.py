@@ -127,8 +127,9 @@ class Detector:
         self.view, self.mounting = view, mounting or Mounting()
         self._to_model = self.mounting.to_model(expected.sensor_height_m)
         self._level = None if self.mounting.level.is_identity else self.mounting.level
-        turns = turns_around(self.spec.ranges, camera_view=expected.camera_view)
-        self._turns = turns if view == "around" else turns[:1]
+        self._turns: tuple[FrameChange, ...] = (FrameChange.turn(0.0),)
+        if view == "around":
+            self._turns = turns_around(self.spec.ranges, camera_view=expected.camera_view)
         self._ranges = ranges_around(self.spec.ranges, self.passes)
         self._warned: set[str] = set()
         self.load_s = perf_counter() - start
@@ -226,6 +227,9 @@ class Detector:
         if not self._to_model.is_identity:
             detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
         frame.laps.append((self.pipeline.stages[-1], perf_counter()))
+        if frame.usable.non_finite:
+            text = f"{frame.usable.non_finite} points are not finite and were dropped"
+            frame.warnings.append(InputWarning("non-finite", text))
         if detections.non_finite:
             text = f"the network's answer is not finite at {detections.non_finite} anchors, which were left out"
             frame.warnings.append(InputWarning("output", text))
@@ -278,6 +282,7 @@ def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> 
         columns = scan.shape[1] if scan.ndim == 2 else 0
         advice = "; append a column of reflectances 0..1" if columns == 3 else ""
         advice = "; give the first four columns: points[:, :4]" if columns > 4 else advice
+        advice = "; the points lie in its columns, transpose it: points.T" if columns > len(scan) == 4 else advice
         raise ScanError(f"the points have shape {array.shape}, not (N, 4): x, y, z, reflectance{advice}")
     finite, non_finite = np.isfinite(scan), 0
     if not finite.all():

@@ -21,6 +21,7 @@ from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
 from asca_export.masked_forms import MaskedBackbone
 from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.pillar_config import TRACED_PILLARS
 from asca_pillars.pillars.pillarize import FEATURES
 
 B = TypeVar("B", bound=AnyBundle)
@@ -35,7 +36,7 @@ def export_encoder(encode: nn.Module, path: Path) -> None:
     `encode` is a `PillarEncoder`, or has its interface. M and P are dynamic. The `paper` reading takes P up to
     the limit that it was trained with.
     """
-    points, pillars = 24, 6  # sizes of the example that the tracer sees; neither is kept
+    points, pillars = 4 * TRACED_PILLARS, TRACED_PILLARS  # of the example that the tracer sees; neither is kept
     point_counts = torch.full((pillars,), points // pillars)
     example = (
         torch.rand(points, len(FEATURES)),

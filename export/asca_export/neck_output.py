@@ -65,7 +65,7 @@ def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelP
     """A copy with a declared output NECK, the name of the head's input, and whether that is in floating point."""
     model = onnx.ModelProto()
     model.CopyFrom(backbone)
-    joined = [node for node in model.graph.node if node.op_type == "Concat" or node.output[0] == JOINED]
+    joined = [node for node in _before_boxes(model) if node.op_type == "Concat" or node.output[0] == JOINED]
     types = {value.name: value.type.tensor_type for value in onnx.shape_inference.infer_shapes(model).graph.value_info}
     kind = types.get(joined[-1].output[0]) if joined else None
     if kind is None or not kind.shape.dim[-1].dim_value:
@@ -75,6 +75,17 @@ def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelP
     output.type.tensor_type.elem_type = elem_type
     model.graph.output.append(output)
     return model, joined[-1].output[0], kind.elem_type == TensorProto.FLOAT
+
+
+def _before_boxes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
+    """What the head's boxes are computed from, in order: masks of active cells are joined too, but for scores alone."""
+    wanted = {value.name for value in model.graph.output if value.name != "scores"}
+    found = []
+    for node in reversed(model.graph.node):
+        if wanted & set(node.output):
+            wanted |= set(node.input)
+            found.append(node)
+    return found[::-1]
 
 
 def _in_float(model: onnx.ModelProto, steps: str) -> onnx.NodeProto:

@@ -75,12 +75,14 @@ def test_names_are_those_of_the_base_s_family() -> None:
     ("config", "row", "message"),
     [
         ("pv_rcnn_kitti", "msaa", "states other sources than the base has"),
+        ("no_sources", "gate", "has balls of raw points, which the base has not"),
         ("afe_rcnn_kitti", "gate", "has balls of raw points, which the base has not"),
     ],
 )
 def test_a_base_that_a_row_would_change_otherwise_is_refused(config: str, row: str, message: str) -> None:
+    overrides = ("model.settings.sources=[]", "model.network.source_widths=[]") if config == "no_sources" else ()
     with pytest.raises(ConfigError, match=f"--variants {row}: {message}"):
-        check([TWO_STAGE.variants[row]], config, (), Path("nowhere"))
+        check([TWO_STAGE.variants[row]], BASE if overrides else config, overrides, Path("nowhere"))
 
 
 @pytest.mark.usefixtures("in_turn")

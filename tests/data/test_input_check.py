@@ -1,5 +1,7 @@
 """Scans unlike those of the training: each way is noticed, its remedy works, and right scans raise no alarm."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +14,7 @@ from asca_pillars.data.input_check import InputWarning, _percentile, check_input
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillarize import PillarLimits, pillarize
 
@@ -71,7 +74,25 @@ def test_no_reflectance() -> None:
     points[:, 3] = 0
     (warning,) = check(points)
     assert warning.about == "reflectance"
-    assert "mean reflectance is 0," in warning.text
+    assert "no reflectance, all are 0" in warning.text and "scale" not in warning.text
+    points[:, 3] = 1e-3
+    (warning,) = check(points)
+    assert "mean reflectance is 0.001," in warning.text
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"points_per_scan": (-1, 5)},
+        {"points_per_scan": (6, 5)},
+        {"reflectance_mean": (0.2, 1.5)},
+        {"ground_z_m": (-1.0, -1.9)},
+        {"ground_z_m": (-1.9, 1e308)},
+    ],
+)
+def test_expectations_that_no_scans_have_are_refused(changes: dict[str, tuple[float, float]]) -> None:
+    with pytest.raises(ConfigError, match=f"expected_input.{next(iter(changes))} = .* lowest and highest in"):
+        replace(EXPECTED, **changes)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("shift_m", [-1.2, 0.9])

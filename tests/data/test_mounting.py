@@ -68,6 +68,11 @@ def test_a_pose_lifts_and_turns() -> None:
         ({"axes": "z,-x,-y"}, "z axis, which must point up or down"),
         ({"sensor_height_m": float("nan")}, "sensor height nan"),
         ({"sensor_height_m": 40.0}, "at most 10"),
+        ({"sensor_height_m": "auto"}, r"sensor height 'auto': give metres; .measured_mounting"),
+        ({"axes": None}, "axes None: give"),
+        ({"pose": "pose.txt"}, r"pose 'pose.txt': give a 4x4 matrix; .read_pose"),
+        ({"pose": np.eye(3)}, r"pose of shape \(3, 3\): give a 4x4 matrix"),
+        ({"pose": np.eye(4).ravel()}, r"pose of shape \(16,\)"),
         ({"pose": ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 2, 0), (0, 0, 0, 1))}, "a rotation and a shift"),
         ({"pose": ((1, 0, 0, 0), (0, -1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))}, "a rotation and a shift"),
         ({"pose": tuple(map(tuple, np.eye(4))), "axes": "y-forward"}, "give one of them"),
@@ -76,6 +81,13 @@ def test_a_pose_lifts_and_turns() -> None:
 def test_what_cannot_be_is_refused(settings: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Mounting(**settings)
+
+
+def test_a_pose_may_be_an_array() -> None:
+    turned = np.array([[0, 1, 0, 2], [-1, 0, 0, 0], [0, 0, 1, 1.84], [0, 0, 0, 1]])
+    mounting = Mounting(pose=turned)  # type: ignore[arg-type]  # what NumPy's users have at hand
+    assert mounting == Mounting(pose=turned.tolist()) and hash(mounting)
+    np.testing.assert_allclose(mounting.level.points(POINT)[0, :3], [5 + 2, -3, -1 + 1.84], atol=1e-6)
 
 
 def test_from_a_config_and_back() -> None:

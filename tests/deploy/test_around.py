@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
+from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
@@ -40,6 +41,12 @@ def test_as_many_passes_as_the_field_of_view_needs(ranges: Ranges, camera_view: 
     turns = turns_around(ranges, camera_view=camera_view)
     assert len(turns) == passes
     assert turns[0].is_identity
+
+
+@pytest.mark.parametrize("y_m", [(1.28, 15.36), (-15.36, -1.28), (0.0, 39.68)])
+def test_a_model_that_does_not_see_to_both_sides_is_not_turned(y_m: tuple[float, float]) -> None:
+    with pytest.raises(ConfigError, match=r"view around: the model looks .* choose view ahead"):
+        turns_around(Ranges((0.0, 69.12), y_m, Z_M), camera_view=True)
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(1, 30))

@@ -81,6 +81,14 @@ def test_the_roofline_is_that_of_one_pass(tiny_bundle: Path, tmp_path: Path) -> 
     assert report["roofline"]["achieved_gmac_s"] == pytest.approx(report["roofline"]["gmac"] / per_pass_s)
 
 
+def test_a_scan_with_nothing_to_compute_has_no_roofline(tiny_bundle: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "far.npy", np.array([[-500, 0, 0, 0.5]], np.float32))
+    command = ["bench", tmp_path / "far.npy", "-b", tiny_bundle, "--rounds", 1, "--json", tmp_path / "report.json"]
+    result = CliRunner().invoke(app, [str(part) for part in command], catch_exceptions=False)
+    assert result.exit_code == 0 and "no roofline" in result.output
+    assert "roofline" not in json.loads((tmp_path / "report.json").read_text())
+
+
 def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:
     with pytest.raises(ConfigError, match="compared with itself"):
         CliRunner().invoke(app, ["bench", "--compare", "asca_sim_int8"], catch_exceptions=False)

@@ -106,6 +106,8 @@ def test_non_finite_points_are_dropped_and_counted(tiny_bundle: Path, scan: Poin
     repaired = detector(np.concatenate([bad[:2], scan, bad[2:]]))
     assert same(repaired, clean)
     assert repaired.report.non_finite_points == 4
+    assert "4 points are not finite and were dropped" in repaired.report.warnings
+    assert not any("not finite" in text for text in clean.report.warnings)
     assert repaired.report.counts.points == len(scan)
 
 
@@ -130,6 +132,7 @@ def test_any_real_array_will_do_and_is_not_changed(tiny_bundle: Path, scan: Poin
     [
         (np.zeros((5, 3)), r"shape \(5, 3\), not \(N, 4\).*append a column of reflectances"),
         (np.zeros((5, 5)), r"shape \(5, 5\), not \(N, 4\)"),
+        (np.zeros((4, 9)), r"shape \(4, 9\), .*transpose it: points\.T"),
         (np.zeros(4), r"shape \(4,\)"),
         (np.zeros((1, 5, 4)), r"shape \(1, 5, 4\)"),
         (np.array([["a"] * 4]), "not an array of numbers"),

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_deploy import Detector, load_bundle
+from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import export_bundle
 from asca_export.masked_forms import NEVER, MarkedEncoder, MaskedBackbone
 from asca_pillars.errors import ExportError
@@ -93,6 +94,16 @@ def test_the_bundles_find_the_same(bundles: tuple[Path, Path]) -> None:
         np.testing.assert_allclose(ours.boxes, theirs.boxes, atol=1e-3)
         np.testing.assert_allclose(ours.scores, theirs.scores, atol=1e-4)
     assert len(Detector(bundles[1], score_threshold=1e-6)(NOTHING)) == 0, "no cell is active"
+
+
+def test_a_second_stage_reads_the_same_map_of_both(bundles: tuple[Path, Path]) -> None:
+    """The masks are joined after the map, and are not it."""
+    rows, whole = (BundleFirstStage(folder)(LEFT[0]).neck for folder in bundles)
+    channels = rows.shape[-1]
+    assert whole.shape[-1] == channels
+    active = whole.reshape(-1, channels)
+    active = active[active.any(axis=1)]
+    np.testing.assert_allclose(np.sort(active, axis=0), np.sort(rows[rows.any(axis=1)], axis=0), atol=1e-4)
 
 
 @needs_openvino

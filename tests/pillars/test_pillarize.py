@@ -180,7 +180,7 @@ def test_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
         pillarize(np.zeros(shape, np.float32), GRID, PillarLimits())
 
 
-@pytest.mark.parametrize("settings", [{"max_pillars": 0}, {"max_points": -1}])
-def test_limits_below_one_are_refused(settings: dict[str, int]) -> None:
+@pytest.mark.parametrize("settings", [{"max_pillars": 0}, {"max_points": -1}, {"max_points": 10**20}])
+def test_limits_that_nothing_counts_to_are_refused(settings: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):
         PillarLimits(**settings)

@@ -4,8 +4,9 @@ import numpy as np
 
 from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.points.refined_detections import refined_detections
+from asca_pillars.points.refined_detections import refined_detections, reported_detections
 from asca_pillars.points.refinement import encode_refinement
+from asca_pillars.pv_rcnn_config import PvRcnnModel
 
 NAMES = ("Car", "Cyclist")
 POST = PostProcess(nms_iou=0.1, max_detections=3)
@@ -39,6 +40,18 @@ def test_what_is_not_finite_is_left_out() -> None:
     proposals = Detections(at(10, 30, 50), np.full(3, 0.5, np.float32), np.zeros(3, np.int64), NAMES)
     found = refined_detections(proposals, np.array([0.9, np.nan, 0.5], np.float32), residuals, POST)
     np.testing.assert_allclose(found.boxes, at(50), atol=1e-5)
+    assert found.non_finite == 2
+
+
+def test_what_is_not_finite_in_either_stage_is_counted() -> None:
+    spec = PvRcnnModel().spec.with_score_threshold(0.1)
+    boxes, labels = at(10, 30, 50), np.zeros(3, np.int64)
+    proposals = Detections(boxes, np.full(3, 0.5, np.float32), labels, spec.class_names, non_finite=7)
+    residuals = np.zeros((3, 7), np.float32)
+    residuals[0, 0] = np.nan
+    residuals[1, 0] = 3e38  # a place beyond float32
+    found = reported_detections(proposals, np.full(3, 2.0, np.float32), residuals, spec)
+    assert len(found) == 1 and found.non_finite == 7 + 2
 
 
 def test_no_proposals() -> None:

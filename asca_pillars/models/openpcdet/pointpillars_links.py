@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 
 from torch import Tensor
 
+from asca_pillars.errors import TrainingError
 from asca_pillars.models.openpcdet.links import Link, norm_links
 from asca_pillars.models.openpcdet.map_links import map_links
 from asca_pillars.pillar_config import PillarModel
@@ -20,15 +21,23 @@ _Z_CENTER = len(FEATURES)  # the one feature that ours does not have
 
 
 def pointpillars_links(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Links for `build_pillar_detector(model)`; `state` has their unitless weights (out, in, ...) by name."""
+    """Links for `build_pillar_detector(model)`; `state` has their unitless weights (out, in, ...) by name.
+
+    Raises:
+        TrainingError: points with other features.
+    """
     low_m, high_m = model.spec.grid.z_range_m
+    shape = tuple(state[_LINEAR].shape) if _LINEAR in state else None
+    if shape is not None and (len(shape) != 2 or shape[1] != _Z_CENTER + 1):
+        raise TrainingError(
+            f"{_LINEAR} has shape {shape}: its points must have {_Z_CENTER + 1} features, x, y, z, intensity and six "
+            "offsets; others cannot be imported"
+        )
 
     def of_height(_: Tensor) -> Tensor:
         return state[_LINEAR][:, _Z_CENTER] * ((low_m + high_m) / 2)
 
     def linear(weight: Tensor) -> Tensor:
-        if weight.shape[1] != _Z_CENTER + 1:
-            return weight  # of another shape than ours, which is then reported
         merged = weight[:, :_Z_CENTER].clone()
         merged[:, _Z] += weight[:, _Z_CENTER]
         return merged

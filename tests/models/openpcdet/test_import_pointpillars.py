@@ -156,6 +156,12 @@ def test_what_does_not_fit_is_named(foreign: PointPillars, tmp_path: Path) -> No
         r"conv_box\.bias has shape \(3,\), which does not fit head\.boxes\.bias \(42,\)",
         {"dense_head.conv_box.bias": some},
     )
+    linear = "vfe.pfn_layers.0.linear.weight"
+    for features in (9, 11):
+        refused(
+            rf"linear\.weight has shape \(\d+, {features}\): .* must have 10 features",
+            {linear: torch.zeros(len(state[linear]), features)},
+        )
     refused("OpenPCDet's model has no encode.pillar_attention", {}, Config(name="own", model=PillarModel()))
     refused("OpenPCDet has none", {}, load_config("asca_refine_sim"))
 
