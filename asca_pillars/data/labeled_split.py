@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.mounting import Mounting
+from asca_pillars.geometry.frame_change import FrameChange
 
 
 class LabeledBoxes(NamedTuple):
@@ -43,6 +44,10 @@ class LabeledSplit(Protocol):
     @property
     def mounting(self) -> Mounting:
         """How the scans' own frame lies to that of `points` and `labeled_boxes`, and how high, if that is stated."""
+
+    @property
+    def to_sensor(self) -> FrameChange:
+        """From the frame of `points` to the same with the sensor at its origin: where what it sees is seen from."""
 
     @property
     def frame_ids(self) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The box around the sensor in which a detector looks."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,11 @@ class Ranges(NamedTuple):
     x_m: tuple[float, float]
     y_m: tuple[float, float]
     z_m: tuple[float, float]
+
+    def shifted(self, by_m: Sequence[float] | NDArray[np.float64]) -> "Ranges":
+        """Where they lie after everything moved by (3,) metres."""
+        x, y, z = ((low + by, high + by) for (low, high), by in zip(self, by_m, strict=True))
+        return Ranges(x, y, z)
 
     def hold_centers(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Which boxes (N, 7), metres, LiDAR frame, have their center inside, seen from above: (N,)."""

@@ -48,11 +48,14 @@ class BoxDataset(ScanSettings):
         labels: a .jsonl or .csv file for all frames, or a folder with a .json or .csv for each; relative or absolute.
         labeled_view_deg: labels stand only within this angle, half of it to each side of straight ahead, as where a
             camera looks: nothing is learnt from what lies outside. 360: everywhere.
+        sensor_position: x, y, z of the sensor in the scans' own frame, metres, where that is the vehicle's: from there
+            it follows what an inserted object hides.
     """
 
     scans: str = "scans"
     labels: str = "labels.jsonl"
     labeled_view_deg: float = ALL_AROUND_DEG
+    sensor_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,6 +105,12 @@ class BoxSplit:
         """
         paths = [frame.scan for _, frame in sorted(self._frames.items())]
         return self.settings.mounting(sample_points(paths, self._read), Path(self.root))[0]
+
+    @cached_property
+    def to_sensor(self) -> FrameChange:
+        """From the level frame to the same with the sensor at its origin."""
+        (position,) = self._level.points(np.array([self.settings.sensor_position]))
+        return FrameChange(np.eye(3), -position.astype(np.float64))
 
     @property
     def scans_folder(self) -> Path:

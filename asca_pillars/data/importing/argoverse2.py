@@ -17,6 +17,8 @@ from asca_pillars.errors import DatasetError
 
 AXLE_HEIGHT_M = 0.33
 """Of the vehicle's frame above the ground: a wheel's radius. The sweeps themselves show 0.35."""
+SENSOR_POSITION_M = (1.35, 0.0, 1.64)
+"""Of the upper one of the two stacked LiDARs, by the calibrations that come with the logs."""
 _CENTER = ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 _TURN = ("qw", "qx", "qy", "qz")
@@ -34,7 +36,9 @@ def read_argoverse2(root: Path) -> Imported:
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
     frames = [frame for log in logs for frame in _frames(log)]
-    settings = BoxDataset(sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root))
+    settings = BoxDataset(
+        sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root), sensor_position=SENSOR_POSITION_M
+    )
     return Imported(settings, frames)
 
 

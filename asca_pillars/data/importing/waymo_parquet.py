@@ -58,7 +58,12 @@ def read_waymo(root: Path, out: Path) -> Imported:
         # It marks the folder from the start, so that an import that was killed can be given again.
         temporary.write_text(MARKER, encoding="utf-8")
     frames = [frame for path in segments for frame in _frames(root, path, out.resolve() / "scans")]
-    return Imported(BoxDataset(sensor_height=0.0, reflectance_scale=1.0, scans=str(out.resolve() / "scans")), frames)
+    top = _calibrations(root / "lidar_calibration" / segments[0].name).get(TOP)
+    x, y, z = np.zeros(3) if top is None else np.round(top.vehicle_from_lidar[:3, 3], 3).tolist()
+    settings = BoxDataset(
+        sensor_height=0.0, reflectance_scale=1.0, scans=str(out.resolve() / "scans"), sensor_position=(x, y, z)
+    )
+    return Imported(settings, frames)
 
 
 def _frames(root: Path, lidar: Path, scans: Path) -> Iterator[ImportedFrame]:

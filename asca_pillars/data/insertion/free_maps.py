@@ -30,7 +30,9 @@ def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: boo
 
 
 def load_free_space(split: LabeledSplit, frame_id: str, prepared: Path, *, camera_view: bool) -> FreeSpace:
-    """The free space of a frame from its file below `prepared`; computed and kept there if missing or outdated.
+    """The free space of a frame, seen from the sensor at its origin (`to_sensor`), from its file below `prepared`.
+
+    It is computed and kept there if missing or outdated.
 
     Raises:
         DatasetError: the calibration cannot be read, or the folder cannot be written.
@@ -40,7 +42,8 @@ def load_free_space(split: LabeledSplit, frame_id: str, prepared: Path, *, camer
     stamp = _stamp(split, frame_id)
     if (space := _read(path, stamp)) is not None:
         return space
-    space = find_free_space(split.points(frame_id, camera_view=camera_view))
+    points = split.points(frame_id, camera_view=camera_view)
+    space = find_free_space(points if split.to_sensor.is_identity else split.to_sensor.points(points))
     _write(path, stamp, space)
     return space
 

@@ -13,7 +13,7 @@ What an inserted object would hide is removed: every point whose ray enters its 
 so; without it, walls would shine through cars. Points of GT-Aug objects behind walls stay, as in SECOND.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -25,11 +25,12 @@ from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_maps import load_free_space
 from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
 from asca_pillars.data.insertion.free_space import FreeSpace
-from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
+from asca_pillars.data.insertion.gt_database import ObjectDatabase, StoredObject, prepare_database
 from asca_pillars.data.insertion.prepared import prepared_folder
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 
 OBJECT_TRIES = 10  # objects of a class that are tried before one is given up
@@ -132,21 +133,31 @@ def insert_objects(frame: LabeledFrame, inserter: Inserter, rng: np.random.Gener
     classes keep their proportions. A frame without room, or without ground, keeps fewer or none. Labelled objects that
     an inserted one hides become IGNORED as those that the data hides.
     """
+    change = inserter.split.to_sensor
     space = inserter.free_space(frame.frame_id) if inserter.settings.method == "rs_aug" else None
-    scene = Scene(frame, _labeled_boxes(inserter.split, frame.frame_id))
+    labeled = inserter.split.labeled_boxes(frame.frame_id).boxes  # of any type: nothing is put into a lorry either
+    scene = Scene(_changed(frame, change), labeled if change.is_identity else change.boxes(labeled))
+    ranges = inserter.ranges.shifted(change.shift_m)
     for label in rng.choice(len(inserter.shares), inserter.settings.objects, p=inserter.shares):
         for _ in range(OBJECT_TRIES):
-            item = inserter.database[int(rng.choice(inserter.candidates[label]))]
+            item = _object_changed(inserter.database[int(rng.choice(inserter.candidates[label]))], change)
             if space is not None:
-                placed = to_free_place(item, space, scene, inserter.ranges, rng)
+                placed = to_free_place(item, space, scene, ranges, rng)
             else:
-                placed = item if is_clear(item.box, scene.obstacles, inserter.ranges) else None
+                placed = item if is_clear(item.box, scene.obstacles, ranges) else None
             if placed is not None:
                 scene.add(placed)
                 break
-    return scene.frame_with_inserted(inserter.min_points)
+    return _changed(scene.frame_with_inserted(inserter.min_points), change.inverse)
 
 
-def _labeled_boxes(split: LabeledSplit, frame_id: str) -> NDArray[np.float32]:
-    """Every labelled object's box (K, 7), whatever its type: nothing may be put into a lorry either."""
-    return split.labeled_boxes(frame_id).boxes
+def _changed(frame: LabeledFrame, change: FrameChange) -> LabeledFrame:
+    if change.is_identity:
+        return frame
+    return replace(frame, points=change.points(frame.points), boxes=change.boxes(frame.boxes))
+
+
+def _object_changed(item: StoredObject, change: FrameChange) -> StoredObject:
+    if change.is_identity:
+        return item
+    return item._replace(box=change.boxes(item.box[None])[0], points=change.points(item.points))

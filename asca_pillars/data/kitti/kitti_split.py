@@ -24,6 +24,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.data.scans.stored_scans import stored_points
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
+from asca_pillars.geometry.frame_change import FrameChange
 
 _PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # the signature, then length and name of the first chunk
 
@@ -132,6 +133,11 @@ class KittiSplit:
                 "are missing); every frame needs both, a label file may be empty"
             )
 
+    @property
+    def to_sensor(self) -> FrameChange:
+        """Nothing: scans are in the sensor's frame."""
+        return FrameChange.turn(0.0)
+
     def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
         """(N, 4) of the scan, LiDAR frame; with `camera_view` those that the camera sees."""
         points = read_scan(self.scan_path(frame_id)).points
@@ -194,7 +200,8 @@ def read_image_set(root: Path, name: str) -> set[str]:
     except OSError as error:
         there = ", ".join(sorted(p.stem for p in path.parent.glob("*.txt"))) or "none"
         raise DatasetError(
-            f"{path}: no such split (lists there: {there}); write the list, or use 'training' for every scan"
+            f"{path}: no such split (lists there: {there}); write the list, one frame id per line, or take every scan: "
+            "--split training, or -s data.train_set=training"
         ) from error
     if not frame_ids:
         raise DatasetError(f"{path}: the list is empty; write one frame id per line")

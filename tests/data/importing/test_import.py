@@ -121,6 +121,7 @@ def test_argoverse2(tmp_path: Path) -> None:
     assert split.frame_ids == ("val/log_a/sensors/lidar/315966265259836000",)  # the other sweep is not there
     boxes = split.labeled_boxes(split.frame_ids[0]).boxes
     assert boxes[0].tolist() == pytest.approx([20, 5, 1, 4, 2, 1.6, 0.7])
+    np.testing.assert_allclose(split.to_sensor.points(np.array([[1.35, 0, 1.64]])), 0, atol=1e-6)
     points = split.points(split.frame_ids[0])
     assert points_in_boxes(points, boxes).all() and points[:, 3].min() >= 0 and 0.5 < points[:, 3].max() <= 1
     # The sweeps are scans for every command, labels and poses beside them are not.

@@ -115,6 +115,7 @@ def test_points_lie_in_the_boxes(tmp_path: Path, moved_m: float) -> None:
     assert "boxes: Vehicle 1" in run(source, tmp_path / "out", "--from", "waymo", "--val-share", 0.5)
     split = BoxSplit(tmp_path / "out")
     assert split.frame_ids == ("segment/1000", "segment/2000") and split.mounting.sensor_height_m == 0
+    np.testing.assert_allclose(split.to_sensor.points(SENSOR_M[None]), 0, atol=1e-6)
     boxes, types = split.labeled_boxes("segment/1000")
     assert types == ("Vehicle",) and boxes[0].tolist() == pytest.approx(BOX)
     points = split.points("segment/1000")

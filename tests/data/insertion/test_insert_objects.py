@@ -18,6 +18,7 @@ from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_labels, write_labels
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
@@ -46,7 +47,7 @@ def inserter_of(root: Path, method: str, **insert: object) -> Inserter:
     return open_inserter(KittiSplit(root, "train"), config(method, **insert))
 
 
-def open_inserter(split: KittiSplit, settings: Config) -> Inserter:
+def open_inserter(split: LabeledSplit, settings: Config) -> Inserter:
     return prepare_inserter(split, settings.model.spec, settings.data, settings.augment.insert)
 
 
