@@ -5,6 +5,10 @@
     asca train asca_refine_sim --data data/sim --out runs/refine
     python -m benchmarks.refine_gain runs/refine/checkpoints/last.ckpt data/check
 
+or, for PV-RCNN, of an exported bundle:
+
+    python -m benchmarks.refine_gain pvrcnn_small_sim data/check
+
 All rows are the same proposals through the same suppression.
 """
 
@@ -14,15 +18,21 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
+from rich.progress import track
 
+from asca_deploy import Detector
+from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError
 from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.geometry.decode import PostProcess, sigmoid
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
@@ -32,27 +42,18 @@ from asca_pillars.models.second_stage.refined_detector import judge
 from asca_pillars.points.refined_detections import refined_detections
 from asca_pillars.system import cpu_model
 
+Judged = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]
+"""The R proposals of a frame, and the second stage's scores (R,) and residuals (R, 7) for them."""
+
 
 def main(
-    checkpoint: Annotated[Path, typer.Argument(help="Of kind pillar_refine, from `asca train`.")],
+    trained: Annotated[Path, typer.Argument(help="Checkpoint of kind pillar_refine, or bundle of kind pv_rcnn.")],
     check: Annotated[Path, typer.Argument(help="KITTI-layout folder to evaluate on.")],
     split: Annotated[str, typer.Option(help="Of that folder.")] = "training",
 ) -> None:
     """Evaluate and print."""
-    trained = load_checkpoint(checkpoint)
-    detector = trained.detector
-    if not isinstance(detector, RefineDetector):
-        raise ConfigError(f"{checkpoint}: of kind {trained.config.model.kind}, which has no second stage")
-    settings, frames = detector.model.refine, KittiSplit(check, split)
-    stage = open_first_stage(detector.model.first_stage)
-    cache = ProposalCache(Path(frames.root) / "prepared", stage, settings.seen)
-    cache.fill(frames, console=Console(markup=False))
-
-    post, class_names = trained.config.model.spec.post, stage.spec.class_names
-    found = {}
-    for frame_id in frames.frame_ids:
-        proposed, points = cache.files.read(frame_id), frames.points(frame_id, camera_view=True)
-        found[frame_id] = proposed.proposals, judge(detector.refiner, points, proposed, settings.neighbors)
+    frames = KittiSplit(check, split)
+    found, post, about = _refined(trained, frames) if trained.is_file() else _pv_rcnn(trained, frames)
 
     def detections(frame_id: str, new_scores: bool, new_boxes: bool) -> Detections:
         proposals, (scores, residuals) = found[frame_id]
@@ -60,6 +61,7 @@ def main(
             proposals, scores if new_scores else proposals.scores, residuals if new_boxes else 0 * residuals, post
         )
 
+    class_names = found[frames.frame_ids[0]][0].class_names
     rows = []
     for name, scores, boxes in (
         ("first stage", False, False),
@@ -69,9 +71,42 @@ def main(
     ):
         values = moderate_ap(frames, class_names, partial(detections, new_scores=scores, new_boxes=boxes))
         rows.append((name, *(f"{value:.1f}" for value in values)))
-    parameters = sum(weight.numel() for weight in detector.refiner.parameters())
-    print(f"{cpu_model()}: {parameters} parameters, {trained.steps} steps, {len(frames.frame_ids)} frames\n")
+    print(f"{cpu_model()}: {about}, {len(frames.frame_ids)} frames\n")
     print(markdown_table(("3D AP, moderate, R40", *class_names), rows, left=1))
+
+
+def _refined(path: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostProcess, str]:
+    checkpoint = load_checkpoint(path)
+    detector = checkpoint.detector
+    if not isinstance(detector, RefineDetector):
+        raise ConfigError(f"{path}: of kind {checkpoint.config.model.kind}; give a bundle of it")
+    settings = detector.model.refine
+    stage = open_first_stage(detector.model.first_stage)
+    cache = ProposalCache(Path(frames.root) / "prepared", stage, settings.seen)
+    cache.fill(frames, console=Console(markup=False))
+    found = {}
+    for frame_id in frames.frame_ids:
+        proposed, points = cache.files.read(frame_id), frames.points(frame_id, camera_view=True)
+        found[frame_id] = proposed.proposals, judge(detector.refiner, points, proposed, settings.neighbors)
+    parameters = sum(weight.numel() for weight in detector.refiner.parameters())
+    return found, checkpoint.config.model.spec.post, f"{parameters} parameters, {checkpoint.steps} steps"
+
+
+def _pv_rcnn(bundle: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostProcess, str]:
+    detector = Detector(bundle)
+    pipeline = detector.pipeline
+    if not isinstance(pipeline, PvRcnnPipeline):
+        raise ConfigError(f"{bundle}: of kind {detector.bundle.kind}; give a bundle of kind pv_rcnn")
+    found: dict[str, Judged] = {}
+    for frame_id in track(frames.frame_ids, "Detecting"):
+        raw = pipeline.infer(pipeline.prepare(frames.points(frame_id, camera_view=True), []), [])
+        if raw.maps is None:
+            nothing = np.empty(0, np.float32)
+            found[frame_id] = Detections.empty(pipeline.spec.class_names), (nothing, nothing.reshape(0, 7))
+            continue
+        proposals, logits, residuals = pipeline.judge(raw.maps, raw, [])
+        found[frame_id] = proposals, (sigmoid(logits), residuals)
+    return found, pipeline.spec.post, f"{detector.bundle.name}, {detector.runs_on}"
 
 
 def moderate_ap(

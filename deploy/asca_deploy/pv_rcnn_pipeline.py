@@ -152,7 +152,15 @@ class PvRcnnPipeline:
         """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
         if raw.maps is None:
             return Detections.empty(self.spec.class_names)
-        proposals = propose_anchors(raw.maps, self.spec, self.settings.proposals)
+        detections = reported_detections(*self.judge(raw.maps, raw, laps), self.spec)
+        laps.append(("decode", perf_counter()))
+        return detections
+
+    def judge(
+        self, maps: HeadMaps[NDArray[np.float32]], raw: FirstAnswer, laps: Laps
+    ) -> tuple[Detections, NDArray[np.float32], NDArray[np.float32]]:
+        """The R proposals of head maps, and what the second stage says of them: logits (R,), residuals (R, 7)."""
+        proposals = propose_anchors(maps, self.spec, self.settings.proposals)
         laps.append(("propose", perf_counter()))
         places = self.deform(raw.scan, raw.levels)
         laps.append(("keypoints", perf_counter()))
@@ -164,9 +172,7 @@ class PvRcnnPipeline:
         laps.append(("neighbors", perf_counter()))
         confidence, residuals = self.refine(raw.scan.keypoints, features, grid)
         laps.append(("refine", perf_counter()))
-        detections = reported_detections(proposals, confidence, residuals, self.spec)
-        laps.append(("decode", perf_counter()))
-        return detections
+        return proposals, confidence, residuals
 
     def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
         """Points (N, 4), metres, LiDAR frame, and reflectance -> what voxels.onnx reads."""
