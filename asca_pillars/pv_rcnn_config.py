@@ -90,7 +90,7 @@ class PvRcnnModel(Strict):
         box_loss: of the second stage's boxes; `va` adds AFE-RCNN's distance IoU seen from above to residuals and
             corners.
         train_first_stage: false: the first stage stays as `asca train --init` gives it, and the second alone is
-            trained, in a third of the time.
+            trained.
     """
 
     FIRST_STAGE: ClassVar[tuple[str, ...]] = ("voxels", "neck", "head")

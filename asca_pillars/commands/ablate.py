@@ -39,7 +39,7 @@ def ablate(
     asca ablate ablation_two_stage --data data/ablation --out runs/two_stage --variants pv_rcnn,deform_paper
 
     asca ablate ablation_two_stage --data data/ablation --out runs/second -s model.train_first_stage=false --init
-    runs/pvrcnn/checkpoints/last.ckpt --variants pv_rcnn,deform_paper
+    pvrcnn_small_sim --variants pv_rcnn,deform_paper
     """
     require("train")
     from rich.console import Console

@@ -20,7 +20,7 @@ BundleOption = Annotated[
         "-b",
         help="Model bundle: a folder, or the name of one that comes with asca: asca_sim, asca_small_sparse_sim (half "
         "as wide: faster), asca_refine_sim (asca_sim and a second stage) or asca_small_sim (a dense neck, for "
-        "providers that need one), each also with _int8. Default: asca_sim_int8.",
+        "providers that need one), each also with _int8, and pvrcnn_small_sim (PV-RCNN). Default: asca_sim_int8.",
     ),
 ]
 MIN_SCORE = 0.05  # of `asca eval --min-score`

@@ -2,8 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from asca_deploy import load_bundle, shipped
+from asca_deploy import shipped
 from asca_deploy.bundle import CanvasFormat, PillarSection
+from asca_deploy.manifest import load_any_bundle
 from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
 from asca_pillars.errors import BundleError, ConfigError
 
@@ -34,7 +35,7 @@ def test_weights_lie_in_some_bundles(tiny_bundle: Path, tmp_path: Path, monkeypa
 
 def test_shipped_files_lie_in_the_package() -> None:
     assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_sim_int8")
-    assert [(name, load_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
+    assert [(name, load_any_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
         ("asca_refine_sim", "asca_refine_sim"),
         ("asca_refine_sim_int8", "asca_refine_sim_int8"),
         ("asca_sim", "asca_sim"),
@@ -43,6 +44,7 @@ def test_shipped_files_lie_in_the_package() -> None:
         ("asca_small_sim_int8", "asca_small_sim_int8"),
         ("asca_small_sparse_sim", "asca_small_sparse_sim"),
         ("asca_small_sparse_sim_int8", "asca_small_sparse_sim_int8"),
+        ("pvrcnn_small_sim", "pvrcnn_small_sim"),
     ]
     assert sample_scan_path().parts[-3:] == ("asca_deploy", "samples", "street.bin")
 
