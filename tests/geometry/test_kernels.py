@@ -25,7 +25,7 @@ GRIDS = tuple(
     PillarGrid(x_range_m=(2.0, far_m), y_range_m=(-1.28, 2.56), z_range_m=(-2.5, 1.5), zones=zones)
     for zones, far_m in ((1, 9.68), (2, 7.12), (3, 9.68))
 )
-LIMITS = (PillarLimits(10**18, 10**18), PillarLimits(20, 3), PillarLimits(10**9, 2), PillarLimits(15, 10**9))
+LIMITS = (PillarLimits(2**31 - 1, 2**31 - 1), PillarLimits(20, 3), PillarLimits(10**9, 2), PillarLimits(15, 10**9))
 
 WITH_KERNELS = (
     *("geometry.decode", "pillars.pillarize", "points.columns", "points.ball_query"),

@@ -51,7 +51,7 @@ def test_missing_parts_of_a_dataset_are_named(root, tmp_path):
     missing = root / "training/velodyne/000003.bin"
     assert_one_line(missing, ["2 of 3", "val.txt"], lambda: KittiSplit(root, "val").frame_ids)
     assert_one_line("none.txt", ["empty"], lambda: KittiSplit(root, "none").frame_ids)
-    assert_one_line("vall.txt", ["none, val", "'training'"], lambda: KittiSplit(root, "vall").frame_ids)
+    assert_one_line("vall.txt", ["none, val", "--split training"], lambda: KittiSplit(root, "vall").frame_ids)
     nowhere = root / "nowhere"
     assert_one_line(nowhere / "training/velodyne", ["<root>"], lambda: KittiSplit(nowhere).frame_ids)
 

@@ -17,10 +17,16 @@ from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn as OurNetwork
 from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
 from asca_pillars.points.refine_geometry import grid_neighbors
 from asca_pillars.pv_rcnn_config import PvRcnnModel
+from asca_pillars.tables.voxels import VoxelGrid
 from tests.models.openpcdet.foreign_networks import PvRcnn, pooled, random_weights, write_foreign
-from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SETTINGS, SPEC, batch, frame
+from tests.models.pv_rcnn import tiny_pv_rcnn
+from tests.models.pv_rcnn.tiny_pv_rcnn import NETWORK, SETTINGS, batch, frame
 from tests.tables.test_cell_map import at_cells, dense
 
+SPEC = dataclasses.replace(  # with the strides of the published model, which has no other kernels
+    tiny_pv_rcnn.SPEC, grid=VoxelGrid((4.8, 24.0), (-6.4, 6.4), (-3.0, 1.0), (0.2, 0.2, 0.1)), last_stride=2
+)
+MODEL = dataclasses.replace(tiny_pv_rcnn.MODEL, spec=SPEC)
 CONFIG = Config(name="foreign", model=MODEL)
 LAYOUTS = {"1.x": (2, 3, 4, 1, 0), "2.x, native": (2, 3, 4, 0, 1), "2.x": (0, 2, 3, 4, 1)}
 """Of a dense kernel (out, in, z, y, x), the order in which spconv has its axes."""
