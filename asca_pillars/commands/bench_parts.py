@@ -55,7 +55,7 @@ def measure_parts(
     report = benchmark(detector, scans, rounds, track=bar)
     result = report.to_dict()
     lines = show.summary_lines(report)
-    if any(report.points_outside >= report.points for report in (detector(scan).report.counts for scan in scans)):
+    if not all(report.points_inside):
         lines.append("no roofline: the backbone has nothing to compute in a scan without points in the model's ranges")
     elif detector.provider in ON_THE_CPU:
         # All passes of a scan are in the stage, and the backbone's operations are those of one.

@@ -22,6 +22,12 @@ def check_wishes(counts: dict[str, int], val_share: float) -> None:
         raise ConfigError(f"val_share is {val_share}; it must lie between 0 and 1")
 
 
+def held_out(count: int, share: float) -> int:
+    """How many of so many frames or sequences are for validation: one at least, where one is left to train on."""
+    wanted = round(count * share)
+    return min(max(wanted, 1), count - 1) if 0 < share < 1 and count > 1 else wanted
+
+
 def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool) -> None:
     """Do a job for each item, in `workers` processes; the job has to be one that can be sent to a process."""
     for _ in in_processes(job, todo, workers, "Simulating", progress=progress):

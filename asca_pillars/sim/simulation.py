@@ -22,7 +22,7 @@ from asca_pillars.data.kitti import (
 from asca_pillars.files import atomic_path
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
-from asca_pillars.sim.parallel import ABOUT_FILE, check_wishes, claim_simulation, for_each
+from asca_pillars.sim.parallel import ABOUT_FILE, check_wishes, claim_simulation, for_each, held_out
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.image_border import outside_image
@@ -159,12 +159,6 @@ def simulate(
     write_image_set(root, "train", names[:first_val])
     write_image_set(root, "val", names[first_val:])
     return root
-
-
-def held_out(count: int, share: float) -> int:
-    """How many of so many frames or sequences are for validation: one at least, where one is left to train on."""
-    wanted = round(count * share)
-    return min(max(wanted, 1), count - 1) if 0 < share < 1 and count > 1 else wanted
 
 
 def frame_id(index: int) -> str:

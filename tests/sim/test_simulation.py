@@ -12,7 +12,7 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import bev_intersection
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.simulation import Frame, SimulationConfig, held_out, simulate, simulate_frame
+from asca_pillars.sim.simulation import Frame, SimulationConfig, simulate, simulate_frame
 from asca_pillars.sim.world.scene import draw_scene
 from tests.sent import sent
 
@@ -79,11 +79,6 @@ def test_frames_of_another_seed_or_configuration_are_not_mixed(tmp_path: Path) -
         simulate(tmp_path, 2, seed=1, progress=False)
     simulate(tmp_path, 2, seed=1, config=CAMERA, progress=False)
     assert KittiSplit(tmp_path).frame_ids == ("000000", "000001")
-
-
-def test_both_lists_get_a_frame_where_there_are_two() -> None:
-    assert [held_out(count, 0.1) for count in (1, 2, 5, 14, 100)] == [0, 1, 1, 1, 10]
-    assert [held_out(3, share) for share in (0.0, 0.9, 1.0)] == [0, 2, 3]
 
 
 def test_impossible_wishes_are_refused(tmp_path: Path) -> None:

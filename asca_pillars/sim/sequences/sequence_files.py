@@ -24,11 +24,11 @@ from asca_pillars.data.kitti import in_image, write_image_set
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.files import atomic_path, write_json
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
-from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each
+from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each, held_out
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
 from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
-from asca_pillars.sim.simulation import SimulationConfig, held_out, take_scan
+from asca_pillars.sim.simulation import SimulationConfig, take_scan
 
 RATE_HZ = 10.0
 PAUSE_S = 5.0  # from the last scan of a sequence to the first of the next, in the time stamps

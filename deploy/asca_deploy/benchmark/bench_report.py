@@ -38,6 +38,8 @@ class BenchmarkReport:
     scans: int
     points: tuple[int, ...]
     """Points of each scan."""
+    points_inside: tuple[int, ...]
+    """Of them those within the model's ranges, added up over the passes."""
     pillars: tuple[int, ...]
     """Pillars of each scan after the limits."""
     detections: tuple[int, ...]
@@ -98,6 +100,7 @@ def benchmark(
         passes=detector.passes,
         scans=len(scans),
         points=tuple(len(scan) for scan in scans),
+        points_inside=tuple(frame.counts.points - frame.counts.points_outside for frame in passes[0]),
         pillars=tuple(pillars_of(frame) for frame in passes[0]),
         detections=tuple(len(detector(scan)) for scan in scans),
         provider=detector.provider,
