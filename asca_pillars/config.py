@@ -161,6 +161,9 @@ class TrainConfig(Strict):
     def __post_init__(self) -> None:
         require_bounds("train", self, ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"), low=1)
         require_bounds("train", self, ("learning_rate", "weight_decay", "decay", "gradient_clip", "seed"), low=0)
+        for name in ("learning_rate", "decay"):
+            if not getattr(self, name):
+                raise ConfigError(f"train.{name} = 0: nothing would be learnt; must be more than 0")
         if not 0 <= self.ema < 1:
             raise ConfigError(f"train.ema = {self.ema:g}: must be at least 0 and less than 1, such as 0.999")
 

@@ -222,6 +222,8 @@ model:
         ("augment.reflectance_loss_probability", "-1", "must lie between 0 and 1"),
         ("augment.object_reflectance_gain", "[2, 0.5]", "must be two positive numbers, the smaller first"),
         ("train.ema", "1", "must be at least 0 and less than 1"),
+        ("train.learning_rate", "0", "must be more than 0"),
+        ("train.decay", "0", "must be more than 0"),
         ("train.ema", ".nan", "should be a finite number"),
         ("train.batch_size", "true", "should be a number"),
         ("augment.scale", "[1.05, 0.95]", "must be two positive numbers, the smaller first"),
