@@ -18,11 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from asca_pillars.errors import OutputError
-
-try:
-    import fcntl
-except ImportError:  # Windows: nothing is locked, so that leftovers of a killed run stay
-    fcntl = None  # type: ignore[assignment]
+from asca_pillars.locks import CAN_LOCK, locked
 
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.asca-[0-9a-f]{8}(?P<retired>-old)?(?:\.[^.]*)?")
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -159,31 +155,20 @@ def recover(folder: str | Path, *, again: bool = False) -> None:
     not our temporary names.
     """
     folder = Path(os.path.realpath(folder))
-    if _shares_folders or (folder in _cleared and not again) or fcntl is None or not folder.is_dir():
+    if _shares_folders or (folder in _cleared and not again) or not CAN_LOCK or not folder.is_dir():
         return
     _cleared.add(folder)
     for path in sorted(folder.glob(".*.asca-*")):
         match = _TEMPORARY.fullmatch(path.name)
         if match is None or path.is_symlink():
             continue
-        with contextlib.suppress(OSError), _locked(path, wait=False):
+        with contextlib.suppress(OSError), locked(path, wait=False):
             if not path.is_dir():
                 path.unlink()
             elif match["retired"] and not (folder / match["name"]).exists():
                 path.replace(folder / match["name"])
             else:
                 shutil.rmtree(path)
-
-
-def try_lock(handle: int) -> bool:
-    """Lock an open file for this process until it closes it; False if another process holds it."""
-    if fcntl is None:
-        return True
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)  # others: no locks there
-    return True
 
 
 def _prepare(path: str | Path) -> Path:
@@ -213,7 +198,7 @@ def _temporary(target: Path, prefix: str, suffix: str, *, folder: bool) -> Itera
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(FileNotFoundError):  # taken for a leftover before it was locked
-                stack.enter_context(_locked(temporary))
+                stack.enter_context(locked(temporary))
             if not temporary.exists():
                 continue
             try:
@@ -222,25 +207,6 @@ def _temporary(target: Path, prefix: str, suffix: str, *, folder: bool) -> Itera
                 # After an exchange this is the old folder.
                 shutil.rmtree(temporary, ignore_errors=True) if folder else temporary.unlink(missing_ok=True)
             return
-
-
-@contextlib.contextmanager
-def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
-    """Hold the lock of a file or folder.
-
-    Raises:
-        OSError: another process holds it and `wait` is False, or there is nothing at `path`.
-    """
-    if fcntl is None:
-        yield
-        return
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        with contextlib.suppress(*((OSError,) if wait else ())):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        yield
-    finally:
-        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -257,7 +223,7 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 def _sync(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk and not only in memory."""
-    if path.is_dir() and fcntl is None:
+    if path.is_dir() and not CAN_LOCK:
         return
     handle = os.open(path, os.O_RDONLY)
     try:
@@ -281,7 +247,7 @@ def _exchange(one: Path, other: Path) -> bool:
 
 def _replace_in_two_steps(temporary: Path, target: Path) -> None:
     retired = temporary.with_name(f"{temporary.name}-old")
-    with _locked(target):
+    with locked(target):
         target.replace(retired)
         try:
             temporary.replace(target)

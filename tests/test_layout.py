@@ -12,6 +12,7 @@ PACKAGES = (ROOT / "asca_pillars", ROOT / "deploy" / "asca_deploy", ROOT / "expo
 SHARED_NAMES = {"__init__.py", "conftest.py"}
 LAYERS = (  # what is in one of them imports from those before it
     {"errors"},
+    {"locks"},
     {"files", "processes", "schema", "system", "yaml_text"},
     {"cluster", "geometry"},
     {"pillars", "tables"},

@@ -16,7 +16,7 @@ import numpy as np
 
 from asca_deploy import Detections
 from asca_pillars.errors import OutputError
-from asca_pillars.files import try_lock
+from asca_pillars.locks import try_lock
 
 JOURNAL_FILE = "detections.partial.jsonl"
 

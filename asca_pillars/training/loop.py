@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from asca_pillars.config import Config, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import recover
+from asca_pillars.locks import only_writer
 from asca_pillars.models.checkpoint import save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.refine_config import RefineModel
@@ -72,13 +74,21 @@ def train(
             another network, or missing where it is needed, the devices are not there, or a loss became infinite or
             NaN.
         TrainingInterruptedError: Ctrl-C; the run is saved.
+        OutputError: another process trains in `out`.
         DatasetError, ScanError: the data cannot be read.
         BundleError, ExportError, ConfigError: the first stage of two cannot be used, or `init` is a bundle without
             weights.
     """
+    # The processes of one run share its folder: the first holds it.
+    with only_writer(out, "asca train") if getattr(rank_zero_only, "rank", 0) == 0 else nullcontext():
+        return _train(config, data_root, Path(out), devices, num_nodes, init)
+
+
+def _train(
+    config: Config, data_root: str | Path, out: Path, devices: str, num_nodes: int, init: str | Path | None
+) -> Path:
     if isinstance(config.model, RefineModel):
         config = replace(config, model=with_first_stage(config.model))
-    out = Path(out)
     checkpoints = out / "checkpoints"
     # What the run records of itself must hold for its checkpoint: without a camera it has seen whole scans.
     view = config.data.camera_view and open_split(data_root).has_camera

@@ -30,7 +30,6 @@ from asca_pillars.training.callbacks import TrainingInterruptedError
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
 from asca_pillars.training.module import DetectionModule
-from asca_pillars.training.run_folder import Seen, claim
 from tests.scenes import GROUND_Z_M, SPEC, write_dataset
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
@@ -98,29 +97,8 @@ def test_run_folder_and_checkpoint(tmp_path: Path) -> None:
     assert isinstance(checkpoint.detector, PillarDetector) and not checkpoint.detector.training
 
 
-def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "data", 3)
-    claim(tmp_path / "run", CONFIG, Seen.of([], 1))
-    (tmp_path / "run" / "checkpoints").mkdir()
-    (tmp_path / "run" / "checkpoints" / "best.ckpt").touch()
-    with pytest.raises(TrainingError, match=r"config\.yaml: .* train\.seed = 0, now train\.seed = 1; choose another"):
-        train(with_train(seed=1), data, tmp_path / "run")
-
-
 def with_train(**changes: object) -> Config:
     return dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, **changes))  # type: ignore[arg-type]
-
-
-def test_a_run_of_an_older_version_goes_on(tmp_path: Path) -> None:
-    """Its config.yaml lacks a setting that came later, not the setting's default."""
-    data = write_dataset(tmp_path / "data", 3)
-    first = train(CONFIG, data, tmp_path / "run")
-    path = tmp_path / "run" / "config.yaml"
-    older = yaml.safe_load(path.read_text())
-    del older["augment"]["insert"], older["model"]["loss"]["score_target"], older["model"]["loss"]["assigner"]
-    path.write_text(yaml.safe_dump(older))
-    steps = load_checkpoint(first).steps
-    assert load_checkpoint(train(CONFIG, data, tmp_path / "run")).steps == steps
 
 
 def test_devices_that_do_not_exist_are_one_line(tmp_path: Path) -> None:
