@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.points.anchor_proposals import AnchorProposals
+from asca_pillars.points.refined_detections import Scores
 from asca_pillars.points.voxel_scan import VoxelSetSettings
 from asca_pillars.schema import Strict
 from asca_pillars.tables.voxel_spec import VoxelSpec
@@ -89,6 +90,8 @@ class PvRcnnModel(Strict):
         rois: how many of them it draws for each frame.
         box_loss: of the second stage's boxes; `va` adds AFE-RCNN's distance IoU seen from above to residuals and
             corners.
+        scores: of refined boxes: `second`, the second stage's as published, or `both`, the geometric mean with the
+            proposal's.
         train_first_stage: false: the first stage stays as `asca train --init` gives it, and the second alone is
             trained.
     """
@@ -103,6 +106,7 @@ class PvRcnnModel(Strict):
     training_proposals: AnchorProposals = field(default_factory=_many_proposals)
     rois: int = 128
     box_loss: Literal["smooth_l1", "va"] = "smooth_l1"
+    scores: Scores = "second"
     train_first_stage: bool = True
 
     def __post_init__(self) -> None:

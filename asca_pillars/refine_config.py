@@ -7,6 +7,7 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStageSettings
 from asca_pillars.points.refine_geometry import RefineSettings
+from asca_pillars.points.refined_detections import Scores
 from asca_pillars.schema import Strict
 
 
@@ -46,12 +47,14 @@ class RefineConfig(Strict):
         neighbors: balls and grids.
         network: widths.
         rois: proposals of a frame that one training step learns from.
+        scores: of refined boxes: `second`, the second stage's, or `both`, the geometric mean with the proposal's.
     """
 
     seen: FirstStageSettings = field(default_factory=FirstStageSettings)
     neighbors: RefineSettings = field(default_factory=RefineSettings)
     network: RefineNetwork = field(default_factory=RefineNetwork)
     rois: int = 32
+    scores: Scores = "both"
 
     def __post_init__(self) -> None:
         if self.rois < 2:

@@ -32,18 +32,18 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report import markdown_table
-from asca_pillars.geometry.decode import PostProcess, sigmoid
+from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.models.second_stage.open_first_stage import open_first_stage
 from asca_pillars.models.second_stage.proposal_cache import ProposalCache
 from asca_pillars.models.second_stage.refined_detector import judge
-from asca_pillars.points.refined_detections import refined_detections
+from asca_pillars.points.refined_detections import Scores, refined_detections, refined_scores
 from asca_pillars.system import cpu_model
 
 Judged = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""The R proposals of a frame, and the second stage's scores (R,) and residuals (R, 7) for them."""
+"""The R proposals of a frame, and the second stage's confidence (R,), logits, and residuals (R, 7) for them."""
 
 
 def main(
@@ -55,21 +55,22 @@ def main(
     frames = KittiSplit(check, split)
     found, post, about = _refined(trained, frames) if trained.is_file() else _pv_rcnn(trained, frames)
 
-    def detections(frame_id: str, new_scores: bool, new_boxes: bool) -> Detections:
-        proposals, (scores, residuals) = found[frame_id]
-        return refined_detections(
-            proposals, scores if new_scores else proposals.scores, residuals if new_boxes else 0 * residuals, post
-        )
+    def detections(frame_id: str, scores: Scores | None, new_boxes: bool) -> Detections:
+        proposals, (confidence, residuals) = found[frame_id]
+        chosen = proposals.scores if scores is None else refined_scores(proposals, confidence, scores)
+        return refined_detections(proposals, chosen, residuals if new_boxes else 0 * residuals, post)
 
     class_names = found[frames.frame_ids[0]][0].class_names
     rows = []
-    for name, scores, boxes in (
-        ("first stage", False, False),
-        ("its boxes, new scores", True, False),
-        ("its scores, new boxes", False, True),
-        ("refined", True, True),
-    ):
-        values = moderate_ap(frames, class_names, partial(detections, new_scores=scores, new_boxes=boxes))
+    choices: tuple[tuple[str, Scores | None, bool], ...] = (
+        ("first stage", None, False),
+        ("its boxes, the second's scores", "second", False),
+        ("its scores, new boxes", None, True),
+        ("the second's scores, new boxes", "second", True),
+        ("scores of both, new boxes", "both", True),
+    )
+    for name, scores, boxes in choices:
+        values = moderate_ap(frames, class_names, partial(detections, scores=scores, new_boxes=boxes))
         rows.append((name, *(f"{value:.1f}" for value in values)))
     print(f"{cpu_model()}: {about}, {len(frames.frame_ids)} frames\n")
     print(markdown_table(("3D AP, moderate, R40", *class_names), rows, left=1))
@@ -105,7 +106,7 @@ def _pv_rcnn(bundle: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostP
             found[frame_id] = Detections.empty(pipeline.spec.class_names), (nothing, nothing.reshape(0, 7))
             continue
         proposals, logits, residuals = pipeline.judge(raw.maps, raw, [])
-        found[frame_id] = proposals, (sigmoid(logits), residuals)
+        found[frame_id] = proposals, (logits, residuals)
     return found, pipeline.spec.post, f"{detector.bundle.name}, {detector.runs_on}"
 
 

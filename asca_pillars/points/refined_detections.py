@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,22 @@ from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.points.refinement import decode_refinement
 
+Scores = Literal["second", "both"]
+"""Whose score a refined box has: the second stage's, or the geometric mean of its own and of its proposal's."""
+
+
+def refined_scores(proposals: Detections, confidence: NDArray[np.float32], scores: Scores) -> NDArray[np.float32]:
+    """Scores (R,) in [0, 1] of refined boxes, from the second stage's confidence (R,), logits."""
+    own = sigmoid(confidence)
+    return own if scores == "second" else np.sqrt(own * proposals.scores)
+
 
 def reported_detections(
-    proposals: Detections, confidence: NDArray[np.float32], residuals: NDArray[np.float32], spec: DetectorSpec
+    proposals: Detections,
+    confidence: NDArray[np.float32],
+    residuals: NDArray[np.float32],
+    spec: DetectorSpec,
+    scores: Scores,
 ) -> Detections:
     """Refined boxes whose scores reach the thresholds of `spec`, best first, after its suppression.
 
@@ -22,22 +36,28 @@ def reported_detections(
         confidence: (R,) logits.
         residuals: (R, 7), see `decode_refinement`. Rows that are not finite are left out, and counted with what the
             first stage left out.
+        spec: thresholds and suppression.
+        scores: what the thresholds are of.
     """
     finite = np.isfinite(confidence) & np.isfinite(residuals).all(axis=1)
-    scores = sigmoid(np.where(finite, confidence, 0))
+    values = refined_scores(proposals, np.where(finite, confidence, np.float32(0)), scores)
     thresholds = np.array([item.score_threshold for item in spec.classes])
-    kept = np.flatnonzero(finite & (scores >= thresholds[proposals.labels]))
-    found = refined_detections(proposals[kept], scores[kept], residuals[kept], spec.post)
+    kept = np.flatnonzero(finite & (values >= thresholds[proposals.labels]))
+    found = refined_detections(proposals[kept], values[kept], residuals[kept], spec.post)
     return replace(found, non_finite=proposals.non_finite + int((~finite).sum()) + found.non_finite)
 
 
 def reported_frames(
-    proposals: Sequence[Detections], confidence: NDArray[np.float32], residuals: NDArray[np.float32], spec: DetectorSpec
+    proposals: Sequence[Detections],
+    confidence: NDArray[np.float32],
+    residuals: NDArray[np.float32],
+    spec: DetectorSpec,
+    scores: Scores,
 ) -> list[Detections]:
     """`reported_detections` of several frames, whose logits (R,) and residuals (R, 7) follow one another."""
     ends = np.cumsum([len(frame) for frame in proposals])[:-1]
     frames = zip(proposals, np.split(confidence, ends), np.split(residuals, ends), strict=True)
-    return [reported_detections(*frame, spec) for frame in frames]
+    return [reported_detections(*frame, spec, scores) for frame in frames]
 
 
 def refined_detections(
@@ -47,7 +67,7 @@ def refined_detections(
 
     Args:
         proposals: R of them.
-        scores: (R,) confidences in [0, 1], which take the place of the first stage's.
+        scores: (R,) in [0, 1], which take the place of the first stage's, see `refined_scores`.
         residuals: (R, 7), see `decode_refinement`.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left out below

@@ -18,6 +18,7 @@ from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStageSettings
 from asca_pillars.points.refine_geometry import RefineSettings
+from asca_pillars.points.refined_detections import Scores
 from asca_pillars.points.voxel_scan import VoxelSetSettings
 from asca_pillars.schema import Strict
 from asca_pillars.tables.neck_tables import MaskRule
@@ -128,6 +129,8 @@ class RefineSection(Strict):
     """Proposals and keypoints."""
     neighbors: RefineSettings
     """Balls and grids."""
+    scores: Scores
+    """Of refined boxes."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.bev_channels <= _MOST_CHANNELS:
@@ -224,6 +227,8 @@ class PvRcnnSection(Strict):
     """Of a keypoint's fused feature."""
     settings: VoxelSetSettings
     """Keypoints, proposals and neighbors."""
+    scores: Scores
+    """Of refined boxes."""
 
     def __post_init__(self) -> None:
         for channels in (*self.voxel_channels, self.keypoint_channels):

@@ -106,7 +106,7 @@ def _second_stage(pipeline: RefinePipeline, first: FirstPass, points: NDArray[np
     scan = refine_scan(points, proposed, proposed.proposals, pipeline.section.neighbors)
     inputs = refine_inputs(scan)
     confidence, residuals = pipeline.refine(inputs)
-    found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec)
+    found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec, pipeline.section.scores)
     return {
         "neck+head": {**_answered(HeadAnswer(first.maps, first.cells)), "neck": first.neck},
         "propose": _detections(proposed.proposals),

@@ -31,9 +31,14 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 
 _ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTIALS[:-1], "pv_rcnn")}
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
-# Of `pillar`, `spec` and `spec.grid`, and what they are where they are not written: in bundles made before there were
-# sparse necks, other anchors and pooled maps. The graphs' metadata tells whether they were taken out.
-_LATER_KEYS = {"neck": "dense"}
+# Of these sections, and of a pillar detector's `spec` and `spec.grid`, and what they are where they are not written: in
+# bundles made before there were sparse necks, scores of both stages, other anchors and pooled maps. Whether they were
+# taken out is told by the graphs' metadata.
+_LATER_KEYS = {
+    "pillar": {"neck": "dense"},
+    "refine": {"scores": "second"},
+    "pv_rcnn": {"scores": "second"},
+}
 _LATER_SPEC_KEYS = {"anchor_places": "cells", "anchor_scores": "own"}
 _LATER_GRID_KEYS = {"map": "warped"}
 _LARGEST_BYTES = 1 << 20
@@ -67,6 +72,7 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
     stamped = {key: data.get(key) for key in (_ESSENTIALS_2 if old else _stamped_keys(data))}
     if old:
         data = upgrade_schema_2(data)
+    data |= {name: first | data[name] for name, first in _LATER_KEYS.items() if isinstance(data.get(name), dict)}
     family: type[AnyBundle] = PvRcnnBundle if data.get("kind") == "pv_rcnn" else Bundle
     layout = _take_out_layout(manifest, data) if family is Bundle else None
     try:
@@ -95,13 +101,12 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
 
 
 def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
-    """The layout that a pillar detector's manifest writes down; keys that came later get their first meaning."""
+    """The layout that a pillar detector's manifest writes down; later keys of `spec` get their first meaning."""
     if data.get("kind") == "pillar" and "refine" in data:
         raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {_EXPORT_AGAIN}")
     layout = None
     if isinstance(section := data.get("pillar"), dict):
-        data["pillar"] = _LATER_KEYS | section
-        layout = data["pillar"].pop("layout", None)
+        layout = section.pop("layout", None)
     if isinstance(spec := data.get("spec"), dict) and isinstance(grid := spec.get("grid"), dict):
         data["spec"] = _LATER_SPEC_KEYS | spec | {"grid": _LATER_GRID_KEYS | grid}
     return layout

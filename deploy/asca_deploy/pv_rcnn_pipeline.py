@@ -100,7 +100,7 @@ class PvRcnnPipeline:
         for kernels in (ball_query.KERNELS, columns.KERNELS, cell_map.KERNELS, voxels.KERNELS):
             load_kernels(kernels)  # here rather than in the first scan
         self.spec: VoxelSpec = bundle.spec
-        self.settings = bundle.pv_rcnn.settings
+        self.settings, self.scores = bundle.pv_rcnn.settings, bundle.pv_rcnn.scores
 
         def opened(
             name: str,
@@ -152,7 +152,7 @@ class PvRcnnPipeline:
         """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
         if raw.maps is None:
             return Detections.empty(self.spec.class_names)
-        detections = reported_detections(*self.judge(raw.maps, raw, laps), self.spec)
+        detections = reported_detections(*self.judge(raw.maps, raw, laps), self.spec, self.scores)
         laps.append(("decode", perf_counter()))
         return detections
 

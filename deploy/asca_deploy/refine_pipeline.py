@@ -107,7 +107,7 @@ class RefinePipeline:
         laps.append(("neighbors", perf_counter()))
         confidence, residuals = self.refine(inputs)
         laps.append(("refine", perf_counter()))
-        detections = reported_detections(proposed.proposals, confidence, residuals, self.spec)
+        detections = reported_detections(proposed.proposals, confidence, residuals, self.spec, self.section.scores)
         laps.append(("decode", perf_counter()))
         return detections
 

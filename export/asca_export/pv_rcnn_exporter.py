@@ -58,7 +58,9 @@ def export_pv_rcnn_bundle(
             name=config.name,
             kind="pv_rcnn",
             spec=model.spec,
-            pv_rcnn=PvRcnnSection(model.network.voxel_channels, model.network.keypoint_channels, model.settings),
+            pv_rcnn=PvRcnnSection(
+                model.network.voxel_channels, model.network.keypoint_channels, model.settings, model.scores
+            ),
             precision="float32",
             backbone_gmac=0.0,
             graphs={},

@@ -78,7 +78,7 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
         ours, theirs = tuple(part.numpy() for part in refined), runtime.refine(scan.keypoints, features, grid)
         for name, wanted, found in zip(("confidence", "residuals"), ours, theirs, strict=True):
             worst = max(worst, _require(f"refine `{name}`", wanted, found, number))
-        boxes, partners = (reported_detections(proposals, c, r, every_box) for c, r in (ours, theirs))
+        boxes, partners = (reported_detections(proposals, c, r, every_box, runtime.scores) for c, r in (ours, theirs))
         difference, lone = nearest_partners(boxes, partners)
         if len(lone):
             raise ExportError(

@@ -68,7 +68,7 @@ def export_refine_bundle(
         _copy_first_stage(first, proposing, folder)
         progress("Exporting the second stage and proving parity")
         path, classes = graphs.graph_path(folder, REFINE), len(model.spec.classes)
-        section = RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors)
+        section = RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors, model.refine.scores)
         export_refine(detector.refiner, section, classes, path)
         draft = draft_bundle(
             checkpoint._replace(config=dataclasses.replace(config, model=model)),

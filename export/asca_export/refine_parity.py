@@ -63,7 +63,9 @@ def prove_refine_parity(
         theirs = runtime.refine(refine_inputs(asked))
         for name, one, other in zip(("confidence", "residuals"), ours, theirs, strict=True):
             worst = max(worst, require_close(f"refine `{name}`", one, other, MAP_TOLERANCE, number))
-        boxes, partners = (reported_detections(proposed.proposals, c, r, spec) for c, r in (ours, theirs))
+        boxes, partners = (
+            reported_detections(proposed.proposals, c, r, spec, model.refine.scores) for c, r in (ours, theirs)
+        )
         difference, lone = nearest_partners(boxes, partners)
         if len(lone):
             raise ExportError(

@@ -13,10 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.bundle import MANIFEST
-from asca_deploy.manifest import graph_files, load_bundle
+from asca_deploy.bundle import MANIFEST, PvRcnnBundle
+from asca_deploy.manifest import graph_files, load_any_bundle, load_bundle
 from asca_deploy.shipped import shipped_bundles
 from asca_pillars.errors import BundleError
+from asca_pillars.schema import to_dict
 from tests.deploy.test_manifest import NOT_THE_GRAPHS, assert_refused, edit
 
 
@@ -47,6 +48,21 @@ def test_a_bundle_that_names_no_neck_has_a_dense_one(tmp_path: Path) -> None:
     assert (section.neck, section.active_cells) == ("dense", None)
     edit(folder, lambda data: data["pillar"].update(neck="sparse", active_cells="fine"))
     assert_refused(folder, NOT_THE_GRAPHS.format("pillar"))
+
+
+def test_refined_boxes_of_an_older_bundle_have_the_scores_that_they_had(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(shipped_bundles()["pvrcnn_small_sim"], tmp_path / "older"))
+    data = json.loads((folder / MANIFEST).read_text())
+    assert data["pv_rcnn"].pop("scores") == "both"
+    for graph in data["graphs"].values():
+        model = onnx.load(folder / graph["file"])
+        stamped = {prop.key: prop.value for prop in model.metadata_props}
+        onnx.helper.set_model_props(model, stamped | {"pv_rcnn": json.dumps(data["pv_rcnn"])})
+        onnx.save(model, folder / graph["file"])
+    data["graphs"] = {name: to_dict(file) for name, file in graph_files(folder, data["graphs"]).items()}
+    (folder / MANIFEST).write_text(json.dumps(data))
+    bundle = load_any_bundle(folder)
+    assert isinstance(bundle, PvRcnnBundle) and bundle.pv_rcnn.scores == "second"
 
 
 def test_schema_2_is_read_as_kind_pillar(tiny_bundle: Path, bundle_copy: Path, scan: NDArray[np.float32]) -> None:

@@ -105,7 +105,9 @@ def test_large_networks_give_their_memory_back() -> None:
         model = load_config(name).model
         assert isinstance(model, PvRcnnModel)
         network = model.network
-        kept[name] = keeps_memory(PvRcnnSection(network.voxel_channels, network.keypoint_channels, model.settings))
+        kept[name] = keeps_memory(
+            PvRcnnSection(network.voxel_channels, network.keypoint_channels, model.settings, model.scores)
+        )
     assert kept == {"pv_rcnn_kitti": False, "pvrcnn_small_sim": True}
 
 

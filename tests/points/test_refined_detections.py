@@ -4,7 +4,7 @@ import numpy as np
 
 from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.geometry.detections import Detections
-from asca_pillars.points.refined_detections import refined_detections, reported_detections
+from asca_pillars.points.refined_detections import refined_detections, refined_scores, reported_detections
 from asca_pillars.points.refinement import encode_refinement
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 
@@ -50,8 +50,29 @@ def test_what_is_not_finite_in_either_stage_is_counted() -> None:
     residuals = np.zeros((3, 7), np.float32)
     residuals[0, 0] = np.nan
     residuals[1, 0] = 3e38  # a place beyond float32
-    found = reported_detections(proposals, np.full(3, 2.0, np.float32), residuals, spec)
+    found = reported_detections(proposals, np.full(3, 2.0, np.float32), residuals, spec, "second")
     assert len(found) == 1 and found.non_finite == 7 + 2
+
+
+def test_scores_of_both_stages_are_their_geometric_mean() -> None:
+    proposals = Detections(at(10, 30), np.array([0.4, 0.9], np.float32), np.zeros(2, np.int64), NAMES)
+    confidence = np.array([2.0, -1.0], np.float32)
+    own = 1 / (1 + np.exp(-confidence))
+    np.testing.assert_allclose(refined_scores(proposals, confidence, "second"), own, rtol=1e-6)
+    np.testing.assert_allclose(refined_scores(proposals, confidence, "both"), np.sqrt(own * [0.4, 0.9]), rtol=1e-6)
+
+
+def test_thresholds_are_of_the_scores_that_are_reported() -> None:
+    """The second stage would keep the first box alone, its proposals' scores the other one."""
+    spec = PvRcnnModel().spec.with_score_threshold(0.5)
+    labels, places = np.zeros(2, np.int64), at(10, 30)
+    proposals = Detections(places, np.array([0.2, 0.9], np.float32), labels, spec.class_names)
+    confidence, residuals = np.array([1.0, -0.5], np.float32), np.zeros((2, 7), np.float32)
+    second = reported_detections(proposals, confidence, residuals, spec, "second")
+    both = reported_detections(proposals, confidence, residuals, spec, "both")
+    np.testing.assert_allclose(second.boxes, places[:1], atol=1e-5)
+    np.testing.assert_allclose(both.boxes, places[1:], atol=1e-5)
+    np.testing.assert_allclose(both.scores, np.sqrt(0.9 / (1 + np.exp(0.5))), rtol=1e-6)
 
 
 def test_no_proposals() -> None:

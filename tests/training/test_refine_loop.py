@@ -62,7 +62,7 @@ def test_a_checkpoint_runs_both_stages(tmp_path: Path, stage: Path) -> None:
     points = KittiSplit(data, "val").points("000002", camera_view=True)
     found = ScanDetector(detector, model.spec.with_score_threshold(0.0))(points)
     proposed = propose_on(open_first_stage(str(stage)), points, model.refine.seen)
-    wanted = refine(detector.refiner, points, proposed, model.refine.neighbors, model.spec.post)
+    wanted = refine(detector.refiner, points, proposed, model.refine.neighbors, model.spec.post, model.refine.scores)
     assert len(found) > 0
     np.testing.assert_array_equal(found.boxes, wanted.boxes)
     np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-6)

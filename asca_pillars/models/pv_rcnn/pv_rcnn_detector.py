@@ -96,7 +96,7 @@ class PvRcnnDetector(nn.Module):
     def detect(self, outputs: PvRcnnOutputs, spec: DetectorSpec) -> list[Detections]:
         """Refined boxes of each frame, with the thresholds of `spec`."""
         confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
-        return reported_frames(outputs.proposals, confidence, residuals, spec)
+        return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.scores)
 
     def _proposals(self, maps: HeadMaps[Tensor], batch: LabeledVoxels) -> tuple[Detections, ...]:
         arrays = [part.detach().float().cpu().numpy() for part in maps]

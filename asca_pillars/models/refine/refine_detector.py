@@ -79,7 +79,7 @@ class RefineDetector(nn.Module):
     def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
         """Refined boxes of each frame, with the thresholds of `spec`."""
         confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
-        return reported_frames(outputs.proposals, confidence, residuals, spec)
+        return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.refine.scores)
 
     def _silence(self, inputs: RefineInputs) -> Refinements:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""

@@ -10,7 +10,7 @@ from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.second_stage.refine_sample import collate_scans
 from asca_pillars.points.first_stage import Proposed
 from asca_pillars.points.refine_geometry import RefineSettings, refine_scan
-from asca_pillars.points.refined_detections import refined_detections
+from asca_pillars.points.refined_detections import Scores, refined_detections, refined_scores
 
 
 def refine(
@@ -19,23 +19,27 @@ def refine(
     proposed: Proposed,
     settings: RefineSettings,
     post: PostProcess,
+    scores: Scores,
 ) -> Detections:
     """Refine the proposals of one scan (N, 4); a scan without any has no detections.
 
     Args:
         network: in evaluation mode, on the CPU.
         post: suppression among the refined boxes.
+        scores: of the refined boxes.
     """
-    return refined_detections(proposed.proposals, *judge(network, points, proposed, settings), post)
+    confidence, residuals = judge(network, points, proposed, settings)
+    values = refined_scores(proposed.proposals, confidence, scores)
+    return refined_detections(proposed.proposals, values, residuals, post)
 
 
 def judge(
     network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Scores (R,) in [0, 1] and residuals (R, 7) of the proposals of one scan, see `refine`."""
+    """Confidence logits (R,) and residuals (R, 7) of the proposals of one scan, see `refine`."""
     if not len(proposed.proposals):
         return np.empty(0, np.float32), np.empty((0, 7), np.float32)
     inputs = collate_scans([refine_scan(points, proposed, proposed.proposals, settings)])
     with torch.inference_mode():
         found = network(inputs)
-    return torch.sigmoid(found.confidence).numpy(), found.residuals.numpy()
+    return found.confidence.numpy(), found.residuals.numpy()

@@ -86,6 +86,7 @@ MODEL = PvRcnnModel(
     network=NETWORK,
     training_proposals=AnchorProposals(candidates=400, nms_iou=0.8, count=64),
     rois=24,
+    scores="both",
 )
 
 

@@ -119,7 +119,7 @@ def test_learns_one_frame_by_heart() -> None:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    found = refine(network.eval(), frame.points, proposed, SETTINGS, PostProcess())
+    found = refine(network.eval(), frame.points, proposed, SETTINGS, PostProcess(), "second")
     overlap = iou_3d(found.boxes, frame.boxes)
     best = overlap.argmax(axis=0)
     before = iou_3d(proposed.proposals.boxes, frame.boxes).max(axis=0)
@@ -131,7 +131,7 @@ def test_learns_one_frame_by_heart() -> None:
 def test_a_scan_without_proposals() -> None:
     frame, proposed = proposed_frame(0)
     nothing = Proposed(Detections.empty(NAMES), proposed.keypoints[:0], proposed.bev[:0])
-    assert len(refine(small_refiner().eval(), frame.points, nothing, SETTINGS, PostProcess())) == 0
+    assert len(refine(small_refiner().eval(), frame.points, nothing, SETTINGS, PostProcess(), "second")) == 0
     sample = prepare_sample(frame, nothing, SETTINGS, 16, np.random.default_rng(0))
     assert len(sample.targets.rois) == 0
 
