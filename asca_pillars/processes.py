@@ -7,13 +7,14 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
+from rich.console import Console
 from rich.progress import track
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# How many threads linear algebra and OpenCV use.
-_THREADS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+# How many threads linear algebra, OpenCV and PyTorch use.
+_THREADS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OMP_NUM_THREADS")
 _job: Callable[[Any], Any] | None = None
 
 
@@ -25,6 +26,7 @@ def in_processes(
     *,
     at_once: int = 4,
     progress: bool = True,
+    console: Console | None = None,
 ) -> Iterator[Result]:
     """The results of a job for each item, in the order of the items, each as soon as it is there.
 
@@ -35,6 +37,7 @@ def in_processes(
         title: of the progress bar.
         at_once: items that a process takes at a time.
         progress: whether it is shown.
+        console: where; on standard output if None.
 
     Raises:
         Exception: that of the job.
@@ -48,7 +51,7 @@ def in_processes(
             results: Iterator[Result] = pool.imap(_do_job, todo, at_once)
         else:
             results = map(job, todo)
-        yield from track(results, title, total=len(todo), disable=not progress)
+        yield from track(results, title, total=len(todo), console=console, disable=not progress)
 
 
 def _take_job(job: Callable[[Any], Any]) -> None:

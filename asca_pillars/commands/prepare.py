@@ -37,7 +37,7 @@ def prepare(
         from asca_pillars.models.build import build_preparation
 
         for name in (settings.data.train_set, settings.data.val_set):
-            build_preparation(settings.model, open_split(data, name), settings.data)
+            build_preparation(settings.model, open_split(data, name), replace(settings.data, workers=workers))
         return
     # A config that is not decided yet gets what either method needs.
     insert = settings.augment.insert

@@ -161,6 +161,6 @@ def weight_average(decay: float) -> WeightAveraging:
         kept = min(decay, float((1 + steps) / (10 + steps)))
         if not averaged.is_floating_point():  # batches that a normalization has counted
             return current
-        return averaged * kept + current * (1 - kept)
+        return averaged + (current - averaged) * (1 - kept)  # what does not move stays bit for bit
 
     return WeightAveraging(avg_fn=average)

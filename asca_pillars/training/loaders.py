@@ -21,6 +21,8 @@ class DetectionData(L.LightningDataModule):
         self.batch_size, self.seed, self.workers = config.train.batch_size, config.train.seed, config.data.workers
         self.training_set = open_dataset(root, config, training=True)
         self.validation_set = open_dataset(root, config, training=False)
+        for frames in (self.training_set.frames, self.validation_set.frames):
+            frames.split.require_files()
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Shuffled batches, from the step on at which the trainer stands."""

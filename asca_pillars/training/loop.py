@@ -64,7 +64,8 @@ def train(
             that has no checkpoint yet gives way.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
-        init: weights that a new run starts from, see `initial_weights`.
+        init: weights that a new run starts from, see `initial_weights`; a run that goes on must have started from
+            them.
 
     Returns:
         The last checkpoint.
@@ -98,7 +99,8 @@ def _train(
     config = replace(config, train=_with_settled_precision(config.train, out, resumes=resumed is not None))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     # What may be mistyped is looked at before minutes of work, and before the folder is that of this run.
-    weights = {} if resumed is not None else initial_weights(config, init)
+    goes_on = resumed is not None
+    weights = None if goes_on and init is None else initial_weights(config, init)
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
@@ -106,7 +108,7 @@ def _train(
         config.train, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes
     )
     data = DetectionData(config, data_root)
-    claim(out, config, Seen.of(data.training_set.frames.frame_ids, trainer.world_size))
+    claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights))
     say = rank_zero_only(Console(markup=False, highlight=False).print)
     if damage is not None and resumed is not None:
         say(f"{damage}: going on from {resumed}")
@@ -114,9 +116,10 @@ def _train(
         remedy = "choose auto or fp32" if resumed is None else f"go on where {out} was started, or anew with --init"
         say(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
-    keep = resumed is not None or not trainer.is_global_zero  # else it may be of scans that were there before
+    keep = goes_on or not trainer.is_global_zero  # else it may be of scans that were there before
     module = DetectionModule(config, measure_input(out, data.training_set.frames, keep=keep))
-    module.detector.load_state_dict(module.detector.state_dict() | weights)
+    if weights and not goes_on:
+        module.detector.load_state_dict(module.detector.state_dict() | weights)
     with warnings.catch_warnings(), interrupt.listening():
         # Of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")

@@ -1,20 +1,23 @@
 """The folder of a run: what it is, so that only the same run goes on in it."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 from rich.progress import track
+from torch import Tensor
 
 from asca_pillars.config import Config, Precision, load_config
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.data.frames import read_frame
+from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path, write_json
+from asca_pillars.models.checkpoint import weights_sha256
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import read_settings
 from asca_pillars.system import describe_environment
@@ -27,17 +30,30 @@ NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
 
 
 class Seen(NamedTuple):
-    """What follows from neither the configuration nor the seed: which frames are drawn from, and by how many."""
+    """What follows from neither the configuration nor the seed: frames, processes and the weights at the start."""
 
     frames: int
     frames_sha256: str
-    """Of their ids."""
+    """Of their ids and of how large their scans are: two datasets number their frames alike."""
     processes: int
+    initial_sha256: str | None = None
+    """Of the weights that the run started from; empty of random ones, None where that is not known."""
 
     @classmethod
-    def of(cls, frame_ids: Sequence[str], processes: int) -> "Seen":
-        """Of training on these frames."""
-        return cls(len(frame_ids), hashlib.sha256("\n".join(frame_ids).encode()).hexdigest(), processes)
+    def of(cls, split: LabeledSplit, processes: int, initial: Mapping[str, Tensor] | None = None) -> "Seen":
+        """Of training on these frames.
+
+        Args:
+            split: the frames.
+            processes: how many.
+            initial: weights, empty where all are random; None where a run goes on whose start is not stated again.
+
+        Raises:
+            OSError: a scan is not there.
+        """
+        sizes = [f"{frame_id} {split.scan_path(frame_id).stat().st_size}" for frame_id in split.frame_ids]
+        start = None if initial is None else weights_sha256(initial) if initial else ""
+        return cls(len(sizes), hashlib.sha256("\n".join(sizes).encode()).hexdigest(), processes, start)
 
 
 def claim(out: Path, config: Config, seen: Seen) -> None:
@@ -47,13 +63,17 @@ def claim(out: Path, config: Config, seen: Seen) -> None:
     checkpoint has learnt nothing, so that another takes its place.
 
     Raises:
-        TrainingError: the run there is another one, or drew from other frames, or in more or fewer processes.
+        TrainingError: the run there is another one, or drew from other frames, or in more or fewer processes, or
+            started from other weights.
     """
     path, frames_path = out / "config.yaml", out / FRAMES_FILE
+    found = read_settings(Seen, frames_path, (), {}) if frames_path.exists() else None
     refusal = _why_another(path, config) if path.exists() else None
-    refusal = refusal or (_why_other_frames(frames_path, seen) if frames_path.exists() else None)
+    refusal = refusal or (found and _why_other_frames(frames_path, found, seen))
     if refusal and any((out / "checkpoints").glob("*.ckpt")):
         raise TrainingError(refusal)
+    if seen.initial_sha256 is None and found is not None:
+        seen = seen._replace(initial_sha256=found.initial_sha256)
     if refusal or not path.exists():
         with atomic_path(out / "environment.json") as temporary:
             temporary.write_text(describe_environment(), encoding="utf-8")
@@ -112,9 +132,8 @@ def _why_another(path: Path, config: Config) -> str | None:
     return f"{path}: the run there was started with {difference}; choose another --out, or delete it"
 
 
-def _why_other_frames(path: Path, seen: Seen) -> str | None:
-    """In what words `seen` is not what `path` says of the run there; None if it is."""
-    found = read_settings(Seen, path, (), {})
+def _why_other_frames(path: Path, found: Seen, seen: Seen) -> str | None:
+    """In what words `seen` is not what was found in `path` of the run there; None if it is."""
     if found.processes != seen.processes:
         return (
             f"{path}: the run there was started with {found.processes} process(es), now {seen.processes}: its steps "
@@ -124,6 +143,11 @@ def _why_other_frames(path: Path, seen: Seen) -> str | None:
         return (
             f"{path}: the run there was started on {found.frames} frames, now there are {seen.frames}, or others; give "
             "it the same --data and data.train_set, or start a new run in another --out with --init"
+        )
+    if None not in (found.initial_sha256, seen.initial_sha256) and found.initial_sha256 != seen.initial_sha256:
+        return (
+            f"{path}: the run there was started from {'other' if found.initial_sha256 else 'random'} weights; leave "
+            "--init out to go on with it, or start a new run in another --out"
         )
     return None
 

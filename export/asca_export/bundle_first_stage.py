@@ -1,8 +1,9 @@
 """A bundle as the first stage of two."""
 
 import tempfile
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import onnx
@@ -35,6 +36,7 @@ class BundleFirstStage:
     def __init__(
         self, bundle: str | Path, *, threads: int = 1, precision: Literal["float32", "int8"] = "float32"
     ) -> None:
+        self._source = bundle, threads, precision
         folder = find_bundle(bundle)
         manifest = load_bundle(folder)
         require_pillar_kind(folder, manifest.kind)
@@ -54,6 +56,11 @@ class BundleFirstStage:
     def spec(self) -> DetectorSpec:
         """Of the bundle."""
         return self._pipeline.spec
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Sent to another process, it is opened there: onnxruntime's sessions cannot be sent."""
+        bundle, threads, precision = self._source
+        return partial(BundleFirstStage, threads=threads, precision=precision), (bundle,)
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
         """See `FirstStage`."""

@@ -98,7 +98,7 @@ def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
     assert (folder / ".ipynb_checkpoints" / "notes.ipynb").exists()
 
 
-SEEN = Seen.of(["a", "b"], 1)
+SEEN = Seen(2, "ab", 1)
 
 
 def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
@@ -113,13 +113,13 @@ def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Pa
 
 def test_a_run_goes_on_with_its_own_frames_and_processes_alone(tmp_path: Path) -> None:
     claim(tmp_path, CONFIG, SEEN)
-    claim(tmp_path, CONFIG, Seen.of(["a", "c"], 1))  # nothing is learnt yet
+    claim(tmp_path, CONFIG, Seen(2, "ac", 1))  # nothing is learnt yet
     learn(tmp_path)
-    claim(tmp_path, CONFIG, Seen.of(["a", "c"], 1))
+    claim(tmp_path, CONFIG, Seen(2, "ac", 1))
     with pytest.raises(TrainingError, match=r"frames\.json: .* on 2 frames, now there are 3, or others; give"):
-        claim(tmp_path, CONFIG, Seen.of(["a", "b", "c"], 1))
+        claim(tmp_path, CONFIG, Seen(3, "abc", 1))
     with pytest.raises(TrainingError, match=r"started with 1 process\(es\), now 2: .* give as many --devices"):
-        claim(tmp_path, CONFIG, Seen.of(["a", "c"], 2))
+        claim(tmp_path, CONFIG, Seen(2, "ac", 2))
     (tmp_path / "frames.json").write_text("{")
     with pytest.raises(ConfigError, match=r"frames\.json: not valid YAML"):
         claim(tmp_path, CONFIG, SEEN)

@@ -1,6 +1,7 @@
 """A checkpoint as the first stage of two."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ class CheckpointFirstStage:
     """
 
     def __init__(self, path: str | Path) -> None:
+        self._path = path
         checkpoint = load_checkpoint(path)
         model, detector = checkpoint.config.model, checkpoint.detector
         require_pillar_kind(path, model.kind)
@@ -33,6 +35,10 @@ class CheckpointFirstStage:
         self._network = detector
         self.spec = model.spec
         self.identity = weights_sha256(detector.state_dict())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Sent to another process, it is read there."""
+        return CheckpointFirstStage, (self._path,)
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
         """See `FirstStage`."""

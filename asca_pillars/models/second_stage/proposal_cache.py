@@ -3,19 +3,20 @@
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import track
 
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.points.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
+from asca_pillars.processes import in_processes
 from asca_pillars.schema import to_dict
 
 _FORMAT = 2  # of the files; another number lets old ones lie
@@ -57,6 +58,7 @@ class ProposalCache:
 
     Args:
         prepared: folder of what is computed once per dataset, see `data.insertion.prepared`.
+        stage: the first stage; can be sent to a process, where several fill the cache.
         camera_view: whether the first stage sees only the points in the image.
     """
 
@@ -69,8 +71,13 @@ class ProposalCache:
         key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
         self.files = ProposalFiles(prepared / f"proposals-{key}", stage.spec.class_names)
 
-    def fill(self, split: LabeledSplit, *, console: Console | None = None) -> None:
+    def fill(self, split: LabeledSplit, *, workers: int = 1, console: Console | None = None) -> None:
         """Compute what is missing or outdated. Each file appears when it is complete, so a killed run just goes on.
+
+        Args:
+            split: frames.
+            workers: processes; each opens the first stage for itself.
+            console: of the progress bar; None for none.
 
         Raises:
             DatasetError, ScanError: a frame cannot be read, or a file not written.
@@ -78,12 +85,9 @@ class ProposalCache:
         todo = [frame_id for frame_id in split.frame_ids if not self._is_current(split, frame_id)]
         if todo:
             require_writable(self.files.folder)
-        for frame_id in track(todo, "Proposing", console=console, disable=console is None):
-            stamp = _stamp(split, frame_id)  # before the scan is read: one that changes meanwhile is read again
-            points = split.points(frame_id, camera_view=self.camera_view)
-            found = propose_on(self.stage, points[np.isfinite(points).all(axis=1)], self.settings)
-            with writing(self.files.path(frame_id)) as temporary, temporary.open("wb") as file:
-                np.savez(file, allow_pickle=False, stamp=stamp, **_arrays(found))
+        propose = partial(_propose, self.files, split, self.stage, self.settings, self.camera_view)
+        for _ in in_processes(propose, todo, workers, "Proposing", progress=console is not None, console=console):
+            pass
 
     def _is_current(self, split: LabeledSplit, frame_id: str) -> bool:
         """Whether the frame's file was made from its scan as it is; of the file only the stamp is read."""
@@ -92,6 +96,21 @@ class ProposalCache:
                 return np.array_equal(arrays["stamp"], _stamp(split, frame_id))
         except (OSError, ValueError, KeyError, EOFError, BadZipFile):  # none there, or a damaged one: it is made again
             return False
+
+
+def _propose(
+    files: ProposalFiles,
+    split: LabeledSplit,
+    stage: FirstStage,
+    settings: FirstStageSettings,
+    camera_view: bool,
+    frame_id: str,
+) -> None:
+    stamp = _stamp(split, frame_id)  # before the scan is read: one that changes meanwhile is read again
+    points = split.points(frame_id, camera_view=camera_view)
+    found = propose_on(stage, points[np.isfinite(points).all(axis=1)], settings)
+    with writing(files.path(frame_id)) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, stamp=stamp, **_arrays(found))
 
 
 def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:

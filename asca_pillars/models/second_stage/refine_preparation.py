@@ -129,7 +129,7 @@ def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig
     folder = prepared_folder(split.root, data) / split.pool
     view = data.camera_view and split.has_camera
     cache = ProposalCache(folder, stage, model.refine.seen, camera_view=view)
-    cache.fill(split, console=Console(stderr=True))
+    cache.fill(split, workers=max(data.workers, 1), console=Console(stderr=True))
     return RefinePreparation(model.refine, CachedProposals(cache.files))
 
 

@@ -35,6 +35,15 @@ def test_reads_what_was_computed(split: KittiSplit, tmp_path: Path) -> None:
         np.testing.assert_allclose(found.bev, wanted.bev, rtol=1e-3, atol=1e-6)
 
 
+def test_several_processes_write_the_same(tmp_path: Path) -> None:
+    split = KittiSplit(write_dataset(tmp_path / "data", 6))
+    one, two = (ProposalCache(tmp_path / name, RandomStage(), SETTINGS) for name in ("one", "two"))
+    one.fill(split)
+    two.fill(split, workers=2)
+    for frame_id in split.frame_ids:
+        assert one.files.path(frame_id).read_bytes() == two.files.path(frame_id).read_bytes()
+
+
 def test_only_what_is_missing_is_computed(split: KittiSplit, tmp_path: Path) -> None:
     stage = RandomStage()
     cache = ProposalCache(tmp_path, stage, SETTINGS)
