@@ -247,8 +247,8 @@ def train_runs(
     _at_once([run for run in todo if not run.trained.exists()], train, jobs, "Training")
 
 
-def evaluate_runs(todo: Sequence[Run], data: str | Path, jobs: int) -> None:
-    """Evaluate what is not evaluated yet, on the validation list of the data.
+def evaluate_runs(todo: Sequence[Run], data: str | Path, split: str, jobs: int) -> None:
+    """Evaluate what is not evaluated yet, on one list of the data.
 
     Raises:
         TrainingError: an evaluation failed; the message names its log.
@@ -256,7 +256,7 @@ def evaluate_runs(todo: Sequence[Run], data: str | Path, jobs: int) -> None:
     threads = max(1, default_threads() // jobs)
 
     def evaluate(run: Run) -> None:
-        where = ("--data", str(data), "--split", "val", "--out", str(run.evaluated.parent))
+        where = ("--data", str(data), "--split", split, "--out", str(run.evaluated.parent))
         _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
 
     _at_once([run for run in todo if not run.evaluated.exists()], evaluate, jobs, "Evaluating")

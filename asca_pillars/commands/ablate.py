@@ -58,6 +58,7 @@ def ablate(
     )
     from asca_pillars.commands.prepare import prepare
     from asca_pillars.config import load_config
+    from asca_pillars.data.kitti import KittiSplit
     from asca_pillars.files import atomic_path
     from asca_pillars.schema import to_dict
     from asca_pillars.system import default_threads
@@ -73,10 +74,10 @@ def ablate(
         # Once, not by every run that finds nothing there.
         prepare(Path(config), data=data, override=overrides, workers=default_threads())
     train_runs(todo, config, data, jobs, overrides, init)
-    evaluate_runs(todo, data, jobs)
+    evaluate_runs(todo, data, base.data.val_set, jobs)
     console = Console(markup=False)
-    speeds = time_variants(todo, family, data, console)
-    text = f"{setup(todo, config, data, jobs)}\n{tables(family, read_results(todo), speeds)}"
+    speeds = time_variants(todo, family, KittiSplit(data, base.data.val_set), console)
+    text = f"{setup(todo, config, data, base.data, jobs)}\n{tables(family, read_results(todo), speeds)}"
     path = out / "results.md"
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

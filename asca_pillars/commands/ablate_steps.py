@@ -13,7 +13,7 @@ from rich.progress import track
 from asca_pillars.ablation.ablation_table import Speed
 from asca_pillars.ablation.two_stage_variants import TWO_STAGE
 from asca_pillars.ablation.variants import PILLARS, Family, Row, Run
-from asca_pillars.config import Config, load_config
+from asca_pillars.config import Config, DataConfig, load_config
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError, TrainingError
@@ -52,17 +52,17 @@ def claim(out: Path, base: dict[str, Any]) -> None:
         )
 
 
-def setup(todo: Sequence[Run], config: str, data: Path, jobs: int) -> str:
+def setup(todo: Sequence[Run], config: str, data: Path, lists: DataConfig, jobs: int) -> str:
     """What the numbers depend on: command, data, machine, time, versions."""
     trained = [json.loads(one.trained.read_text(encoding="utf-8")) for one in todo]
     hours = sum(record["seconds"] for record in trained) / 3600
-    frames = {name: len(KittiSplit(data, name).frame_ids) for name in ("train", "val")}
+    trained_on, checked_on = (len(KittiSplit(data, name).frame_ids) for name in (lists.train_set, lists.val_set))
     note = data / "simulation.json"
     origin = f"simulated, seed {json.loads(note.read_text(encoding='utf-8'))['seed']}" if note.exists() else str(data)
     versions = package_versions()
     lines = (
         f"Command: `{command_line()}`",
-        f"Data: {origin}; {frames['train']} frames for training, {frames['val']} for validation",
+        f"Data: {origin}; {trained_on} frames for training, {checked_on} for validation",
         f"Base: {config}; {len(todo)} runs, {hours:.1f} hours of training in sum, {jobs} at a time, "
         f"{trained[0]['threads']} thread(s) each",
         f"Machine: {cpu_model()}; torch {versions['torch']}, onnxruntime {versions['onnxruntime']}",
@@ -117,7 +117,8 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
     Raises:
         ConfigError: a row does not go with the base.
         TrainingError, BundleError: the weights `init` do not go with a row.
-        DatasetError: the data have no camera, or fewer validation frames than parity is proven on.
+        DatasetError: a list or a file is missing, the data have no camera, or fewer validation frames than parity is
+            proven on.
     """
     from asca_export.exporter import MIN_SCANS
     from asca_pillars.training.initial_weights import initial_weights
@@ -130,16 +131,21 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
             initial_weights(load_config(config, (*overrides, *variant.overrides)), init)
         except TrainingError as error:
             raise TrainingError(f"--variants {variant.name}: {error}") from None
-    split = open_split(data, "val")
-    if not isinstance(split, KittiSplit):
-        raise DatasetError(f"{data}: the ablation's table is KITTI's AP, which needs a camera; give data in its layout")
+    for name in (base.data.train_set, base.data.val_set):
+        split = open_split(data, name)
+        if not isinstance(split, KittiSplit):
+            raise DatasetError(
+                f"{data}: the ablation's table is KITTI's AP, which needs a camera; give data in its layout"
+            )
+        split.require_files()
     if len(split.frame_ids) < MIN_SCANS:
         raise DatasetError(
-            f"{data}: {len(split.frame_ids)} frames in ImageSets/val.txt; at least {MIN_SCANS} are needed to export on"
+            f"{data}: {len(split.frame_ids)} frames in the list `{split.name}`; at least {MIN_SCANS} are needed to "
+            "export on"
         )
 
 
-def time_variants(todo: Sequence[Run], family: Family, data: Path, console: Console) -> dict[str, Speed]:
+def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, console: Console) -> dict[str, Speed]:
     """Export one checkpoint of every variant and time them in alternation on the same scans."""
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
@@ -148,7 +154,6 @@ def time_variants(todo: Sequence[Run], family: Family, data: Path, console: Cons
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.checkpoint import load_checkpoint
 
-    split = KittiSplit(data, "val")
     scans = [read_frame(split, frame_id, ()).points for frame_id in split.frame_ids[:MIN_SCANS]]
     first = {one.variant.name: one for one in reversed(todo)}  # of several seeds the first one wins
     detectors: dict[str, Detector] = {}

@@ -88,7 +88,9 @@ LONG_CARS = (
         ({"variants": "baseline,baseline"}, "baseline is there twice"),
         ({"override": ["model.spec.grid.x_range_m=[0, 61.0]"]}, "x_range_m"),
         ({"override": [LONG_CARS]}, "--variants cpa_channel_lower_ious: states KITTI's classes"),
-        ({}, "3 frames in ImageSets/val.txt; at least 8 are needed"),
+        ({}, "3 frames in the list `val`; at least 8 are needed"),
+        ({"override": ["data.train_set=none"]}, "ImageSets/none.txt: no such split"),
+        ({"override": ["data.val_set=none"]}, "ImageSets/none.txt: no such split"),
     ],
 )
 def test_what_would_end_an_ablation_ends_it_before_anything_is_trained(
@@ -123,7 +125,7 @@ def test_as_many_at_a_time_as_asked_for_share_the_cores(tmp_path: Path, monkeypa
     monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
     todo = runs(tmp_path, [0, 1], [VARIANTS["baseline"], VARIANTS["asp_k2"]])
     train_runs(todo, "tiny.yaml", tmp_path, jobs=2)
-    evaluate_runs(todo, tmp_path, jobs=2)
+    evaluate_runs(todo, tmp_path, "val", jobs=2)
     assert threads == [3] * 8 and all(one.trained.exists() for one in todo)
 
 
