@@ -132,6 +132,36 @@ def test_a_damaged_chunk_ends_an_indexed_file_early(tmp_path: Path) -> None:
     assert len(read) < 8 and recording.damage is not None
 
 
+def test_chunks_that_an_index_counts_and_that_are_gone_are_damage(tmp_path: Path) -> None:
+    """Zeros over the header of one chunk: it is empty to the library."""
+    from mcap.reader import make_reader
+
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8), "/rear": clouds(1)})
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    data, start = bytearray(path.read_bytes()), summary.chunk_indexes[1].chunk_start_offset
+    data[start : start + 200] = bytes(200)
+    path.write_bytes(data)
+    recording = open_recording(path)
+    read = list(recording.messages("/lidar"))
+    assert 0 < len(read) < 8
+    assert recording.damage == f"{path}: {len(read)} of the 8 messages of /lidar can be read"
+    assert len(list(recording.messages("/rear"))) == 1 and recording.damage is None
+
+
+def test_messages_that_a_rosbag2_counts_and_that_are_gone_are_damage(tmp_path: Path) -> None:
+    import apsw
+
+    write_recording(tmp_path / "bag", iter([(time_ns, cloud_points(0)) for time_ns in stamps(3)]))
+    (database,) = (tmp_path / "bag").glob("*.db3")
+    with apsw.Connection(str(database)) as connection:
+        connection.execute(f"DELETE FROM messages WHERE timestamp = {stamps(3)[1]}")
+    recording = open_recording(tmp_path / "bag")
+    assert len(list(recording.messages(TOPIC))) == 2
+    assert recording.damage is not None and f"2 of the 3 messages of {TOPIC} can be read" in recording.damage
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
