@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
 
 from asca_pillars.data.recordings.open_recording import is_recording, open_recording
-from asca_pillars.data.recordings.recorded_scans import RecordedScans
+from asca_pillars.data.recordings.recorded_scans import SEARCHED_MESSAGES, RecordedScans
 from asca_pillars.errors import ScanError
 from benchmarks.made_recordings import TOPIC, write_recording
 from tests.data.recordings.cloud_recordings import CLOUD, cloud_points, clouds, laid_out, stamps, store, write_mcap
@@ -205,3 +205,26 @@ def test_the_reflectance_scale_is_decided_once_for_the_recording(tmp_path: Path)
     assert scans.scale.scale == 255.0
     first = next(scans.read()).scan
     assert first is not None and first.points[0, 3] == pytest.approx(1.5 / 255)
+
+
+@pytest.mark.parametrize("nothing", [0, np.nan])
+def test_scans_without_points_have_no_say_in_the_reflectance_scale(tmp_path: Path, nothing: float) -> None:
+    """Twenty scans of no points, or of points that are not finite, while the sensor starts."""
+    bright, times = cloud_points(0), stamps(22)
+    bright[:, 3] = np.linspace(0, 255, len(bright))
+    none = bright[:0] if nothing == 0 else bright * np.float32(nothing)
+    messages = [(time, laid_out(none if time < times[20] else bright, time_ns=time)) for time in times]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
+    scans = RecordedScans(recording, recording.point_cloud_topic(), "auto")
+    assert scans.scale.scale == 255.0
+    assert [len(scan.points) for scan in scans.first(8)] == [len(bright)] * 2, "nor in the sensor's height"
+
+
+def test_scans_with_points_are_not_looked_for_without_end(tmp_path: Path) -> None:
+    late = [
+        (time, laid_out(cloud_points(0)[: number // SEARCHED_MESSAGES]))
+        for number, time in enumerate(stamps(SEARCHED_MESSAGES + 1))
+    ]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": late}, chunk_size=100_000))
+    scans = RecordedScans(recording, recording.point_cloud_topic(), "auto")
+    assert scans.scale.scale == "auto" and not list(scans.first(8))
