@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -25,7 +25,15 @@ from asca_pillars.commands.foxglove_file import FoxgloveFile, require_own_file
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
-from asca_pillars.commands.recording_results import Found, JsonLines, KittiTracks, ResultFile, open_text, tracked
+from asca_pillars.commands.recording_results import (
+    Found,
+    JsonLines,
+    KittiTracks,
+    ResultFile,
+    open_text,
+    said_of_stamps,
+    tracked,
+)
 from asca_pillars.commands.rerun_file import RerunFile
 from asca_pillars.commands.scan_input import said_of_scale
 from asca_pillars.data.kitti import read_calibration
@@ -102,10 +110,11 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
         seconds = process_time() - start
         tracker = Tracker(birth_score=births) if task.track else None
         damages.add(recording.damage)
-        if all(one.detections is None for one in journal.results()):
+        times_ns = [one.time_ns for one in journal.results() if one.detections is not None]
+        if not times_ns:
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{run.first()}")
-        if poses is not None:
-            _check_times(poses, journal, f"{task.path}, {task.odometry}", console)
+        if task.track:
+            _check_times(times_ns, task, topic.name, poses, console)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
         _write(task, results, scans, calibration, about)
         journal.remove()
@@ -178,14 +187,18 @@ def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
     return {one.name: one.score_threshold if score is None else score for one in spec.classes}
 
 
-def _check_times(poses: Poses, journal: Journal, place: str, console: Console) -> None:
-    """Say that the odometry does not last as long as the scans; ScanError if it is of another time."""
-    times = [one.time_ns for one in journal.results() if one.detections is not None]
+def _check_times(times: Sequence[int], task: RecordingTask, topic: str, poses: Poses | None, console: Console) -> None:
+    """Say that stamps are out of order or the odometry is too short; ScanError if it is of another time."""
+    if stamps := said_of_stamps(times):
+        console.print(f"{task.path}, {topic}: {stamps}", style="yellow", soft_wrap=True)
+    if poses is None:
+        return
     outside = [time for time in times if not poses.covers(time)]
     if not outside:
         return
     began, ended = ((int(poses.times_ns[end]) - min(times)) / 1e9 for end in (0, -1))
-    said = f"{place}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {len(outside)} of {len(times)} scans"
+    share = f"{len(outside)} of {len(times)} scans"
+    said = f"{task.path}, {task.odometry}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {share}"
     if len(outside) == len(times):
         raise ScanError(f"{said} are at other times, as of another clock; leave --odometry out")
     console.print(f"{said} lie outside, with wrong velocities over ground", style="yellow", soft_wrap=True)

@@ -72,7 +72,10 @@ def notes(results: Iterable[Result]) -> Iterator[str]:
         if notes.dropped_points:  # when the file was read; what the detector dropped is among its warnings
             found.append(f"{notes.dropped_points} points are not finite and were dropped")
         if notes.clipped_reflectances:
-            found.append(f"{notes.clipped_reflectances} reflectances lie outside 0..1 and were set to the nearer end")
+            found.append(
+                f"{notes.clipped_reflectances} reflectances lie outside 0..{notes.reflectance_scale:g} and were set "
+                "to the nearer end; if they are stored on another scale, state it (--reflectance-scale)"
+            )
         for text in found:
             names[_NUMBER.sub("#", text)].append(f"{path.name}: {text}")  # of one kind: alike but for the numbers
     for lines in names.values():

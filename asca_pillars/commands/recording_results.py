@@ -1,7 +1,7 @@
 """The files that `asca detect` makes of a recording: JSON lines, KITTI's tracking text, Foxglove, rerun."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import Detections
-from asca_deploy.tracker import Tracker
+from asca_deploy.tracker import MAX_SCAN_GAP_S, Tracker
 from asca_deploy.tracks import Tracks
 from asca_pillars.commands.recording_journal import Journal
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
@@ -37,23 +37,56 @@ class ResultFile(Protocol):
 def tracked(
     journal: Journal, tracker: Tracker | None, pose_at: Callable[[int], NDArray[np.float64]] | None = None
 ) -> Iterator[Found]:
-    """The results of a journal, with identities if there is a tracker; scans that could not be read are left out.
+    """The results of a journal, in its order, with identities if there is a tracker; not those that were skipped.
 
     Args:
         journal: of all scans.
         tracker: a new one.
         pose_at: from a time, nanoseconds, to the (4, 4) pose of the scan, metres; None: unknown.
     """
-    for result in journal.results():
-        if result.detections is None:
-            continue
-        place = result.number, result.time_ns, result.frame_id
-        if tracker is None:
-            yield Found(*place, result.detections, None, result.dropped_points)
-        else:
-            pose = None if pose_at is None else pose_at(result.time_ns)
-            tracks = tracker(result.detections, result.time_ns * 1e-9, pose)
-            yield Found(*place, tracks.detections, tracks, result.dropped_points)
+    found = (
+        Found(one.number, one.time_ns, one.frame_id, one.detections, None, one.dropped_points)
+        for one in journal.results()
+        if one.detections is not None
+    )
+    if tracker is None:
+        yield from found
+        return
+    results = list(found)
+    for index in tracking_order([one.time_ns for one in results]):
+        one = results[index]
+        pose = None if pose_at is None else pose_at(one.time_ns)
+        tracks = tracker(one.detections, one.time_ns * 1e-9, pose)
+        results[index] = one._replace(detections=tracks.detections, tracks=tracks)
+    yield from results
+
+
+def tracking_order(times_ns: Sequence[int]) -> list[int]:
+    """The order in which recorded scans are tracked: by time, drive by drive.
+
+    A scan that came late, or one wrong stamp, then ends no tracks but its own. Another drive begins where two scans lie
+    more than MAX_SCAN_GAP_S before the two recorded before them, as when a clock was set or a drive is played again:
+    sorted as one, such drives would mix.
+    """
+    times = np.array(times_ns, np.int64)
+    begins = np.zeros(len(times), bool)
+    if len(times) > 3:
+        pairs = np.stack([times[:-1], times[1:]])
+        latest, earliest = pairs.max(axis=0), pairs.min(axis=0)
+        begins[2:-1] = latest[2:] < earliest[:-2] - round(MAX_SCAN_GAP_S * 1e9)
+    return [int(index) for index in np.lexsort((times, np.cumsum(begins)))]
+
+
+def said_of_stamps(times_ns: Sequence[int]) -> str | None:
+    """A sentence if stamps of recorded scans go back, or on by more than the pause that ends tracks."""
+    steps = np.diff(np.array(times_ns, np.int64))
+    back, ahead = int((steps < 0).sum()), int((steps > MAX_SCAN_GAP_S * 1e9).sum())
+    if not back and not ahead:
+        return None
+    return (
+        f"of {len(times_ns)} time stamps {back} go back and {ahead} jump ahead by more than {MAX_SCAN_GAP_S:g} s: "
+        "scans are tracked in the order of their times, and tracks end at such jumps"
+    )
 
 
 class JsonLines:

@@ -86,9 +86,11 @@ class ScanSettings(Strict):
 
 
 def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
-    """Points (N, >=3), metres, of up to SAMPLE_SCANS scans, evenly spaced; unreadable ones are left out."""
+    """Points (N, >=3), metres, of up to SAMPLE_SCANS scans, evenly spaced, but those unreadable or empty."""
     for path in paths[:: max(-(-len(paths) // SAMPLE_SCANS), 1)]:
         try:
-            yield read(path)
+            points = read(path)
         except ScanError:
             continue  # named when its turn comes
+        if len(points):
+            yield points

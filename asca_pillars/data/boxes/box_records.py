@@ -89,6 +89,15 @@ def read_frame_file(path: Path) -> BoxRecords:
     return _json_records(content, str(path))
 
 
+def read_time(path: Path) -> float | None:
+    """The time stamp, seconds, that a *.json file of one frame states as `time_s`; None: none, as in a .csv.
+
+    Raises:
+        DatasetError: the file cannot be read.
+    """
+    return None if path.suffix.lower() == ".csv" else _time_s(_parsed(_text(path), str(path)))
+
+
 def records_from(
     boxes: NDArray[np.floating],
     types: Sequence[str],
@@ -128,9 +137,13 @@ def _json_lines(path: Path) -> Iterator[NamedRecords]:
         scan = content.get("scan") if isinstance(content, dict) else None
         if not isinstance(scan, str) or not scan:
             raise DatasetError(f'{place}: no "scan"; a line is {{"scan": "NAME.bin", "boxes": [...]}}')
-        time_s = content.get("time_s")
-        timed = isinstance(time_s, int | float) and not isinstance(time_s, bool) and math.isfinite(time_s)
-        yield NamedRecords(scan, _json_records(content, place), place, float(time_s) if timed else None)
+        yield NamedRecords(scan, _json_records(content, place), place, _time_s(content))
+
+
+def _time_s(content: Any) -> float | None:
+    time_s = content.get("time_s") if isinstance(content, dict) else None
+    is_number = isinstance(time_s, int | float) and not isinstance(time_s, bool)
+    return float(time_s) if is_number and math.isfinite(time_s) else None
 
 
 def _json_records(content: Any, place: str) -> BoxRecords:

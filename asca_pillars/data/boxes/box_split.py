@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, records_from
+from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, read_time, records_from
 from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.data.mounting import Mounting
@@ -64,16 +64,22 @@ class BoxDataset(ScanSettings):
 
 
 class BoxFrame(NamedTuple):
-    """A scan and its labels; `file_records` are those of a file for all frames, None where the frame has its own."""
+    """A scan and its labels; `file_` are those of a file for all frames, None where the frame has its own."""
 
     scan: Path
     label_file: Path
     file_records: BoxRecords | None
+    file_time_s: float | None = None
 
     @property
     def records(self) -> BoxRecords:
         """The boxes; DatasetError if the frame's own file is damaged."""
         return read_frame_file(self.label_file) if self.file_records is None else self.file_records
+
+    @property
+    def time_s(self) -> float | None:
+        """The time stamp that the labels state, if any; DatasetError as `records`."""
+        return read_time(self.label_file) if self.file_records is None else self.file_time_s
 
 
 @dataclass(frozen=True)
@@ -138,6 +144,11 @@ class BoxSplit:
                 f"({len(missing)} of {len(wanted)} are missing); a frame without objects needs an entry without boxes"
             )
         return tuple(sorted(wanted))
+
+    @cached_property
+    def times_s(self) -> dict[str, float]:
+        """Time stamps, seconds, of the frames whose labels state one (`time_s`)."""
+        return {one: time_s for one in self.frame_ids if (time_s := self._frames[one].time_s) is not None}
 
     def scan_path(self, frame_id: str) -> Path:
         """The frame's scan."""
@@ -244,12 +255,12 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             same = frames.setdefault(frame_id_of(path, scans), BoxFrame(path, labels, nothing)).scan
             if same != path:
                 raise DatasetError(f"{same} and {path}: both would be frame {frame_id_of(path, scans)}; rename one")
-    for scan, records, place, _ in read_frames(labels):
+    for scan, records, place, time_s in read_frames(labels):
         path = _find_scan(scan, scans, place)
         frame_id = frame_id_of(path, scans)
         if frame_id in places:
             raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
-        frames[frame_id], places[frame_id] = BoxFrame(path, labels, records), place
+        frames[frame_id], places[frame_id] = BoxFrame(path, labels, records, time_s), place
     if not frames:
         raise DatasetError(f"{labels}: no frame in it; write a line for each scan, as docs/DATA.md says")
     return frames

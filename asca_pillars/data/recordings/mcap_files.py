@@ -1,5 +1,6 @@
 """MCAP files, by the format's own library; one whose end is missing is read as far as it goes."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -20,7 +21,7 @@ class McapRecording(Recording):
 
     def __init__(self, path: Path, files: Sequence[Path]) -> None:
         self.path, self._files = path, files
-        self._indexed: dict[Path, bool] = {}
+        self._counts: dict[Path, Counter[str]] = {}  # of files with an index, by topic
         topics: dict[str, Topic] = {}
         for file in files:
             for topic in self._topics(file):
@@ -29,7 +30,7 @@ class McapRecording(Recording):
         self.topics = [topics[name] for name in sorted(topics)]
 
     def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic; a file that ends early says so in `damage`, and the next one goes on."""
+        """The messages of a topic; the first file that lacks some is named in `damage`, and the next one goes on."""
         self.damage = None
         for file in self._files:
             count = 0
@@ -44,10 +45,17 @@ class McapRecording(Recording):
                             )
                         count += 1
                         yield Message(message.log_time, message.data, encoding)
+                    # The library passes over chunks whose header is overwritten.
+                    declared = self._counts[file][topic] if file in self._counts else 0
+                    if count < declared:
+                        self._damaged(f"{file}: {count} of the {declared} messages of {topic} can be read")
                 except (ScanError, GeneratorExit):
                     raise
                 except Exception as error:  # decompressors and struct have errors of their own
-                    self.damage = f"{file}: ends early, after {count} messages of {topic} ({reason(error)})"
+                    self._damaged(f"{file}: ends early, after {count} messages of {topic} ({reason(error)})")
+
+    def _damaged(self, said: str) -> None:
+        self.damage = self.damage or said
 
     def _stored(self, file: Path, stream: IO[bytes], topic: str) -> Iterator[tuple[Any, Any]]:
         from mcap.reader import SeekingReader
@@ -55,7 +63,7 @@ class McapRecording(Recording):
         from mcap.records import Message as McapMessage
         from mcap.stream_reader import StreamReader
 
-        if self._indexed[file]:
+        if file in self._counts:
             for _, channel, message in SeekingReader(stream, validate_crcs=True).iter_messages(topics=[topic]):
                 yield channel, message
             return
@@ -75,13 +83,15 @@ class McapRecording(Recording):
             except Exception:  # no end, no index, or no MCAP: the records themselves tell
                 summary = None
             if summary is not None and summary.statistics is not None and summary.chunk_indexes:
-                self._indexed[file] = True
                 counts = summary.statistics.channel_message_counts
-                return [
+                topics = [
                     Topic(channel.topic, _type(summary.schemas, channel), counts.get(channel.id, 0))
                     for channel in summary.channels.values()
                 ]
-            self._indexed[file] = False
+                self._counts[file] = Counter()
+                for topic in topics:
+                    self._counts[file][topic.name] += topic.messages
+                return topics
             stream.seek(0)
             return _counted(file, stream)
 

@@ -7,8 +7,11 @@ from typing import NamedTuple
 from asca_pillars.data.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.data.recordings.recording import Recording, Topic
 from asca_pillars.data.scans.scan_reader import ReflectanceScale, Scan, finite_scan
-from asca_pillars.data.scans.stored_scans import FolderScale, common_reflectance_scale
+from asca_pillars.data.scans.stored_scans import FolderScale, common_reflectance_scale, has_finite_point
 from asca_pillars.errors import ScanError
+
+SEARCHED_MESSAGES = 300
+"""How far scans with points are looked for: half a minute at 10 Hz, in which a sensor starts."""
 
 
 class RecordedScan(NamedTuple):
@@ -27,7 +30,7 @@ class RecordedScans:
     Args:
         recording: to read from.
         topic: of point clouds.
-        reflectance_scale: the stored value that is a reflectance of 1; auto: decided once, by the first scans.
+        reflectance_scale: the stored value that is a reflectance of 1; auto: by the first scans with points, once.
 
     Attributes:
         scale: what was decided.
@@ -41,7 +44,7 @@ class RecordedScans:
             self.scale = FolderScale(reflectance_scale, None)
 
     def first(self, count: int) -> Iterator[Scan]:
-        """The first scans that can be read, at most `count`."""
+        """The first scans with points, at most `count`; none is looked for beyond SEARCHED_MESSAGES."""
         return (finite_scan(cloud.points, self.scale.scale) for cloud in self._first(count))
 
     def read(self, start: int = 0) -> Iterator[RecordedScan]:
@@ -57,14 +60,16 @@ class RecordedScans:
             yield RecordedScan(number, cloud.time_ns, cloud.frame_id, finite_scan(cloud.points, self.scale.scale))
 
     def _first(self, count: int) -> Iterator[PointCloud]:
-        return islice(self._clouds(), count)
+        return islice(self._clouds_with_points(), count)
 
-    def _clouds(self) -> Iterator[PointCloud]:
-        for number, message in enumerate(self.recording.messages(self.topic.name)):
+    def _clouds_with_points(self) -> Iterator[PointCloud]:
+        for number, message in enumerate(islice(self.recording.messages(self.topic.name), SEARCHED_MESSAGES)):
             try:
-                yield read_point_cloud(message, self._place(number))
+                cloud = read_point_cloud(message, self._place(number))
             except ScanError:
                 continue  # named when its turn comes
+            if has_finite_point(cloud.points):
+                yield cloud
 
     def _place(self, number: int) -> str:
         return f"{self.recording.path}, {self.topic.name}, message {number}"

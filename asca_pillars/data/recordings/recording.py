@@ -38,7 +38,7 @@ class Recording(ABC):
     Attributes:
         path: the file or folder.
         topics: all of them, by name.
-        damage: why the last call of `messages` ended early; None if it did not.
+        damage: what the last call of `messages` lacked, and where; None: nothing.
     """
 
     path: Path

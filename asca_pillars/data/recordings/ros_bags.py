@@ -33,6 +33,8 @@ class RosBag(Recording):
                 for _, time_ns, data in reader.messages(connections=chosen):
                     count += 1
                     yield Message(time_ns, bytes(data), "ros1" if _is_ros1(self.path) else "cdr")
+                if count < (declared := sum(one.messages for one in self.topics if one.name == topic)):
+                    self.damage = f"{self.path}: {count} of the {declared} messages of {topic} can be read"
             except (ScanError, GeneratorExit):
                 raise
             except Exception as error:  # of SQLite, the decompressors, the library
@@ -51,7 +53,7 @@ def _opened(path: Path) -> Any:
         reader = (Reader1 if _is_ros1(path) else Reader2)(path)
         reader.open()
     except Exception as error:
-        what, remedy = "rosbag2", "copy or record it again"
+        what, remedy = "rosbag2", "copy it again, or mend it (sqlite3 broken.db3 .recover | sqlite3 mended.db3)"
         if path.suffix != path.suffix.lower():  # the library goes by the suffix as it stands
             remedy = f"rename it to {path.stem}{path.suffix.lower()}"
         if _is_ros1(path):

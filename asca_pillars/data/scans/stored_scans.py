@@ -23,7 +23,8 @@ class FolderScale(NamedTuple):
 def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = None, sample: int = 16) -> FolderScale:
     """One reflectance scale for scans that belong together, from `sample` of them, evenly spaced.
 
-    A dark scan among brighter ones is then not read on another scale. Scans that cannot be read have no say; where
+    A dark scan among brighter ones is then not read on another scale. Scans that cannot be read, or have no points,
+    have no say; where
     none has reflectances, the scale is auto.
     """
     chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
@@ -37,9 +38,9 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
 def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
     """One reflectance scale for scans that belong together: the largest that any of them is stored in.
 
-    Auto where none of them has reflectances.
+    Auto where none of them has reflectances; scans without points have no say.
     """
-    samples = [(one.reflectance, one.dtype) for one in stored if one.reflectance is not None]
+    samples = [(one.reflectance, one.dtype) for one in stored if one.reflectance is not None and has_finite_point(one)]
     if not samples:
         return FolderScale("auto", None)
     decided = [decide_scale(*one) for one in samples]
@@ -47,6 +48,12 @@ def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
     guessed = any(by_values for _, by_values in decided)
     doubts = [ambiguity(values, scale) for values, _ in samples] if guessed else [None]
     return FolderScale(scale, doubts[0] if all(doubts) else None)
+
+
+def has_finite_point(stored: StoredPoints) -> bool:
+    """Whether there is a point whose numbers are all finite: drivers send scans of none while a sensor starts."""
+    finite = np.isfinite(stored.xyz).all(axis=1)
+    return bool((finite if stored.reflectance is None else finite & np.isfinite(stored.reflectance)).any())
 
 
 def stored_points(path: Path, *, columns: int | None = 4) -> NDArray[np.float32]:

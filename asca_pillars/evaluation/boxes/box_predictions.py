@@ -1,18 +1,19 @@
 """What is evaluated without a camera: a dataset's labelled boxes, and predictions as `asca detect` writes them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from asca_pillars.data.boxes.box_records import BoxRecords, json_line, read_frames, records_from
+from asca_pillars.data.boxes.box_records import NamedRecords, json_line, records_from
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
+from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame
 from asca_pillars.evaluation.predictions import shortage
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.detections import Detections
@@ -64,8 +65,8 @@ def write_box_predictions(
 def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | None = None) -> BoxFrames:
     """Pair the labels of a split with the predictions of a *.jsonl or *.csv file.
 
-    Boxes are in the scan's own frame, as labels are. A line belongs to the frame whose id is the longest end of its
-    scan's path; lines of other frames are left out, and so are boxes where nothing is labelled.
+    Boxes are in the scan's own frame, as labels are. `predictions_by_frame` says which frame a line belongs to; lines
+    of other frames are left out, and so are boxes where nothing is labelled.
 
     Args:
         path: the file, or a folder that `asca detect` wrote.
@@ -73,17 +74,18 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
         console: shows the progress.
 
     Raises:
-        DatasetError: a file cannot be read; a prediction without a score; none is of a frame of the split.
+        DatasetError: as `predictions_by_frame`; a prediction without a score.
     """
     path = path / "detections.jsonl" if path.is_dir() else path
-    predictions, known = _by_frame(path, set(split.frame_ids))
+    predictions = predictions_by_frame(path, split)
+    _require_scores(predictions.values())
     level = split.mounting.level
     frames = []
-    for frame_id in track(known, "Points in boxes", console=console, disable=console is None):
+    for frame_id in track(sorted(predictions), "Points in boxes", console=console, disable=console is None):
         objects, types = split.labeled_boxes(frame_id)
         points = split.points(frame_id, camera_view=False)
         visible = np.asarray(points_in_boxes(points, objects).any(axis=0))
-        records = predictions[frame_id]
+        records = predictions[frame_id].records
         found = records.boxes if level.is_identity else level.boxes(records.boxes)
         kept = np.flatnonzero(_can_be_judged(split, frame_id, objects, found))
         found_types = tuple(records.types[row] for row in kept)
@@ -100,28 +102,8 @@ def _can_be_judged(
     return np.asarray(split.in_labeled_view(frame_id, found[:, :3]) | (apart < NEAR_LABEL_M).any(axis=1))
 
 
-def _by_frame(path: Path, frame_ids: set[str]) -> tuple[dict[str, BoxRecords], Sequence[str]]:
-    predictions: dict[str, BoxRecords] = {}
-    places: dict[str, str] = {}
-    for scan, records, place, _ in read_frames(path):
+def _require_scores(lines: Iterable[NamedRecords]) -> None:
+    for _, records, place, _ in lines:
         if np.isnan(records.scores).any():
             number = int(np.isnan(records.scores).argmax()) + 1
             raise DatasetError(f"{place}, box {number}: no `score`; every prediction needs one")
-        frame_id = frame_of_scan(scan, frame_ids)
-        if frame_id in places:
-            raise DatasetError(f"{place}: {scan} has predictions in {places[frame_id]} already; join them")
-        if frame_id is not None:
-            predictions[frame_id], places[frame_id] = records, place
-    if not predictions:
-        raise DatasetError(
-            f"{path}: none of its scans is a frame to be evaluated, such as {min(frame_ids)}; "
-            "give the predictions of this dataset's scans"
-        )
-    return predictions, sorted(predictions)
-
-
-def frame_of_scan(scan: str, frame_ids: set[str]) -> str | None:
-    """The frame whose id is the longest end of a scan's path; None if there is none."""
-    parts = PurePosixPath(scan.replace("\\", "/")).with_suffix("").parts
-    ends = ("/".join(parts[first:]) for first in range(len(parts)))
-    return next((end for end in ends if end in frame_ids), None)

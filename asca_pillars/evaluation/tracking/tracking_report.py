@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asca_pillars.data.boxes.box_records import NamedRecords, read_frames
+from asca_pillars.data.boxes.box_records import NamedRecords
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import DatasetError
-from asca_pillars.evaluation.boxes.box_predictions import frame_of_scan
+from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame
 from asca_pillars.evaluation.report import TextTable
 from asca_pillars.evaluation.tracking.clear_mot import ClearMot, clear_mot
 from asca_pillars.evaluation.tracking.hota import Hota, hota
@@ -24,7 +24,6 @@ CLEAR_IOU = 0.25
 MIN_POINTS = 5
 """Labels of fewer points are not counted, where the dataset says how many there are."""
 UNKNOWN_OCCLUSION = 3
-_SAME_TIME_S = 1e-3
 
 
 class ClassScore(NamedTuple):
@@ -62,10 +61,10 @@ class _Frame:
 def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dict[str, Any]) -> TrackingReport:
     """Score the tracks that `asca detect --track` wrote.
 
-    A line belongs to the frame of its scan's name or, for recordings, of its time. Labelled frames without a line count
-    as frames in which nothing was found. Not counted are labels outside the ranges that the predictions' folder notes
-    (recording.json), of fewer than MIN_POINTS points and of unknown occlusion. Scored are the detector's classes, which
-    the folder notes, too; without it those that are predicted.
+    `predictions_by_frame` says which frame a line belongs to. Labelled frames without a line count as frames in which
+    nothing was found. Not counted are labels outside the ranges that the predictions' folder notes (recording.json), of
+    fewer than MIN_POINTS points and of unknown occlusion. Scored are the detector's classes, which the folder notes,
+    too; without it those that are predicted.
 
     Args:
         split: labels with `track_id`; a frame's folder is its sequence.
@@ -74,16 +73,15 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
         about: for the JSON.
 
     Raises:
-        DatasetError: a file cannot be read, boxes have no `track_id`, or no line belongs to a frame.
+        DatasetError: as `predictions_by_frame`; boxes have no `track_id`.
     """
     path = predictions / "detections.jsonl" if predictions.is_dir() else predictions
-    times = _times(split)
-    found = _by_frame(path, split, times)
+    found = predictions_by_frame(path, split)
     about_run = _about_run(path.parent / "recording.json")
     names = about_run.get("classes") or sorted({kind for one in found.values() for kind in one.records.types})
     sequences: dict[str, list[_Frame]] = {}
     labelled: Counter[str] = Counter()
-    for frame_id in _in_order(split.frame_ids, times):
+    for frame_id in _in_order(split.frame_ids, split.times_s):
         frame = _frame(split, frame_id, found.get(frame_id), names, about_run.get("ranges_m"))
         labelled.update(frame.types)
         sequences.setdefault(frame_id.rpartition("/")[0], []).append(frame)
@@ -193,43 +191,11 @@ def _ids(values: Sequence[Any], place: str) -> Any:
     return np.array([int(text) if text.isdecimal() else hash(text) >> 24 for text in texts], np.int64)
 
 
-def _by_frame(path: Path, split: BoxSplit, times: Mapping[str, float]) -> dict[str, NamedRecords]:
-    """The lines of the predictions by the frames that they belong to."""
-    known = set(split.frame_ids)
-    ordered = sorted((time_s, frame_id) for frame_id, time_s in times.items())
-    stamps = np.array([time_s for time_s, _ in ordered])
-    found: dict[str, NamedRecords] = {}
-    for one in read_frames(path):
-        frame_id = frame_of_scan(one.scan, known)
-        if frame_id is None and one.time_s is not None and ordered:
-            nearest = int(np.abs(stamps - one.time_s).argmin())
-            frame_id = ordered[nearest][1] if abs(stamps[nearest] - one.time_s) < _SAME_TIME_S else None
-        if frame_id in found:
-            raise DatasetError(f"{one.place}: frame {frame_id} has predictions in {found[frame_id].place}; join them")
-        if frame_id is not None:
-            found[frame_id] = one
-    if not found:
-        raise DatasetError(f"{path}: no line belongs to a frame of {split.root}, by name or by time")
-    return found
-
-
 def _in_order(frame_ids: Sequence[str], times: Mapping[str, float]) -> list[str]:
     """As they followed each other: by time where every frame has one, else 2 before 10."""
     if all(frame_id in times for frame_id in frame_ids):
         return sorted(frame_ids, key=lambda frame_id: times[frame_id])
     return sorted(frame_ids, key=lambda frame_id: natural_order(Path(frame_id)))
-
-
-def _times(split: BoxSplit) -> dict[str, float]:
-    """Time stamps of frames, seconds, where labels say them."""
-    times = {}
-    for frame_id in split.frame_ids:
-        path = split.labels_path / f"{frame_id}.json"
-        if path.is_file():
-            content = json.loads(path.read_text(encoding="utf-8"))
-            if "time_s" in content:
-                times[frame_id] = float(content["time_s"])
-    return times
 
 
 def _about_run(path: Path) -> dict[str, Any]:

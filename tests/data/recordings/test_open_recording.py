@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
 
 from asca_pillars.data.recordings.open_recording import is_recording, open_recording
-from asca_pillars.data.recordings.recorded_scans import RecordedScans
+from asca_pillars.data.recordings.recorded_scans import SEARCHED_MESSAGES, RecordedScans
 from asca_pillars.errors import ScanError
 from benchmarks.made_recordings import TOPIC, write_recording
 from tests.data.recordings.cloud_recordings import CLOUD, cloud_points, clouds, laid_out, stamps, store, write_mcap
@@ -132,6 +132,36 @@ def test_a_damaged_chunk_ends_an_indexed_file_early(tmp_path: Path) -> None:
     assert len(read) < 8 and recording.damage is not None
 
 
+def test_chunks_that_an_index_counts_and_that_are_gone_are_damage(tmp_path: Path) -> None:
+    """Zeros over the header of one chunk: it is empty to the library."""
+    from mcap.reader import make_reader
+
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8), "/rear": clouds(1)})
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    data, start = bytearray(path.read_bytes()), summary.chunk_indexes[1].chunk_start_offset
+    data[start : start + 200] = bytes(200)
+    path.write_bytes(data)
+    recording = open_recording(path)
+    read = list(recording.messages("/lidar"))
+    assert 0 < len(read) < 8
+    assert recording.damage == f"{path}: {len(read)} of the 8 messages of /lidar can be read"
+    assert len(list(recording.messages("/rear"))) == 1 and recording.damage is None
+
+
+def test_messages_that_a_rosbag2_counts_and_that_are_gone_are_damage(tmp_path: Path) -> None:
+    import apsw
+
+    write_recording(tmp_path / "bag", iter([(time_ns, cloud_points(0)) for time_ns in stamps(3)]))
+    (database,) = (tmp_path / "bag").glob("*.db3")
+    with apsw.Connection(str(database)) as connection:
+        connection.execute(f"DELETE FROM messages WHERE timestamp = {stamps(3)[1]}")
+    recording = open_recording(tmp_path / "bag")
+    assert len(list(recording.messages(TOPIC))) == 2
+    assert recording.damage is not None and f"2 of the 3 messages of {TOPIC} can be read" in recording.damage
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
@@ -175,3 +205,26 @@ def test_the_reflectance_scale_is_decided_once_for_the_recording(tmp_path: Path)
     assert scans.scale.scale == 255.0
     first = next(scans.read()).scan
     assert first is not None and first.points[0, 3] == pytest.approx(1.5 / 255)
+
+
+@pytest.mark.parametrize("nothing", [0, np.nan])
+def test_scans_without_points_have_no_say_in_the_reflectance_scale(tmp_path: Path, nothing: float) -> None:
+    """Twenty scans of no points, or of points that are not finite, while the sensor starts."""
+    bright, times = cloud_points(0), stamps(22)
+    bright[:, 3] = np.linspace(0, 255, len(bright))
+    none = bright[:0] if nothing == 0 else bright * np.float32(nothing)
+    messages = [(time, laid_out(none if time < times[20] else bright, time_ns=time)) for time in times]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
+    scans = RecordedScans(recording, recording.point_cloud_topic(), "auto")
+    assert scans.scale.scale == 255.0
+    assert [len(scan.points) for scan in scans.first(8)] == [len(bright)] * 2, "nor in the sensor's height"
+
+
+def test_scans_with_points_are_not_looked_for_without_end(tmp_path: Path) -> None:
+    late = [
+        (time, laid_out(cloud_points(0)[: number // SEARCHED_MESSAGES]))
+        for number, time in enumerate(stamps(SEARCHED_MESSAGES + 1))
+    ]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": late}, chunk_size=100_000))
+    scans = RecordedScans(recording, recording.point_cloud_topic(), "auto")
+    assert scans.scale.scale == "auto" and not list(scans.first(8))
