@@ -47,14 +47,15 @@ class RefineConfig(Strict):
         neighbors: balls and grids.
         network: widths.
         rois: proposals of a frame that one training step learns from.
-        scores: of refined boxes: `second`, the second stage's, or `both`, the geometric mean with the proposal's.
+        scores: of refined boxes: `second`, the second stage's, which has seen the proposal's, or `both`, the geometric
+            mean of the two.
     """
 
     seen: FirstStageSettings = field(default_factory=FirstStageSettings)
     neighbors: RefineSettings = field(default_factory=RefineSettings)
     network: RefineNetwork = field(default_factory=RefineNetwork)
     rois: int = 32
-    scores: Scores = "both"
+    scores: Scores = "second"
 
     def __post_init__(self) -> None:
         if self.rois < 2:

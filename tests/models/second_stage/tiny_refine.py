@@ -21,7 +21,6 @@ REFINE = RefineConfig(
     neighbors=RefineSettings(ball_samples=6, grid_size=2, grid_samples=5),
     network=RefineNetwork(ball_widths=(8, 12), keypoint_channels=16, grid_widths=(12,), hidden=16),
     rois=8,
-    scores="second",  # the tiny first stage is sure of nothing
 )
 STILL_OBJECTS = AugmentConfig(object_rotation_rad=0.0, object_shift_m=0.0)
 
