@@ -80,7 +80,7 @@ def tracking_order(times_ns: Sequence[int]) -> list[int]:
 def said_of_stamps(times_ns: Sequence[int]) -> str | None:
     """A sentence if stamps of recorded scans go back, or on by more than the pause that ends tracks."""
     steps = np.diff(np.array(times_ns, np.int64))
-    back, ahead = int((steps < 0).sum()), int((steps > MAX_SCAN_GAP_S * 1e9).sum())
+    back, ahead = int((steps < 0).sum()), int((steps > round(MAX_SCAN_GAP_S * 1e9)).sum())
     if not back and not ahead:
         return None
     return (

@@ -148,7 +148,7 @@ def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_pat
         (["--data", "{root}", "--predictions", "x", "--min-score", "0.9"], "--min-score 0.9 is for running a model"),
         (["--data", "{root}", "--score", "nan"], "--score nan must be a number"),
         (["--data", "{root}", "--predictions", "{root}/none.jsonl", "--json", "{root}"], "is a folder"),
-        (["--data", "{root}", "--predictions", "{root}/labels.jsonl"], "labels.jsonl:1, box 1: no `score`"),
+        (["--data", "{root}", "--predictions", "{root}/labels.jsonl"], "labels.jsonl:2, box 1: no `score`"),
         (["--data", "{root}", "--predictions", "{root}/none.jsonl"], "none.jsonl: cannot be read"),
     ],
 )

@@ -142,8 +142,9 @@ def _json_lines(path: Path) -> Iterator[NamedRecords]:
 
 def _time_s(content: Any) -> float | None:
     time_s = content.get("time_s") if isinstance(content, dict) else None
-    is_number = isinstance(time_s, int | float) and not isinstance(time_s, bool)
-    return float(time_s) if is_number and math.isfinite(time_s) else None
+    if isinstance(time_s, bool) or not isinstance(time_s, int | float) or not math.isfinite(time_s):
+        return None
+    return float(time_s)
 
 
 def _json_records(content: Any, place: str) -> BoxRecords:

@@ -19,7 +19,7 @@ TIMES_S = {f"{number:06d}": 1.7e9 + number / 10 for number in range(6)}
 def dataset(root: Path, times_s: dict[str, float] | None, own_files: bool = True) -> BoxSplit:
     """Frames of one car each, with time stamps, in a file each or in one for all; times None: without them."""
     (root / "scans").mkdir(parents=True)
-    labels = {}
+    labels: dict[str, dict[str, Any]] = {}
     for number, frame_id in enumerate(times_s or TIMES_S):
         path = root / "scans" / f"{frame_id}.npy"
         path.parent.mkdir(exist_ok=True)
