@@ -76,6 +76,19 @@ def atomic_directory(path: str | Path, command: str, marker: str) -> Iterator[Pa
         _sync(target.parent)
 
 
+def remove_directory(path: str | Path, command: str, marker: str) -> None:
+    """Remove the folder that `atomic_directory` wrote at `path`, as a whole; leave anything without `marker` alone.
+
+    Raises:
+        OutputError: as `require_replaceable`.
+    """
+    target = Path(os.path.realpath(path))
+    require_replaceable(target, command, marker)
+    if (target / marker).is_file():
+        with _temporary(target, f".{target.name}.asca-", "", folder=True) as temporary:
+            target.replace(temporary / target.name)
+
+
 def write_json(path: str | Path, content: Any) -> None:
     """Write plain values as JSON, through `atomic_path`.
 

@@ -29,7 +29,7 @@ from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.evaluation.report import markdown_table
-from asca_pillars.evaluation.tracking.tracking_report import tracking_report, tracking_table
+from asca_pillars.evaluation.tracking.tracking_report import tracking_report, tracking_tables
 from asca_pillars.system import cpu_model
 from benchmarks.made_recordings import stamped_scans, write_recording
 
@@ -55,8 +55,8 @@ def main(
                 f"{1e3 * cpu_s / scans:.1f} ms of processor time per scan, start and writing included"
             )
         report = tracking_report(BoxSplit(data), folder / "out_drive.mcap", str(data), {})
-        table = tracking_table(report)
-        print(f"\n{markdown_table(table.columns, table.rows, table.left)}")
+        for table in tracking_tables(report):
+            print(f"\n{markdown_table(table.columns, table.rows, table.left)}")
     print(_tracker_cost([json.loads(line) for line in lines]))
     print(_paced(data, threads, paced))
 

@@ -11,7 +11,7 @@ import pytest
 
 from asca_pillars import files
 from asca_pillars.errors import OutputError
-from asca_pillars.files import atomic_directory, atomic_path, require_own, require_replaceable
+from asca_pillars.files import atomic_directory, atomic_path, remove_directory, require_own, require_replaceable
 from tests.bundle_folder import EXPORT, names, old_bundle
 
 
@@ -147,6 +147,20 @@ def test_a_foreign_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
         (target / "notes").write_text("precious")
     assert names(target) == ["a.onnx", "bundle.json", "notes"]
     assert names(tmp_path) == ["bundle"]
+
+
+def test_one_s_own_folder_is_removed_and_nobody_else_s(tmp_path: Path) -> None:
+    remove_directory(tmp_path / "absent", *EXPORT)
+    remove_directory(old_bundle(tmp_path / "bundle"), *EXPORT)
+    (tmp_path / "empty").mkdir()
+    remove_directory(tmp_path / "empty", *EXPORT)
+    assert names(tmp_path) == ["empty"]
+    theirs = old_bundle(tmp_path / "theirs")
+    (theirs / "notes.txt").write_text("mine")
+    before = names(theirs)
+    with pytest.raises(OutputError, match=r"notes\.txt"):
+        remove_directory(theirs, *EXPORT)
+    assert names(theirs) == before
 
 
 def test_what_is_no_folder_and_what_is_no_file_is_refused(tmp_path: Path) -> None:

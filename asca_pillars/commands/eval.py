@@ -28,8 +28,9 @@ def evaluate(
         ),
     ] = None,
     split: Annotated[
-        str, typer.Option("--split", help="A list of ImageSets/, or training for every frame; with --data.")
-    ] = "val",
+        str | None,
+        typer.Option("--split", help="A list of ImageSets/, or training for every frame; with --data. Default: val."),
+    ] = None,
     predictions: Annotated[
         Path | None,
         typer.Option(
@@ -101,6 +102,9 @@ def evaluate(
     options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
     if predictions is not None:
         steps.check_of_a_model(predictions, options, min_score)
+    if split is not None and data is None:
+        raise ConfigError(f"--split {split} is a list of the frames of a dataset: give --data ROOT, too")
+    split = "val" if split is None else split
     if protocol == "tracking":
         from asca_pillars.commands.eval_tracks import check_arguments, evaluate_tracks
 

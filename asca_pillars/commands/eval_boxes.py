@@ -14,6 +14,7 @@ from asca_pillars.commands.eval_steps import (
     check_score,
     claim,
     model_scores,
+    remove_predictions_of_another,
     warn_of_unlike_scans,
 )
 from asca_pillars.commands.models import Model, open_model
@@ -90,6 +91,8 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     tables, notes = box_tables(report), box_notes(report)
     print_tables(report.title, tables, notes, console)
     content = box_json(report)
+    if predictions is not None:
+        remove_predictions_of_another(task.out, predictions)
     write_json(task.out / f"{task.protocol}.json", content)
     with atomic_path(task.out / f"{task.protocol}.md") as temporary:
         temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")

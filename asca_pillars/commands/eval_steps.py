@@ -33,7 +33,14 @@ from asca_pillars.evaluation.report import (
 from asca_pillars.evaluation.waymo import waymo_detection
 from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
 from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
-from asca_pillars.files import atomic_directory, atomic_path, require_own, require_replaceable, write_json
+from asca_pillars.files import (
+    atomic_directory,
+    atomic_path,
+    remove_directory,
+    require_own,
+    require_replaceable,
+    write_json,
+)
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.system import describe_environment
@@ -69,6 +76,17 @@ def claim(out: Path, json_path: Path | None) -> None:
     for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
         require_replaceable(out / folder, COMMAND, marker)
     require_writable_json(json_path)
+
+
+def remove_predictions_of_another(out: Path, scored: Path) -> None:
+    """Remove the model's predictions that an earlier evaluation left in `out`, unless they are those that are scored.
+
+    Raises:
+        OutputError, OSError: they cannot be removed.
+    """
+    own = (out / "predictions").resolve()
+    if own not in (scored.resolve(), *scored.resolve().parents):
+        remove_directory(own, COMMAND, MADE_BY)
 
 
 def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: float | None) -> Task:
@@ -112,6 +130,7 @@ def check_of_a_model(predictions: Path, options: RuntimeOptions, min_score: floa
     given = {
         f"--provider {options.provider}": options.provider != plain.provider,
         f"--precision {options.precision}": options.precision != plain.precision,
+        f"--threads {options.threads}": options.threads != plain.threads,
         f"--min-score {min_score:g}": min_score != MIN_SCORE,
     }
     if options_given := [name for name, differs in given.items() if differs]:
@@ -218,6 +237,7 @@ def report_waymo(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     tables, notes = [waymo_table(report)], waymo_notes(report)
     print_tables(report.title, tables, notes, console)
     content = waymo_json(report)
+    remove_predictions_of_another(out, task.predictions)
     write_json(out / "waymo.json", content)
     with atomic_path(out / "waymo.md") as temporary:
         temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
@@ -234,10 +254,13 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     report = EvalReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     print_report(report, console)
     content = to_json(report)
+    remove_predictions_of_another(out, task.predictions)
+    remove_directory(out / "gallery", COMMAND, gallery.INDEX)
     write_json(out / "report.json", content)
     with atomic_path(out / "report.md") as temporary:
         temporary.write_text(to_markdown(report), encoding="utf-8")
     if missing_modules("eval"):
+        (out / "curves.png").unlink(missing_ok=True)
         console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
     else:
         write_curves(out / "curves.png", ap.overall, report.title)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_steps import claim
+from asca_pillars.commands.eval_steps import claim, remove_predictions_of_another
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError
@@ -14,7 +14,7 @@ from asca_pillars.evaluation.tracking.tracking_report import (
     tracking_json,
     tracking_notes,
     tracking_report,
-    tracking_table,
+    tracking_tables,
 )
 from asca_pillars.files import atomic_path, write_json
 from asca_pillars.system import describe_environment
@@ -55,9 +55,10 @@ def evaluate_tracks(
     about = {"data": str(data), "split": split, "predictions": str(predictions)}
     about |= {"environment": json.loads(describe_environment())}
     report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
-    tables, notes = [tracking_table(report)], tracking_notes(report)
+    tables, notes = tracking_tables(report), tracking_notes(report)
     print_tables(report.subject, tables, notes, console)
     content = tracking_json(report)
+    remove_predictions_of_another(out, predictions)
     write_json(out / "tracking.json", content)
     with atomic_path(out / "tracking.md") as temporary:
         temporary.write_text(markdown_page(report.subject, tables, notes), encoding="utf-8")

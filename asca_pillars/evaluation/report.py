@@ -108,12 +108,17 @@ def print_report(report: EvalReport, console: Console) -> None:
 
 
 def print_tables(title: str, tables: Sequence[TextTable], notes: Sequence[str], console: Console) -> None:
-    """A title, tables and notes on the console; a name that the row above has is not repeated."""
+    """A title, tables and notes on the console; a name that the row above has is not repeated.
+
+    A table is wider than the console rather than cut a figure or a word.
+    """
     console.print(title, style="bold", highlight=False, soft_wrap=True)
     for table in tables:
         drawn = Table()
         for index, column in enumerate(table.columns):
-            drawn.add_column(column, justify="left" if index < table.left else "right")
+            words = (*column.split(), *(row[index] for row in table.rows))
+            width = max(map(len, words))
+            drawn.add_column(column, justify="left" if index < table.left else "right", min_width=width)
         last = None
         for name, *cells in table.rows:
             if table.left > 1 and last not in (None, name):
@@ -121,7 +126,7 @@ def print_tables(title: str, tables: Sequence[TextTable], notes: Sequence[str], 
             drawn.add_row("" if name == last else name, *cells)
             last = name
         console.print(f"\n{table.title}", highlight=False, soft_wrap=True)
-        console.print(drawn)
+        console.print(drawn, crop=False)
     for line in notes:
         console.print(line, highlight=False, soft_wrap=True)
 

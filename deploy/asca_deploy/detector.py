@@ -257,7 +257,7 @@ class Detector:
 
 
 def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> UsablePoints:
-    """The finite points of (N, 4) as contiguous float32, reflectance within 0..1.
+    """The points of (N, 4) that are finite in the model's frame as contiguous float32, reflectance within 0..1.
 
     Args:
         points: (N, 4) x, y, z in metres and reflectance, of any real type.
@@ -284,12 +284,12 @@ def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> 
         advice = "; give the first four columns: points[:, :4]" if columns > 4 else advice
         advice = "; the points lie in its columns, transpose it: points.T" if columns > len(scan) == 4 else advice
         raise ScanError(f"the points have shape {array.shape}, not (N, 4): x, y, z, reflectance{advice}")
-    finite, non_finite = np.isfinite(scan), 0
+    if to_model is not None and not to_model.is_identity:
+        scan = to_model.points(scan)
+    finite, non_finite = np.isfinite(scan), 0  # in the model's frame: a turn may lead out of float32
     if not finite.all():
         usable = finite.all(axis=1)
         scan, non_finite = scan[usable], int(len(scan) - usable.sum())
-    if to_model is not None and not to_model.is_identity:
-        scan = to_model.points(scan)
     reflectance = scan[:, 3].copy()  # in one piece, which NumPy searches several times faster
     if not len(scan) or (reflectance.min() >= 0 and reflectance.max() <= 1):
         return UsablePoints(scan, scan, non_finite, 0)

@@ -7,9 +7,13 @@
 There are more scans per second than one after the other, and each is a little later, for it waits for the one before.
 """
 
+import atexit
+import sys
+import threading
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar
+from concurrent.futures import Future
+from queue import SimpleQueue
+from typing import Any, Generic, TypeVar
 
 Scan = TypeVar("Scan")
 Ready = TypeVar("Ready")
@@ -28,7 +32,8 @@ def overlapped(
     `scans` is read in a thread of its own, so that reading files or waiting for a sensor overlaps too, and never more
     than one scan ahead of the one that is asked for. Closing the iterator waits for the stages that run, and for the
     scan if one is being read, and ends both threads. A source that may wait for ever has a method `interrupt`, which is
-    called first and lets its iterator end (`scan_queue.ScanQueue`).
+    called first and lets its iterator end (`scan_queue.ScanQueue`). A program that ends with an open stream waits for
+    the stages that run and for no scan.
 
     Args:
         scans: read in the host's thread.
@@ -50,41 +55,96 @@ def overlapped(
 
 
 class _Ahead(Generic[Scan, Ready, Maps]):
-    """Two threads, each of which does its own stage of scan after scan."""
+    """Two threads, each of which does its own stage of scan after scan.
+
+    They are daemons: the interpreter joins other threads before it closes what is still open, and a source that waits
+    for ever would then never be interrupted.
+    """
 
     def __init__(self, scans: Iterable[Scan], prepare: Callable[[Scan], Ready], infer: Callable[[Ready], Maps]) -> None:
         self._source, self._scans = scans, iter(scans)
         self._prepare, self._infer = prepare, infer
-        self._ended = False
-        self._host = ThreadPoolExecutor(1, "asca-host")
-        self._network = ThreadPoolExecutor(1, "asca-network")
+        self._ended = self._left = False
+        self._asked: SimpleQueue[Future[tuple[Maps, ...]] | None] = SimpleQueue()
+        self._ready: SimpleQueue[tuple[Future[tuple[Maps, ...]], tuple[Ready, ...]] | None] = SimpleQueue()
+        self._preparing, self._inferring = threading.Lock(), threading.Lock()
+        self._host = threading.Thread(target=self._run_host, name="asca-host", daemon=True)
+        self._network = threading.Thread(target=self._run_network, name="asca-network", daemon=True)
 
     def __enter__(self) -> "_Ahead[Scan, Ready, Maps]":
+        self._host.start()
+        self._network.start()
+        _open.add(self)
         return self
 
     def __exit__(self, *_: object) -> None:
-        interrupt = getattr(self._source, "interrupt", None)
-        if interrupt is not None:
-            interrupt()
-        # The host first: the network's thread may be waiting for it.
-        self._host.shutdown(cancel_futures=True)
-        self._network.shutdown(cancel_futures=True)
+        if sys.is_finalizing():  # daemons stand still by now and cannot be joined; `leave` was called before
+            return
+        _open.discard(self)
+        self.leave()
+        self._asked.put(None)
+        self._host.join()
+        self._network.join()
 
     def start(self) -> "Future[tuple[Maps, ...]]":
         """Begin with the next scan; the future holds what `infer` makes of it, or nothing if there is no scan left."""
-        return self._network.submit(self._run_network, self._host.submit(self._run_host))
+        future: Future[tuple[Maps, ...]] = Future()
+        self._asked.put(future)
+        return future
 
-    def _run_host(self) -> tuple[Ready, ...]:
-        if self._ended:
+    def leave(self) -> None:
+        """Let no stage begin any more, and wait for those that run: at the program's end their libraries go away."""
+        self._left = True
+        interrupt = getattr(self._source, "interrupt", None)
+        if interrupt is not None:
+            interrupt()
+        for thread, running in ((self._host, self._preparing), (self._network, self._inferring)):
+            if thread.is_alive():  # not so in a forked process, where nobody would release the lock
+                with running:
+                    pass
+
+    def _run_host(self) -> None:
+        while (future := self._asked.get()) is not None:
+            try:
+                ready = self._next_ready()
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                self._ready.put((future, ready))
+                del ready
+            del future  # the thread keeps nothing of a scan while it waits for the next one
+        self._ready.put(None)
+
+    def _next_ready(self) -> tuple[Ready, ...]:
+        if self._ended or self._left:
             return ()
         self._ended = True  # stays so if reading or preparing fails: what comes after would never be handed out
         try:
             scan = next(self._scans)
         except StopIteration:
             return ()
-        ready = self._prepare(scan)
+        with self._preparing:
+            if self._left:
+                return ()
+            ready = self._prepare(scan)
         self._ended = False
         return (ready,)
 
-    def _run_network(self, coming: "Future[tuple[Ready, ...]]") -> tuple[Maps, ...]:
-        return tuple(self._infer(ready) for ready in coming.result())
+    def _run_network(self) -> None:
+        while (item := self._ready.get()) is not None:
+            future, ready = item
+            try:
+                with self._inferring:
+                    future.set_result(() if self._left else tuple(self._infer(one) for one in ready))
+            except BaseException as error:
+                future.set_exception(error)
+            del item, future, ready
+
+
+_open: set[_Ahead[Any, Any, Any]] = set()
+
+
+@atexit.register
+def _leave_open() -> None:
+    for stream in tuple(_open):
+        stream.leave()

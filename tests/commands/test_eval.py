@@ -56,11 +56,13 @@ def evaluate(
     precision: str | None = None,
     threads: int | None = 1,
     protocol: Protocol = "kitti",
+    split: str | None = None,
 ) -> dict:
     """Run the command; what it wrote as JSON."""
     command.evaluate(
         model,
         data=data,
+        split=split,
         predictions=predictions,
         labels=labels,
         out=out,
@@ -71,7 +73,7 @@ def evaluate(
         protocol=protocol,
         provider=provider,
         precision=precision,
-        threads=threads,
+        threads=threads if predictions is None else None,
     )
     return json.loads((out / ("report.json" if protocol == "kitti" else "waymo.json")).read_text())
 
@@ -209,6 +211,9 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
     )
     assert refusal(tmp_path, **texts, gallery=3) == "--gallery 3 draws scans: give --data ROOT that has them"
     assert refusal(tmp_path, **texts, score=float("nan")) == "--score nan must be a number"
+    assert refusal(tmp_path, **texts, split="val") == (
+        "--split val is a list of the frames of a dataset: give --data ROOT, too"
+    )
     assert refusal(tmp_path, data=root, score=0.04) == (
         "score 0.04 of Car is below --min-score 0.05, the lowest that asca_sim_int8 is run with; lower --min-score"
     )
@@ -227,15 +232,6 @@ def test_a_json_that_cannot_be_written_is_told_before_the_work(
     monkeypatch.setattr(f"asca_pillars.commands.eval_steps.report_{protocol}", lambda *_: pytest.fail("too late"))
     message = refusal(tmp_path, **texts, protocol=protocol, json_path=tmp_path / "folder")
     assert message == "folder: is a folder; choose a file's name"
-
-
-def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
-    theirs = tmp_path / "out" / "predictions"
-    shutil.copytree(texts["predictions"], theirs)
-    assert refusal(tmp_path, data=root) == (
-        "out: holds predictions and nothing that `asca eval` wrote; choose another folder, or empty it"
-    )
-    assert len(list(theirs.glob("*.txt"))) == 3
 
 
 def test_a_class_that_kitti_does_not_know_is_left_out_and_named(

@@ -14,6 +14,7 @@ from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
 from tests.data.boxes.box_scenes import write_box_dataset
+from tests.earlier_evaluation import earlier_predictions
 from tests.scenes import write_dataset
 
 
@@ -123,6 +124,16 @@ def test_what_lies_where_nothing_is_labelled_is_neither_right_nor_wrong(
         run("--data", root, "--split", "training", "--around", "--out", tmp_path / "out")
 
 
+def test_predictions_of_an_earlier_model_do_not_stay_beside_the_report_of_others(
+    root: Path, perfect: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    earlier_predictions(out)
+    (out / "notes.txt").write_text("my own")
+    run("--data", root, "--predictions", perfect, "--out", out)
+    assert {path.name for path in out.iterdir()} == {"iou.json", "iou.md", "notes.txt"}
+
+
 def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_path: Path) -> None:
     perfect.write_text("".join(line for line in perfect.read_text().splitlines(keepends=True) if "000001" in line))
     assert "evaluated on 1 of 2 frames: no predictions for 000002" in " ".join(
@@ -146,6 +157,8 @@ def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_pat
         (["--data", "{root}", "--predictions", "x", "--provider", "y"], "--provider y is for running a model"),
         (["--data", "{root}", "--predictions", "x", "--precision", "y"], "--precision y is for running a model"),
         (["--data", "{root}", "--predictions", "x", "--min-score", "0.9"], "--min-score 0.9 is for running a model"),
+        (["--data", "{root}", "--predictions", "x", "--threads", "2"], "--threads 2 is for running a model"),
+        (["--split", "training", "--predictions", "x", "--labels", "y"], "--split training is a list of the frames of"),
         (["--data", "{root}", "--score", "nan"], "--score nan must be a number"),
         (["--data", "{root}", "--predictions", "{root}/none.jsonl", "--json", "{root}"], "is a folder"),
         (["--data", "{root}", "--predictions", "{root}/labels.jsonl"], "labels.jsonl:2, box 1: no `score`"),

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,12 +7,15 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector, load_bundle
-from asca_deploy.benchmark import cold_start, measure_roofline, measure_scaling, measure_throughput
+from asca_deploy.benchmark import cold, cold_start, measure_roofline, measure_scaling, measure_throughput
 from asca_deploy.benchmark import resident_memory as process_memory
 from asca_deploy.benchmark.roofline import SIZE, gemm_rate
 from asca_deploy.benchmark.scaling import resample
 from asca_deploy.benchmark.throughput import FRAMES
+from asca_pillars.data.mounting import Mounting, read_pose
 from asca_pillars.errors import AscaError
+from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.pillars.pillarize import PillarCounts
 from tests.deploy.conftest import STAGES
 
 Points = NDArray[np.float32]
@@ -42,6 +46,15 @@ def test_scaling_has_a_row_for_each_size(tiny_bundle: Path, scan: Points) -> Non
     assert rows[0].pillars < rows[1].pillars <= rows[2].pillars <= 300
     for row in rows:
         assert tuple(row.stages_ms) == ("input", *STAGES) and row.total_ms > 0
+
+
+def test_pillars_of_turned_passes_are_those_of_a_pass(tiny_bundle: Path, scan: Points) -> None:
+    around = np.concatenate([FrameChange.turn(quarter * np.pi / 2).points(scan) for quarter in range(4)])
+    detector = Detector(tiny_bundle, view="around")
+    (row,) = measure_scaling(detector, around, counts=(200,), rounds=1)
+    summed = detector(resample(around, 200)).report.counts
+    assert isinstance(summed, PillarCounts) and detector.passes > 1
+    assert 0 < row.pillars == round(summed.pillars / detector.passes) < 200
 
 
 def test_throughput_of_stream_and_single_calls(tiny_bundle: Path, scans: list[Points]) -> None:
@@ -88,6 +101,31 @@ def test_a_new_process_finds_boxes_and_says_what_it_took(tiny_bundle: Path, scan
     assert found.first_boxes_s >= found.import_s + found.load_s + found.first_scan_s
     assert min(found.import_s, found.load_s, found.first_scan_s) > 0
     assert found.detect_peak_memory_mib is None or 20 < found.detect_peak_memory_mib < 1e5
+
+
+POSE = ((0.0, 1.0, 0.0, 0.5), (-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.1), (0.0, 0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize("mounting", [Mounting(1.6, axes="-y,x,z"), Mounting(pose=POSE)])
+def test_new_processes_have_the_mounting_of_the_detector(
+    tiny_bundle: Path, scan: Points, mounting: Mounting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Mounting] = []
+    run = cold._run
+
+    def spy(code: str, *arguments: object) -> str:
+        if code == cold._DETECT:
+            options = dict(zip(map(str, arguments[3::2]), map(str, arguments[4::2]), strict=True))
+            height = float(options["--sensor-height"]) if "--sensor-height" in options else None
+            pose = read_pose(options["--pose"]) if "--pose" in options else None
+            seen.append(Mounting(height, options.get("--axes", "x-forward"), pose))
+        else:
+            seen.append(Mounting(**json.loads(str(arguments[-1]))))
+        return run(code, *arguments)
+
+    monkeypatch.setattr(cold, "_run", spy)
+    cold_start(Detector(tiny_bundle, threads=1, mounting=mounting), scan, repeats=1)
+    assert seen == [mounting, mounting]
 
 
 def test_a_new_process_that_fails_says_why(bundle_copy: Path, scan: Points) -> None:

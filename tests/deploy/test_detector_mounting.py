@@ -61,6 +61,20 @@ def test_a_reflectance_outside_is_clipped_in_any_frame(tiny_bundle: Path, scan: 
     assert Detector(tiny_bundle, mounting=Mounting(axes="y-forward"))(scan).report.clipped_reflectances == 1
 
 
+@pytest.mark.parametrize("tilt_deg", [0.5, 3.0])
+def test_what_a_tilted_frame_leads_out_of_float32_is_dropped_and_counted(
+    tiny_bundle: Path, scan: Points, tilt_deg: float
+) -> None:
+    """A driver's "no return" may be the largest number there is."""
+    pose, tilt = np.eye(4), np.radians(tilt_deg)
+    pose[:3, :3] = [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
+    detector = Detector(tiny_bundle, mounting=Mounting(pose=pose))  # type: ignore[arg-type]
+    scan[::50, :3] = np.finfo(np.float32).max
+    found = detector(scan)
+    assert found.report.non_finite_points == len(scan[::50])
+    assert same(found, detector(np.delete(scan, np.s_[::50], axis=0)))
+
+
 @pytest.fixture
 def revolution() -> Points:
     """A scan all around: another street in each quarter."""

@@ -1,3 +1,5 @@
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -170,3 +172,63 @@ def test_stop_iteration_out_of_a_stage_is_an_error_and_no_end() -> None:
 
     with pytest.raises(RuntimeError):
         list(overlapped([1, 2], prepare, infer=lambda ready: ready, finish=lambda found: found))
+
+
+LEFT = """
+import sys, threading
+from asca_deploy.scan_queue import ScanQueue
+from asca_deploy.stream import overlapped
+
+def silent():
+    yield 1
+    threading.Event().wait()
+
+way, queue = sys.argv[1], ScanQueue("wait")
+queue.put(1)
+scans = silent() if way == "no interrupt" else queue
+stream = overlapped(scans, prepare=lambda scan: scan, infer=lambda ready: ready, finish=lambda found: found)
+
+def callback(found):
+    if way == "raise":
+        raise ValueError("callback failed")
+
+callback(next(stream))
+print("end of program")
+"""
+
+BUSY = """
+import threading, time
+from asca_deploy.stream import overlapped
+
+begun = threading.Event()
+
+def infer(ready):
+    if ready == 2:
+        begun.set()
+        time.sleep(0.5)
+        print("inferred", flush=True)
+    return ready
+
+stream = overlapped([1, 2], prepare=lambda scan: scan, infer=infer, finish=lambda found: found)
+next(stream)
+begun.wait()
+"""
+
+
+def run_program(text: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", text, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=6 * PATIENCE_S)
+
+
+@pytest.mark.parametrize(("way", "status"), [("leave", 0), ("raise", 1), ("no interrupt", 0)])
+def test_a_program_that_leaves_a_stream_over_a_silent_sensor_ends(way: str, status: int) -> None:
+    """The stream is still held: by a variable, or by the frame of the traceback."""
+    ended = run_program(LEFT, way)
+    assert ended.returncode == status
+    assert ("end of program" in ended.stdout) == (status == 0)
+    assert ("ValueError: callback failed" in ended.stderr) == (status == 1)
+
+
+def test_a_program_that_ends_waits_for_the_stage_that_runs() -> None:
+    ended = run_program(BUSY)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "inferred\n", "")

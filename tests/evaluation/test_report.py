@@ -13,7 +13,17 @@ from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRIC
 from asca_pillars.evaluation.kitti.objects import frame_objects
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames
-from asca_pillars.evaluation.report import BANDS_M, EvalReport, notes, print_report, tables, to_json, to_markdown
+from asca_pillars.evaluation.report import (
+    BANDS_M,
+    EvalReport,
+    TextTable,
+    notes,
+    print_report,
+    print_tables,
+    tables,
+    to_json,
+    to_markdown,
+)
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 
@@ -107,6 +117,14 @@ def test_missing_frames_stand_in_every_form_of_the_report() -> None:
     assert content["frames"] == 12 and content["frames_asked"] == 14 and content["shortage"] == sentence
     assert content["frames_without_predictions"] == ["000012", "000013"]
     assert to_json(report())["shortage"] is None and "12 frames" in to_markdown(report()).splitlines()[0]
+
+
+def test_a_narrow_console_cuts_no_figure() -> None:
+    table = TextTable("t", ("class", "a long name of a column", "share"), (("Pedestrian", "-226.3", "1.00 - 2.00"),))
+    console = Console(record=True, width=20, markup=False, file=io.StringIO())
+    print_tables("title", [table], [], console)
+    printed = console.export_text()
+    assert all(text in printed for text in ("Pedestrian", "-226.3", "1.00 - 2.00", "column")) and "…" not in printed
 
 
 def test_the_json_has_kittis_shape_and_no_nan() -> None:

@@ -93,15 +93,22 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
     return TrackingReport(subject, scores, len(split.frame_ids), len(found), not_scored, about)
 
 
-def tracking_table(report: TrackingReport) -> TextTable:
-    """A row for each class."""
-    columns = ("class", "HOTA", "DetA", "AssA", "LocA", "MOTA", "switches", "fragments", "labels", "misses", "false")
-    rows = []
-    for name, one, clear in report.scores:
-        means = [f"{100 * value:.1f}" for value in (*one, clear.mota)]
-        counts = (clear.identity_switches, clear.fragmentations, clear.labels, clear.misses, clear.false_boxes)
-        rows.append((name, *means, *map(str, counts)))
-    return TextTable("Tracking", columns, tuple(rows), left=1)
+def tracking_tables(report: TrackingReport) -> list[TextTable]:
+    """HOTA with its parts, and MOTA with its counts; a row for each class."""
+    parts = [(one.name, *(f"{100 * value:.1f}" for value in one.hota)) for one in report.scores]
+    counts = [
+        (
+            name,
+            f"{100 * clear.mota:.1f}",
+            *map(str, (clear.identity_switches, clear.fragmentations, clear.labels, clear.misses, clear.false_boxes)),
+        )
+        for name, _, clear in report.scores
+    ]
+    columns = ("class", "MOTA", "switches", "fragments", "labels", "misses", "false")
+    return [
+        TextTable("HOTA (%)", ("class", "HOTA", "DetA", "AssA", "LocA"), tuple(parts), left=1),
+        TextTable("MOTA (%)", columns, tuple(counts), left=1),
+    ]
 
 
 def tracking_notes(report: TrackingReport) -> list[str]:

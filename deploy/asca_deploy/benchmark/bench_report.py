@@ -41,7 +41,7 @@ class BenchmarkReport:
     points_inside: tuple[int, ...]
     """Of them those within the model's ranges, added up over the passes."""
     pillars: tuple[int, ...]
-    """Pillars of each scan after the limits."""
+    """Pillars of each scan after the limits, the mean of the passes."""
     detections: tuple[int, ...]
     provider: str
     precision: str

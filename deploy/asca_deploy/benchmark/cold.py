@@ -4,16 +4,16 @@ import json
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
+from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import AscaError
 
 _FIRST_BOXES = """
@@ -21,9 +21,10 @@ import sys, time
 from asca_deploy import Detector
 imported = time.time()
 import json, numpy
-points, options = numpy.load(sys.argv[2]), json.loads(sys.argv[3])
+from asca_pillars.data.mounting import Mounting
+points, options, mounting = numpy.load(sys.argv[2]), json.loads(sys.argv[3]), json.loads(sys.argv[4])
 start = time.time()
-detector = Detector(sys.argv[1], **options)
+detector = Detector(sys.argv[1], mounting=Mounting(**mounting), **options)
 loaded = time.time()
 detector(points)
 boxes = time.time()
@@ -73,16 +74,27 @@ def cold_start(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.npy"
         np.save(path, scan)
+        arguments += ["--reflectance-scale", "1", *_mounting_options(detector.mounting, Path(folder))]
         memory = _run(_DETECT, bundle, path, Path(folder) / "out", *arguments).splitlines()[-1]
-        times = np.array([_first_boxes(bundle, path, options) for _ in track(repeats, "new processes")])
+        given = json.dumps(options), json.dumps(asdict(detector.mounting), default=float)
+        times = np.array([_first_boxes(bundle, path, *given) for _ in track(repeats, "new processes")])
     first_boxes_s, import_s, load_s, first_scan_s = (float(value) for value in np.median(times, axis=0))
     peak_mib = None if memory == "None" else float(memory)
     return ColdStart(first_boxes_s, import_s, load_s, first_scan_s, peak_mib, repeats)
 
 
-def _first_boxes(bundle: Path, scan: Path, options: dict[str, Any]) -> tuple[float, float, float, float]:
+def _mounting_options(mounting: Mounting, folder: Path) -> list[str]:
+    """The same for `asca detect`, which takes a pose from a file: one in `folder`."""
+    options = [] if mounting.sensor_height_m is None else ["--sensor-height", str(mounting.sensor_height_m)]
+    if mounting.pose is None:
+        return [*options, "--axes", mounting.axes]
+    np.savetxt(folder / "pose.txt", mounting.pose)
+    return [*options, "--pose", str(folder / "pose.txt")]
+
+
+def _first_boxes(bundle: Path, scan: Path, options: str, mounting: str) -> tuple[float, float, float, float]:
     start = time()
-    imported, load_s, first_scan_s, boxes = json.loads(_run(_FIRST_BOXES, bundle, scan, json.dumps(options)))
+    imported, load_s, first_scan_s, boxes = json.loads(_run(_FIRST_BOXES, bundle, scan, options, mounting))
     return boxes - start, imported - start, load_s, first_scan_s
 
 

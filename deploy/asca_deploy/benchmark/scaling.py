@@ -19,7 +19,7 @@ class ScalingRow:
 
     points: int
     pillars: int
-    """After the limits."""
+    """After the limits, the mean of the passes."""
     stages_ms: dict[str, float]
     """p50 of each stage."""
     total_ms: float

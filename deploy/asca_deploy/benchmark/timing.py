@@ -54,5 +54,5 @@ def run_frame(detector: Detector, scan: NDArray[Any]) -> FrameReport:
 
 
 def pillars_of(frame: FrameReport) -> int:
-    """Pillars of a scan after the limits; 0 where the family has none."""
-    return frame.counts.pillars if isinstance(frame.counts, PillarCounts) else 0
+    """Pillars of a scan after the limits, the mean of its passes; 0 where the family has none."""
+    return round(frame.counts.pillars / frame.passes) if isinstance(frame.counts, PillarCounts) else 0

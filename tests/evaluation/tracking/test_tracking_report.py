@@ -21,6 +21,7 @@ from asca_pillars.evaluation.tracking.tracking_report import (
 )
 from asca_pillars.sim.sequences.sequence_files import simulate_sequences
 from asca_pillars.sim.simulation_configs import load_simulation_config
+from tests.earlier_evaluation import earlier_predictions
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 
@@ -159,9 +160,13 @@ def test_a_frame_with_two_lines_is_refused(drives: Path, tmp_path: Path) -> None
 
 def test_the_command_prints_and_writes(drives: Path, tmp_path: Path) -> None:
     score(drives, tmp_path / "found", labels(drives))
+    earlier_predictions(tmp_path / "out")
     options = ["--protocol", "tracking", "--split", "training", "--data", drives, "--predictions", tmp_path / "found"]
     result = CliRunner().invoke(app, ["eval", *map(str, options), "-o", str(tmp_path / "out")], catch_exceptions=False)
     assert result.exit_code == 0 and "HOTA" in result.output and "switches" in result.output
+    tables = [line for line in result.output.splitlines() if line.startswith(("┃", "│"))]
+    assert tables and max(map(len, tables)) <= 80 and not any("…" in line for line in tables)
+    assert not (tmp_path / "out" / "predictions").exists()
     written = json.loads((tmp_path / "out" / "tracking.json").read_text())
     assert written["classes"]["Car"]["hota"] == pytest.approx(1) and written["frames"] == 12
     assert "| Car |" in (tmp_path / "out" / "tracking.md").read_text()
