@@ -200,8 +200,8 @@ def read_image_set(root: Path, name: str) -> set[str]:
     except OSError as error:
         there = ", ".join(sorted(p.stem for p in path.parent.glob("*.txt"))) or "none"
         raise DatasetError(
-            f"{path}: no such split (lists there: {there}); write the list, one frame id per line, or take every frame: "
-            "--split training; in a configuration data.train_set and data.val_set = training"
+            f"{path}: no such split (lists there: {there}); write the list, one frame id per line, or take every "
+            "frame: --split training; in a configuration data.train_set and data.val_set = training"
         ) from error
     if not frame_ids:
         raise DatasetError(f"{path}: the list is empty; write one frame id per line")
