@@ -96,10 +96,10 @@ def _train(
     config = replace(config, data=replace(config.data, camera_view=view))
     recover(checkpoints, again=True)  # another process may have been killed there since
     resumed, damage = checkpoint_to_resume(checkpoints)
-    config = replace(config, train=_with_settled_precision(config.train, out, resumes=resumed is not None))
+    goes_on = resumed is not None
+    config = replace(config, train=_with_settled_precision(config.train, out, resumes=goes_on))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     # What may be mistyped is looked at before minutes of work, and before the folder is that of this run.
-    goes_on = resumed is not None
     weights = None if goes_on and init is None else initial_weights(config, init)
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
@@ -110,10 +110,10 @@ def _train(
     data = DetectionData(config, data_root)
     claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights))
     say = rank_zero_only(Console(markup=False, highlight=False).print)
-    if damage is not None and resumed is not None:
+    if damage is not None and goes_on:
         say(f"{damage}: going on from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():
-        remedy = "choose auto or fp32" if resumed is None else f"go on where {out} was started, or anew with --init"
+        remedy = f"go on where {out} was started, or anew with --init" if goes_on else "choose auto or fp32"
         say(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
     keep = goes_on or not trainer.is_global_zero  # else it may be of scans that were there before
@@ -131,7 +131,7 @@ def _train(
         # Advice on workers and logging that does not fit two cores and small data.
         warnings.filterwarnings("ignore", category=PossibleUserWarning)
         try:
-            trainer.fit(module, data, ckpt_path=None if resumed is None else str(resumed), weights_only=True)
+            trainer.fit(module, data, ckpt_path=str(resumed) if goes_on else None, weights_only=True)
         finally:  # a run that was stopped has weights to take elsewhere, too
             if trainer.is_global_zero and (checkpoints / LAST).is_file():
                 save_weights(checkpoints / LAST, checkpoints / WEIGHTS)

@@ -64,7 +64,7 @@ class BoxDataset(ScanSettings):
 
 
 class BoxFrame(NamedTuple):
-    """A scan and its labels; `file_` are those of a file for all frames, None where the frame has its own."""
+    """A scan and its labels; records and time of a file for all frames, None where the frame has a file of its own."""
 
     scan: Path
     label_file: Path

@@ -24,8 +24,7 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
     """One reflectance scale for scans that belong together, from `sample` of them, evenly spaced.
 
     A dark scan among brighter ones is then not read on another scale. Scans that cannot be read, or have no points,
-    have no say; where
-    none has reflectances, the scale is auto.
+    have no say; where none has reflectances, the scale is auto.
     """
     chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
     stored = []

@@ -1,7 +1,10 @@
 """Which frame of a dataset each line of predictions belongs to: by the name of its scan's file, or by its time."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
 
 from asca_pillars.data.boxes.box_records import NamedRecords, read_frames
 from asca_pillars.data.boxes.box_split import BoxSplit
@@ -23,9 +26,10 @@ def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedReco
             frame has two lines; no line belongs to a frame.
     """
     known, times = set(split.frame_ids), split.times_s if isinstance(split, BoxSplit) else {}
+    timed_ids, stamps_s = tuple(times), np.array(list(times.values()))
     found: dict[str, NamedRecords] = {}
     for line in read_frames(path):
-        frame_id = _frame_of_line(line, known, times)
+        frame_id = _frame_of_line(line, known, timed_ids, stamps_s)
         if frame_id in found:
             raise DatasetError(f"{line.place}: frame {frame_id} has predictions in {found[frame_id].place}; join them")
         if frame_id is not None:
@@ -38,14 +42,16 @@ def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedReco
     return found
 
 
-def _frame_of_line(line: NamedRecords, known: set[str], times: Mapping[str, float]) -> str | None:
+def _frame_of_line(
+    line: NamedRecords, known: set[str], timed_ids: Sequence[str], stamps_s: NDArray[np.float64]
+) -> str | None:
     is_message = line.time_s is not None and not PurePosixPath(line.scan).suffix
     named = None if is_message else _frame_of_scan(line.scan, known)
     if line.time_s is None:
         return named
-    timed = [frame_id for frame_id, time_s in times.items() if abs(time_s - line.time_s) < _SAME_TIME_S]
+    timed = [timed_ids[int(row)] for row in np.flatnonzero(np.abs(stamps_s - line.time_s) < _SAME_TIME_S)]
     if named is not None:
-        if timed and named in times and named not in timed:
+        if timed and named in timed_ids and named not in timed:
             raise DatasetError(
                 f"{line.place}: {line.scan} names frame {named}, but its time_s {line.time_s:.3f} is that of "
                 f"{timed[0]}; correct one of them, or leave time_s out"
