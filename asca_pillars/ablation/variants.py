@@ -217,56 +217,50 @@ def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Row]) -> list
     return [Run(variant, seed, Path(out) / variant.name / f"seed{seed}") for seed in seeds for variant in variants]
 
 
-def train_runs(
+def finish_runs(
     todo: Sequence[Run],
     config: str,
     data: str | Path,
+    split: str,
     jobs: int,
     overrides: Sequence[str] = (),
     init: Path | None = None,
 ) -> None:
-    """Train what is not trained yet, `jobs` processes at a time that share the cores.
+    """Train and evaluate what is not yet, `jobs` processes at a time that share the cores.
+
+    A run is evaluated as soon as it is trained, so that an interrupted ablation has rows to look at.
 
     Args:
+        split: list of the data to evaluate on.
         overrides: of every run, in the form of `asca train -s`; those of the variant win over them.
         init: weights that every run starts from, see `asca train --init`.
 
     Raises:
-        TrainingError: a training failed; the message names its log.
+        TrainingError: a training or an evaluation failed; the message names its log.
     """
     threads = max(1, default_threads() // jobs)
 
-    def train(run: Run) -> None:
-        settings = (*overrides, *run.variant.overrides, f"train.seed={run.seed}")
-        start = () if init is None else ("--init", str(init))
-        where = ("--data", str(data), "--out", str(run.folder), "--devices", "1", *start)
-        seconds = _asca(run, ("train", config, *where, *(part for text in settings for part in ("-s", text))), threads)
-        with atomic_path(run.trained) as temporary:
-            temporary.write_text(json.dumps({"seconds": round(seconds), "threads": threads}), encoding="utf-8")
-
-    _at_once([run for run in todo if not run.trained.exists()], train, jobs, "Training")
-
-
-def evaluate_runs(todo: Sequence[Run], data: str | Path, split: str, jobs: int) -> None:
-    """Evaluate what is not evaluated yet, on one list of the data.
-
-    Raises:
-        TrainingError: an evaluation failed; the message names its log.
-    """
-    threads = max(1, default_threads() // jobs)
-
-    def evaluate(run: Run) -> None:
-        where = ("--data", str(data), "--split", split, "--out", str(run.evaluated.parent))
+    def finish(run: Run) -> None:
+        if not run.trained.exists():
+            settings = (*overrides, *run.variant.overrides, f"train.seed={run.seed}")
+            start = () if init is None else ("--init", str(init))
+            where = ("--data", str(data), "--out", str(run.folder), "--devices", "1", *start)
+            chosen = [part for text in settings for part in ("-s", text)]
+            seconds = _asca(run, ("train", config, *where, *chosen), threads)
+            with atomic_path(run.trained) as temporary:
+                temporary.write_text(json.dumps({"seconds": round(seconds), "threads": threads}), encoding="utf-8")
+        report = run.evaluated.parent
+        where = ("--data", str(data), "--split", split, "--out", str(report))
         _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
 
-    _at_once([run for run in todo if not run.evaluated.exists()], evaluate, jobs, "Evaluating")
+    _at_once([run for run in todo if not run.evaluated.exists()], finish, jobs)
 
 
-def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int, what: str) -> None:
+def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> None:
     with ThreadPoolExecutor(jobs) as pool:
         waiting = [pool.submit(work, run) for run in todo]
         try:
-            for future in track(waiting, what, disable=not waiting):
+            for future in track(waiting, "Training and evaluating", disable=not waiting):
                 future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -46,7 +46,7 @@ def ablate(
     from rich.markdown import Markdown
 
     from asca_pillars.ablation.ablation_table import read_results, tables
-    from asca_pillars.ablation.variants import evaluate_runs, runs, train_runs
+    from asca_pillars.ablation.variants import finish_runs, runs
     from asca_pillars.commands.ablate_steps import (
         check,
         claim,
@@ -73,8 +73,7 @@ def ablate(
     if any(one.variant.insert != "none" and not one.trained.exists() for one in todo):
         # Once, not by every run that finds nothing there.
         prepare(Path(config), data=data, override=overrides, workers=default_threads())
-    train_runs(todo, config, data, jobs, overrides, init)
-    evaluate_runs(todo, data, base.data.val_set, jobs)
+    finish_runs(todo, config, data, base.data.val_set, jobs, overrides, init)
     console = Console(markup=False)
     speeds = time_variants(todo, family, KittiSplit(data, base.data.val_set), console)
     text = f"{setup(todo, config, data, base.data, jobs)}\n{tables(family, read_results(todo), speeds)}"

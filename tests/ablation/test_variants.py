@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from asca_pillars.ablation import variants
-from asca_pillars.ablation.variants import VARIANTS, Variant, evaluate_runs, runs, train_runs
+from asca_pillars.ablation.variants import VARIANTS, Variant, finish_runs, runs
 from asca_pillars.commands import ablate_steps
 from asca_pillars.commands.ablate import ablate
 from asca_pillars.config import load_config, pillar_spec
@@ -124,15 +124,29 @@ def test_as_many_at_a_time_as_asked_for_share_the_cores(tmp_path: Path, monkeypa
     monkeypatch.setattr(variants, "default_threads", lambda: 6)
     monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
     todo = runs(tmp_path, [0, 1], [VARIANTS["baseline"], VARIANTS["asp_k2"]])
-    train_runs(todo, "tiny.yaml", tmp_path, jobs=2)
-    evaluate_runs(todo, tmp_path, "val", jobs=2)
+    finish_runs(todo, "tiny.yaml", tmp_path, "val", jobs=2)
     assert threads == [3] * 8 and all(one.trained.exists() for one in todo)
+
+
+def test_a_run_is_evaluated_before_the_next_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = []
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        commands.append(command[3])
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+    todo = runs(tmp_path, [0], [VARIANTS["baseline"], VARIANTS["asp_k2"]])
+    todo[1].folder.mkdir(parents=True)
+    todo[1].trained.write_text("{}")  # by an ablation that was stopped before its evaluation
+    finish_runs(todo, "tiny.yaml", tmp_path, "val", jobs=1)
+    assert commands == ["train", "eval", "eval"]
 
 
 def test_a_failed_run_names_its_log(tmp_path: Path) -> None:
     todo = runs(tmp_path / "out", [0], [VARIANTS["baseline"]])
     with pytest.raises(TrainingError, match=r"train\.log: `asca train` of baseline, seed 0 failed: .*nowhere"):
-        train_runs(todo, str(tmp_path / "nowhere.yaml"), tmp_path, jobs=1)  # refused before torch is imported
+        finish_runs(todo, str(tmp_path / "nowhere.yaml"), tmp_path, "val", jobs=1)  # refused before torch is imported
     assert not todo[0].trained.exists()
 
 
