@@ -17,13 +17,14 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from asca_deploy.bundle import WEIGHTS
-from asca_pillars.config import Config, TrainConfig
+from asca_pillars.config import Config, ModelConfig, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import recover
 from asca_pillars.locks import only_writer
 from asca_pillars.models.checkpoint import save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
+from asca_pillars.pillar_config import PillarModel
 from asca_pillars.refine_config import RefineModel
 from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
@@ -104,9 +105,7 @@ def _train(
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
-    trainer = _trainer(
-        config.train, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes
-    )
+    trainer = _trainer(config, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes)
     data = DetectionData(config, data_root)
     claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights))
     say = rank_zero_only(Console(markup=False, highlight=False).print)
@@ -138,6 +137,15 @@ def _train(
     return checkpoints / LAST
 
 
+def syncs_statistics(model: ModelConfig) -> bool:
+    """Whether BatchNorm takes its statistics from all devices; on CPUs torch has no such thing.
+
+    In a step of two stages a device may have too few keypoints or proposals to take part, and the others would wait
+    for its statistics forever. They have thousands of rows each, which statistics of one device's are good enough for.
+    """
+    return torch.cuda.is_available() and isinstance(model, PillarModel)
+
+
 def _with_settled_precision(recipe: TrainConfig, out: Path, *, resumes: bool) -> TrainConfig:
     """`auto` becomes what the run in `out` computes in, so that it goes on exactly, or what suits the device."""
     auto = recipe.precision == "auto"
@@ -146,14 +154,14 @@ def _with_settled_precision(recipe: TrainConfig, out: Path, *, resumes: bool) ->
 
 
 def _trainer(
-    recipe: TrainConfig,
+    config: Config,
     out: Path,
     files: AtomicCheckpointIO,
     saving: list[Checkpoint],
     devices: int | str,
     num_nodes: int,
 ) -> L.Trainer:
-    checkpoints = out / "checkpoints"
+    recipe, checkpoints = config.train, out / "checkpoints"
     callbacks: list[Any] = [
         RunProgress(),
         LearningRateMonitor("step"),
@@ -169,7 +177,7 @@ def _trainer(
             precision="bf16-mixed" if recipe.precision == "bf16" else "32-true",
             gradient_clip_val=recipe.gradient_clip or None,
             num_sanity_val_steps=SANITY_STEPS,
-            sync_batchnorm=torch.cuda.is_available(),  # there is no such thing on a CPU
+            sync_batchnorm=syncs_statistics(config.model),
             use_distributed_sampler=False,
             enable_model_summary=False,
             log_every_n_steps=10,

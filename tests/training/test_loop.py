@@ -25,10 +25,12 @@ from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.trainable import Trainable
 from asca_pillars.pillar_config import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.pillars.pillarize import PillarLimits
+from asca_pillars.pv_rcnn_config import PvRcnnModel
+from asca_pillars.refine_config import RefineModel
 from asca_pillars.schema import to_dict
 from asca_pillars.training.callbacks import TrainingInterruptedError
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
-from asca_pillars.training.loop import train
+from asca_pillars.training.loop import syncs_statistics, train
 from asca_pillars.training.module import DetectionModule
 from tests.scenes import GROUND_Z_M, SPEC, write_dataset
 
@@ -274,3 +276,11 @@ def test_two_processes_train_together(tmp_path: Path) -> None:
     assert run.returncode == 0, run.stderr
     # Eight training frames, two to a batch, two batches at a time, two epochs.
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").steps == 4
+
+
+def test_devices_wait_for_each_other_only_where_all_take_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not syncs_statistics(PillarModel())  # torch has it on GPUs alone
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert syncs_statistics(PillarModel())
+    # A device without keypoints skips a step of two stages, see `PvRcnnDetector.predict`.
+    assert not syncs_statistics(PvRcnnModel()) and not syncs_statistics(RefineModel())
