@@ -1,0 +1,104 @@
+"""Every family computes a step where its weights are; what it leaves on the CPU a GPU refuses."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.config import Config
+from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.models.build import build_model
+from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import Movable, Trainable
+from asca_pillars.pillar_config import PillarModel
+from asca_pillars.training.dataset import Batch, Collate, open_dataset
+from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, VARIANTS, batch, frame, tiny_detector
+from tests.models.second_stage.tiny_refine import opened_config, write_first_stage
+from tests.scenes import SPEC, write_dataset
+from tests.second_device import SecondDevice, move_weights, on_gpu
+from tests.training.test_loop import CONFIG, NETWORK
+
+PILLARS: dict[str, dict[str, Any]] = {
+    **{f"CPA {cpa}": {"cpa": cpa} for cpa in ("none", "paper", "channel", "point")},
+    "sparse neck": {"neck": "sparse"},
+}
+
+
+@pytest.fixture
+def gpu() -> Iterator[SecondDevice]:
+    with SecondDevice() as mode:
+        yield mode
+
+
+def learns_and_detects(detector: Trainable, inputs: Movable, spec: DetectorSpec) -> None:
+    assert isinstance(detector, torch.nn.Module)
+    move_weights(detector)
+    with SecondDevice():
+        there = inputs.to("cuda")
+        detector.train()
+        terms = detector.loss(detector.predict(there), there)
+        assert all(map(on_gpu, terms.values()))
+        total = torch.stack(list(terms.values())).sum()
+    total.backward()
+    with SecondDevice(), torch.inference_mode():
+        detector.eval()
+        assert len(detector.detect(detector.predict(there), spec)) == 2
+
+
+def drawn(config: Config, root: Path) -> Movable:
+    frames = open_dataset(root, config, training=True)
+    found = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
+    assert isinstance(found, Batch)
+    return found.inputs
+
+
+@pytest.mark.parametrize("changes", PILLARS.values(), ids=PILLARS)
+def test_pillars(tmp_path: Path, changes: dict[str, Any]) -> None:
+    model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, **changes))
+    inputs = drawn(dataclasses.replace(CONFIG, model=model), write_dataset(tmp_path, 3))
+    learns_and_detects(build_model(model), inputs, SPEC)
+
+
+def test_a_second_stage(tmp_path: Path) -> None:
+    config = opened_config(write_first_stage(tmp_path / "first.ckpt"))
+    inputs = drawn(config, write_dataset(tmp_path / "data", 3))
+    learns_and_detects(build_model(config.model), inputs, config.model.spec)
+
+
+@pytest.mark.parametrize("changes", [*VARIANTS.values(), EVERYTHING], ids=[*VARIANTS, "everything"])
+def test_pv_rcnn(changes: dict[str, Any]) -> None:
+    detector = tiny_detector(**changes)
+    learns_and_detects(detector, batch(detector, frame(0), frame(1)), detector.model.spec)
+
+
+def test_a_step_with_nothing_to_learn_from() -> None:
+    detector = tiny_detector()
+    empty = dataclasses.replace(frame(0), points=np.empty((0, 4), np.float32))
+    learns_and_detects(detector, batch(detector, empty, empty), detector.model.spec)
+
+
+def test_single_scans() -> None:
+    detector = tiny_detector().eval()
+    move_weights(detector)
+    points = frame(0).points
+    with SecondDevice():
+        ScanDetector(detector, detector.model.spec)(points)
+
+
+@pytest.mark.usefixtures("gpu")
+def test_what_stays_on_the_cpu_is_refused() -> None:
+    there, here = torch.ones(3).to("cuda"), torch.ones(3)
+    assert there.is_cuda and there.device.type == "cuda" and torch.zeros(2, device=there.device).is_cuda
+    assert not there.cpu().is_cuda and not here.is_cuda
+    assert (2 * there + there[torch.tensor([0, 1, 1])] + torch.tensor(1.0)).is_cuda
+    for refused in (lambda: there + here, lambda: there.index_select(0, torch.tensor([0])), there.numpy):
+        with pytest.raises(RuntimeError, match="on the"):
+            refused()
+    detector = tiny_detector()
+    inputs = batch(detector, frame(0), frame(1)).to("cuda")
+    with pytest.raises(RuntimeError, match="on the CPU"):
+        detector.predict(inputs)  # its weights are still there
