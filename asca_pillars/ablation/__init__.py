@@ -1,1 +1,1 @@
-"""Training and comparing the variants of the paper's Table 5."""
+"""Training and comparing the variants of a detector: rows, runs and their table."""

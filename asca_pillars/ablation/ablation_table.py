@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from asca_pillars.ablation.variants import Family, Run
+from asca_pillars.ablation.ablation_runs import Run
+from asca_pillars.ablation.family import Family
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES
 from asca_pillars.evaluation.report import markdown_table
 

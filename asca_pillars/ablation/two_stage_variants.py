@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from asca_pillars.ablation.variants import Family
+from asca_pillars.ablation.family import Family
 from asca_pillars.points.voxel_scan import Deform
 from asca_pillars.pv_rcnn_config import Attention, Gate, PvRcnnModel
 from asca_pillars.schema import to_dict

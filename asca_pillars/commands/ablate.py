@@ -45,8 +45,8 @@ def ablate(
     from rich.console import Console
     from rich.markdown import Markdown
 
+    from asca_pillars.ablation.ablation_runs import finish_runs, runs
     from asca_pillars.ablation.ablation_table import read_results, tables
-    from asca_pillars.ablation.variants import finish_runs, runs
     from asca_pillars.commands.ablate_steps import (
         check,
         claim,

@@ -10,9 +10,11 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from asca_pillars.ablation.ablation_runs import Run
 from asca_pillars.ablation.ablation_table import Speed
+from asca_pillars.ablation.family import Family, Row
+from asca_pillars.ablation.pillar_variants import PILLARS
 from asca_pillars.ablation.two_stage_variants import TWO_STAGE
-from asca_pillars.ablation.variants import PILLARS, Family, Row, Run
 from asca_pillars.config import Config, DataConfig, load_config
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split

@@ -6,7 +6,7 @@ from typing import Any, TextIO
 
 import pytest
 
-from asca_pillars.ablation import variants
+from asca_pillars.ablation import ablation_runs
 from asca_pillars.commands import ablate_steps
 from tests.in_process import run_here
 
@@ -21,6 +21,6 @@ def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
         return done
 
     # Training answers to Ctrl-C, which only a main thread can.
-    monkeypatch.setattr(variants, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
-    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+    monkeypatch.setattr(ablation_runs, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
+    monkeypatch.setattr(ablation_runs, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
     monkeypatch.setattr(ablate_steps, "TIMED_ROUNDS", 2)

@@ -10,15 +10,14 @@ from typing import Any
 import pytest
 import yaml
 
-from asca_pillars.ablation import variants
-from asca_pillars.ablation.variants import VARIANTS, Variant, finish_runs, runs
+from asca_pillars.ablation import ablation_runs
+from asca_pillars.ablation.ablation_runs import finish_runs, runs
+from asca_pillars.ablation.pillar_variants import VARIANTS
 from asca_pillars.commands import ablate_steps
 from asca_pillars.commands.ablate import ablate
 from asca_pillars.config import load_config, pillar_spec
 from asca_pillars.errors import AscaError, ConfigError, TrainingError
-from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
-from asca_pillars.settings import shipped_configs
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -29,26 +28,6 @@ def config(tmp_path: Path) -> str:
     one_epoch = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1))
     path.write_text(yaml.safe_dump(to_dict(one_epoch)))
     return str(path)
-
-
-@pytest.mark.parametrize("variant", VARIANTS.values(), ids=lambda variant: variant.name)
-def test_every_variant_fits_the_shipped_base(variant: Variant) -> None:
-    config = load_config(shipped_configs()["ablation_small"], variant.overrides)
-    assert isinstance(config.model, PillarModel)
-    assert config.model.spec.grid.zones == variant.zones and config.model.network.cpa == variant.cpa
-    assert config.augment.insert.method == variant.insert
-    assert config.model.spec.grid.v_max_m == (0.16 if variant.zones == 1 else 0.32)
-    assert config.model.spec.grid.map == variant.map and config.model.network.neck == variant.neck
-    car, *persons = config.model.spec.classes
-    assert (car.positive_iou, car.negative_iou) == (0.6, 0.45)
-    assert {(spec.positive_iou, spec.negative_iou) for spec in persons} == {variant.person_ious or (0.5, 0.35)}
-    assert config.model.loss.assigner == ("atss" if "atss" in variant.name else "overlap")
-    assert config.model.loss.score_target == ("iou" if "iou_score" in variant.name else "one")
-
-
-def test_a_row_that_says_nothing_of_the_loss_keeps_the_base_configuration_s() -> None:
-    config = load_config("ablation_small", ("model.loss.assigner=atss", *VARIANTS["cpa_channel"].overrides))
-    assert isinstance(config.model, PillarModel) and config.model.loss.assigner == "atss"
 
 
 @pytest.mark.usefixtures("in_turn")
@@ -97,7 +76,7 @@ def test_what_would_end_an_ablation_ends_it_before_anything_is_trained(
     tmp_path: Path, config: str, options: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = write_dataset(tmp_path / "data", 6, val_frames=3)
-    monkeypatch.setattr(variants, "_asca", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr(ablation_runs, "_asca", lambda *_: pytest.fail("too late"))
     given = {"seeds": "0", "variants": "baseline,cpa_channel_lower_ious"} | options
     with pytest.raises(AscaError, match=message):
         ablate(config, data=data, out=tmp_path / "out", **given)
@@ -121,8 +100,8 @@ def test_as_many_at_a_time_as_asked_for_share_the_cores(tmp_path: Path, monkeypa
         together.wait()  # breaks unless two runs are here at once
         return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr(variants, "default_threads", lambda: 6)
-    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+    monkeypatch.setattr(ablation_runs, "default_threads", lambda: 6)
+    monkeypatch.setattr(ablation_runs, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
     todo = runs(tmp_path, [0, 1], [VARIANTS["baseline"], VARIANTS["asp_k2"]])
     finish_runs(todo, "tiny.yaml", tmp_path, "val", jobs=2)
     assert threads == [3] * 8 and all(one.trained.exists() for one in todo)
@@ -135,7 +114,7 @@ def test_a_run_is_evaluated_before_the_next_is_trained(tmp_path: Path, monkeypat
         commands.append(command[3])
         return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr(variants, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+    monkeypatch.setattr(ablation_runs, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
     todo = runs(tmp_path, [0], [VARIANTS["baseline"], VARIANTS["asp_k2"]])
     todo[1].folder.mkdir(parents=True)
     todo[1].trained.write_text("{}")  # by an ablation that was stopped before its evaluation

@@ -1,0 +1,123 @@
+"""The runs of an ablation: trained, evaluated and kept, on equal terms.
+
+Every run is `asca train` with one base configuration and a few overrides, in a process of its own; finished runs are
+kept, so that an interrupted ablation goes on where it stopped.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.progress import track
+
+from asca_pillars.ablation.family import Row
+from asca_pillars.errors import TrainingError
+from asca_pillars.files import atomic_path
+from asca_pillars.system import default_threads
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: a variant with a seed, in a folder of its own."""
+
+    variant: Row
+    seed: int
+    folder: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last one that training wrote."""
+        return self.folder / "checkpoints" / "last.ckpt"
+
+    @property
+    def trained(self) -> Path:
+        """Written when training has ended: how long it took."""
+        return self.folder / "trained.json"
+
+    @property
+    def evaluated(self) -> Path:
+        """The report of `asca eval`."""
+        return self.folder / "evaluation" / "report.json"
+
+
+def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Row]) -> list[Run]:
+    """Every run, all variants of the first seed before those of the next."""
+    return [Run(variant, seed, Path(out) / variant.name / f"seed{seed}") for seed in seeds for variant in variants]
+
+
+def finish_runs(
+    todo: Sequence[Run],
+    config: str,
+    data: str | Path,
+    split: str,
+    jobs: int,
+    overrides: Sequence[str] = (),
+    init: Path | None = None,
+) -> None:
+    """Train and evaluate what is not yet, `jobs` processes at a time that share the cores.
+
+    A run is evaluated as soon as it is trained, so that an interrupted ablation has rows to look at.
+
+    Args:
+        split: list of the data to evaluate on.
+        overrides: of every run, in the form of `asca train -s`; those of the variant win over them.
+        init: weights that every run starts from, see `asca train --init`.
+
+    Raises:
+        TrainingError: a training or an evaluation failed; the message names its log.
+    """
+    threads = max(1, default_threads() // jobs)
+
+    def finish(run: Run) -> None:
+        if not run.trained.exists():
+            settings = (*overrides, *run.variant.overrides, f"train.seed={run.seed}")
+            start = () if init is None else ("--init", str(init))
+            where = ("--data", str(data), "--out", str(run.folder), "--devices", "1", *start)
+            chosen = [part for text in settings for part in ("-s", text)]
+            seconds = _asca(run, ("train", config, *where, *chosen), threads)
+            with atomic_path(run.trained) as temporary:
+                temporary.write_text(json.dumps({"seconds": round(seconds), "threads": threads}), encoding="utf-8")
+        report = run.evaluated.parent
+        where = ("--data", str(data), "--split", split, "--out", str(report))
+        _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
+
+    _at_once([run for run in todo if not run.evaluated.exists()], finish, jobs)
+
+
+def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> None:
+    with ThreadPoolExecutor(jobs) as pool:
+        waiting = [pool.submit(work, run) for run in todo]
+        try:
+            for future in track(waiting, "Training and evaluating", disable=not waiting):
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _asca(run: Run, arguments: Sequence[str], threads: int) -> float:
+    """Run one command as a user would, its output in the run's folder; returns the seconds it took."""
+    run.folder.mkdir(parents=True, exist_ok=True)
+    log = run.folder / f"{arguments[0]}.log"
+    start = time.monotonic()
+    with log.open("a", encoding="utf-8") as file:
+        done = subprocess.run(
+            [sys.executable, "-m", "asca_pillars.cli", *arguments],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            # One thread count for every run: sums of floats depend on it, and so do the weights.
+            env=os.environ | {"OMP_NUM_THREADS": str(threads)},
+            check=False,
+        )
+    if done.returncode:
+        words = log.read_text(encoding="utf-8").split("\n")
+        reason = next((line for line in reversed(words) if line.strip()), "it said nothing")
+        name = f"{run.variant.name}, seed {run.seed}"
+        raise TrainingError(f"{log}: `asca {arguments[0]}` of {name} failed: {reason.removeprefix('asca: ')}")
+    return time.monotonic() - start
