@@ -1,4 +1,4 @@
-"""What boxes have wrong on average, and how much of the AP that costs: as where labels are drawn by another habit.
+"""Systematic errors of boxes, and what they cost in AP: for example, where labels follow another convention.
 
     asca eval --data data/check --out evaluation
     python -m benchmarks.box_errors data/check evaluation --class Pedestrian --score 0.45
@@ -17,6 +17,7 @@ import typer
 from numpy.typing import NDArray
 
 from asca_pillars.commands.run_command import run_command
+from asca_pillars.errors import ConfigError
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.score_threshold import MatchInput, match_class
@@ -37,15 +38,23 @@ def main(
     score: Annotated[float, typer.Option(help="Detections from this score on count.")] = 0.45,
 ) -> None:
     """Print the errors, and the AP as it is and without their medians."""
+    if name not in CLASS_NAMES:
+        raise ConfigError(f"--class {name}: choose one of {', '.join(CLASS_NAMES)}")
     frames = read_evaluation(data, out)
     errors = box_errors(frames, name, score)
+    if not len(errors):
+        raise ConfigError(f"--score {score:g}: no {name} of {out} has this score and covers one that counts; lower it")
     middle = np.median(errors, axis=0)
     spread = np.subtract(*np.quantile(errors, (0.75, 0.25), axis=0)) / 2
     rows = [
         (what, f"{100 * median:+.1f}", f"{100 * half:.1f}")
         for what, median, half in zip((*PLACES, *SIZES), middle, spread, strict=True)
     ]
-    print(markdown_table((f"{name}, {len(errors)} pairs", "median (cm)", "half the quartiles' distance"), rows, left=1))
+    print(
+        markdown_table(
+            (f"{name}, {len(errors)} pairs", "median (cm)", "half the interquartile range (cm)"), rows, left=1
+        )
+    )
     ways = {
         "as they are": np.zeros(6),
         "without the medians of places": middle * (1, 1, 1, 0, 0, 0),
@@ -59,19 +68,14 @@ def main(
 def box_errors(frames: ScoredFrames, name: str, score: float) -> Errors:
     """(N, 6) of the pairs, see `Errors`."""
     inputs = MatchInput.of(frames.truth, frames.detections, CLASS_NAMES, dict.fromkeys(CLASS_NAMES, score), FOUND_IOU)
-    counted, found, truth = (
-        match_class(inputs, name, "moderate", "bev").counted,
-        inputs.frames.detections,
-        inputs.frames.truth,
-    )
+    counted = match_class(inputs, name, "moderate", "bev").counted
+    found, truth = inputs.frames.detections, inputs.frames.truth
     meant = is_type(found, name) & (found.scores >= score)
     pairs = inputs.pairs.where(inputs.pairs.overlaps["bev"] >= FOUND_IOU[name])
     pairs = pairs.where(counted[pairs.truth] & meant[pairs.detection])
     apart = found.locations[pairs.detection] - truth.locations[pairs.truth]
-    along = _sight(truth.locations[pairs.truth])
-    places = np.stack(
-        [(apart[:, ::2] * along).sum(1), (apart[:, ::2] * along[:, ::-1] * (1, -1)).sum(1), apart[:, 1]], 1
-    )
+    farther, right = ((apart[:, ::2] * axis).sum(axis=1) for axis in _axes(truth.locations[pairs.truth]))
+    places = np.stack([farther, right, apart[:, 1]], axis=1)
     return np.concatenate([places, found.dimensions_hwl[pairs.detection] - truth.dimensions_hwl[pairs.truth]], axis=1)
 
 
@@ -85,16 +89,8 @@ def average_precision(frames: ScoredFrames, name: str, taken: Errors) -> Sequenc
 
 def _corrected(found: FrameObjects, name: str, taken: Errors) -> FrameObjects:
     mine = is_type(found, name)[:, None]
-    along = _sight(found.locations)
-    farther, right, lower = taken[:3]
-    moved = np.stack(
-        [
-            along[:, 0] * farther + along[:, 1] * right,
-            np.full(len(found), lower),
-            along[:, 1] * farther - along[:, 0] * right,
-        ],
-        1,
-    )
+    along, across = _axes(found.locations)
+    moved = np.insert(along * taken[0] + across * taken[1], 1, taken[2], axis=1)
     return replace(
         found,
         locations=found.locations - mine * moved,
@@ -102,10 +98,11 @@ def _corrected(found: FrameObjects, name: str, taken: Errors) -> FrameObjects:
     )
 
 
-def _sight(locations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) x and z of the direction in which the camera sees each place (N, 3)."""
+def _axes(locations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """x and z (N, 2) of the direction in which the camera sees each place (N, 3), and of the one to the right of it."""
     ground = locations[:, ::2]
-    return np.asarray(ground / np.linalg.norm(ground, axis=1, keepdims=True))
+    along = np.asarray(ground / np.linalg.norm(ground, axis=1, keepdims=True))
+    return along, along[:, ::-1] * (1, -1)
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ def finish_runs(
         where = ("--data", str(data), "--split", split, "--out", str(report))
         _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
 
-    _at_once([run for run in todo if not run.evaluated.exists()], finish, jobs)
+    _at_once([run for run in todo if not (run.trained.exists() and run.evaluated.exists())], finish, jobs)
 
 
 def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> None:

@@ -141,7 +141,7 @@ def syncs_statistics(model: ModelConfig) -> bool:
     """Whether BatchNorm takes its statistics from all devices; on CPUs torch has no such thing.
 
     In a step of two stages a device may have too few keypoints or proposals to take part, and the others would wait
-    for its statistics forever. They have thousands of rows each, which statistics of one device's are good enough for.
+    for its statistics forever. Each has thousands of rows, which are enough for statistics of its own.
     """
     return torch.cuda.is_available() and isinstance(model, PillarModel)
 

@@ -120,6 +120,13 @@ def test_a_run_is_evaluated_before_the_next_is_trained(tmp_path: Path, monkeypat
     todo[1].trained.write_text("{}")  # by an ablation that was stopped before its evaluation
     finish_runs(todo, "tiny.yaml", tmp_path, "val", jobs=1)
     assert commands == ["train", "eval", "eval"]
+    todo[1].evaluated.parent.mkdir()
+    todo[1].evaluated.write_text("{}")
+    finish_runs(todo[1:], "tiny.yaml", tmp_path, "val", jobs=1)
+    assert len(commands) == 3, "it is finished"
+    todo[1].trained.unlink()  # an evaluation of nobody knows what
+    finish_runs(todo[1:], "tiny.yaml", tmp_path, "val", jobs=1)
+    assert commands[3:] == ["train", "eval"]
 
 
 def test_a_failed_run_names_its_log(tmp_path: Path) -> None:
