@@ -16,10 +16,6 @@ class Row(Protocol):
         """For `asca train -s`."""
 
     @property
-    def insert(self) -> str:
-        """How objects are inserted, see `augment.insert.method`."""
-
-    @property
     def components(self) -> tuple[str, ...]:
         """Cells of the table's first columns."""
 

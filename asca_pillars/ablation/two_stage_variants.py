@@ -34,7 +34,6 @@ class TwoStageVariant:
     scales: bool = False
     box_loss: str = "smooth_l1"
     keypoints: int = _KEYPOINTS
-    insert: str = "none"
 
     @property
     def overrides(self) -> tuple[str, ...]:
@@ -46,7 +45,6 @@ class TwoStageVariant:
             f"model.network.attention={self.attention}",
             f"model.box_loss={self.box_loss}",
             f"model.settings.keypoints={self.keypoints}",
-            f"augment.insert.method={self.insert}",
             *(self._scales if self.scales else ()),
         )
 

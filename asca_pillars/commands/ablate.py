@@ -70,7 +70,8 @@ def ablate(
     todo = runs(out, parse_seeds(seeds), rows)
     check(rows, config, overrides, data, init)
     claim(out, {"config": to_dict(base), "data": str(data)} | ({} if init is None else {"init": str(init)}))
-    if any(one.variant.insert != "none" and not one.trained.exists() for one in todo):
+    waiting = [load_config(config, [*overrides, *one.variant.overrides]) for one in todo if not one.trained.exists()]
+    if any(one.augment.insert.method != "none" for one in waiting):
         # Once, not by every run that finds nothing there.
         prepare(Path(config), data=data, override=overrides, workers=default_threads())
     finish_runs(todo, config, data, base.data.val_set, jobs, overrides, init)
