@@ -9,10 +9,12 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.progress import track
 
@@ -80,9 +82,9 @@ def finish_runs(
             start = () if init is None else ("--init", str(init))
             where = ("--data", str(data), "--out", str(run.folder), "--devices", "1", *start)
             chosen = [part for text in settings for part in ("-s", text)]
-            seconds = _asca(run, ("train", config, *where, *chosen), threads)
-            with atomic_path(run.trained) as temporary:
-                temporary.write_text(json.dumps({"seconds": round(seconds), "threads": threads}), encoding="utf-8")
+            with _timed(run.folder / "training_seconds.json") as seconds:
+                _asca(run, ("train", config, *where, *chosen), threads)
+            _write(run.trained, {"seconds": round(sum(seconds)), "threads": threads})
         report = run.evaluated.parent
         where = ("--data", str(data), "--split", split, "--out", str(report))
         _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
@@ -101,11 +103,31 @@ def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> Non
             raise
 
 
-def _asca(run: Run, arguments: Sequence[str], threads: int) -> float:
-    """Run one command as a user would, its output in the run's folder; returns the seconds it took."""
+@contextmanager
+def _timed(path: Path) -> Iterator[list[float]]:
+    """The seconds of every attempt, that of this one last once it has ended, well or not; kept in a file.
+
+    An attempt that was killed together with this process is not among them.
+    """
+    attempts: list[float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    start = time.monotonic()
+    try:
+        yield attempts
+    finally:
+        attempts.append(time.monotonic() - start)
+        _write(path, attempts)
+
+
+def _write(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _asca(run: Run, arguments: Sequence[str], threads: int) -> None:
+    """Run one command as a user would, its output in the run's folder."""
     run.folder.mkdir(parents=True, exist_ok=True)
     log = run.folder / f"{arguments[0]}.log"
-    start = time.monotonic()
     with log.open("a", encoding="utf-8") as file:
         done = subprocess.run(
             [sys.executable, "-m", "asca_pillars.cli", *arguments],
@@ -120,4 +142,3 @@ def _asca(run: Run, arguments: Sequence[str], threads: int) -> float:
         reason = next((line for line in reversed(words) if line.strip()), "it said nothing")
         name = f"{run.variant.name}, seed {run.seed}"
         raise TrainingError(f"{log}: `asca {arguments[0]}` of {name} failed: {reason.removeprefix('asca: ')}")
-    return time.monotonic() - start

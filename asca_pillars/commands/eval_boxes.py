@@ -104,7 +104,7 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
 def _run(model: Model, split: LabeledSplit, task: BoxTask, console: Console) -> BoxFrames:
     """Run the model and write what it finds: what is scored is read from there, so that it can be scored again."""
     with atomic_directory(task.out / "predictions", COMMAND, MADE_BY) as folder:
-        camera_view = split.has_camera and not task.around
+        camera_view = split.has_camera and model.camera_view
         write_box_predictions(folder / PREDICTIONS, split, model.detect, camera_view=camera_view, console=console)
         about = {"model": model.about, "data": str(split.root), "split": split.name, "files": [PREDICTIONS]}
         write_json(folder / MADE_BY, about)

@@ -71,6 +71,10 @@ class LabeledSplit(Protocol):
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which of the positions (N, 3), metres, frame of `points`, lie where objects are labelled."""
 
+    @property
+    def one_reflectance_scale(self) -> bool:
+        """Whether `stored_points` have one scale for all scans; else reading decides it scan by scan."""
+
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
         """(N, 4) all of the file, perhaps not finite or with a reflectance beyond 0..1."""
 

@@ -1,6 +1,7 @@
 """The ablation's runs: real commands on a few made-up frames, resumable and repeatable."""
 
 import dataclasses
+import json
 import subprocess
 import threading
 from pathlib import Path
@@ -127,6 +128,22 @@ def test_a_run_is_evaluated_before_the_next_is_trained(tmp_path: Path, monkeypat
     todo[1].trained.unlink()  # an evaluation of nobody knows what
     finish_runs(todo[1:], "tiny.yaml", tmp_path, "val", jobs=1)
     assert commands[3:] == ["train", "eval"]
+
+
+def test_the_time_of_a_run_is_that_of_all_its_attempts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter((0.0, 100.0, 500.0, 530.0))
+    ends = iter((1, 0, 0))
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(command, next(ends))
+
+    monkeypatch.setattr(ablation_runs, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
+    monkeypatch.setattr(ablation_runs, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    todo = runs(tmp_path, [0], [VARIANTS["baseline"]])
+    with pytest.raises(TrainingError):
+        finish_runs(todo, "tiny.yaml", tmp_path, "val", jobs=1)
+    finish_runs(todo, "tiny.yaml", tmp_path, "val", jobs=1)
+    assert json.loads(todo[0].trained.read_text())["seconds"] == 130
 
 
 def test_a_failed_run_names_its_log(tmp_path: Path) -> None:

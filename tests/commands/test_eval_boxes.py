@@ -5,11 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from asca_deploy import sample_scan_path
+from asca_deploy import Detections, Detector, sample_scan_path
 from asca_pillars.cli import app
+from asca_pillars.commands.models import Model
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
+from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
@@ -104,6 +107,25 @@ def test_kitti_data_is_scored_too(tmp_path: Path) -> None:
         "Pedestrian": 1,
         "Cyclist": 1,
     }
+
+
+@pytest.mark.parametrize("camera_view", [True, False])
+def test_a_model_gets_the_points_that_it_was_trained_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera_view: bool
+) -> None:
+    root, given = write_dataset(tmp_path / "kitti", 2), []
+    sample = Detector("asca_small_sparse_sim")
+
+    def detect(points: NDArray[np.float32]) -> Detections:
+        given.append(len(points))
+        return sample(points)
+
+    model = Model("any", detect, sample.spec, camera_view, {})
+    monkeypatch.setattr("asca_pillars.commands.eval_boxes.open_model", lambda *_, **__: model)
+    run("--data", root, "--out", tmp_path / "out", "--protocol", "distance")
+    split = KittiSplit(root, "val")
+    assert given == [len(split.points(one, camera_view=camera_view)) for one in split.frame_ids]
+    assert (given == [len(split.points(one, camera_view=False)) for one in split.frame_ids]) is not camera_view
 
 
 def test_what_lies_where_nothing_is_labelled_is_neither_right_nor_wrong(

@@ -90,6 +90,7 @@ class BoxSplit:
     name: str = "training"
 
     pool = "scans"
+    one_reflectance_scale = True
 
     @property
     def has_camera(self) -> bool:

@@ -19,6 +19,7 @@ BOXES_MISSED = 0.02
 POINTS_OUTSIDE = 0.75  # a grid that looks forward loses half of what a sensor sees in a full turn
 POINTS_CUT = 0.2
 SCANS_OVER_MAX_CELLS = 0.05
+REFLECTANCES_CUT = 0.001  # fewer are specks and retroreflectors
 ODD_SCANS = 0.5  # single scans of other sensors look turned: on wide streets and at crossings
 FEWEST_BOXES = 10  # with fewer a share or a mean says nothing
 DIM_REFLECTANCE = 0.1  # the brightest point of all scans; the reflectance was scaled down twice
@@ -142,24 +143,22 @@ def _of_reflectance(scans: ScanFacts, frames: int) -> Iterator[str]:
         yield "reflectance is 0 everywhere; check what exported the scans, the detector uses it"
     elif high < DIM_REFLECTANCE:
         yield f"reflectance reaches {high:.2g} only; store it as 0..1 (was it divided twice?)"
-    if scans.lowest_above_one is None:
-        return
-    if scans.lowest_above_one < 2:
+    *others, (scale, scaled) = scans.reflectance_scales
+    if others:
         yield (
-            f"reflectance reaches {scans.lowest_above_one:.3g} in a scan, which is therefore taken as 0..255 and "
-            "divided by 255; cut it off at 1 in the files"
+            f"reflectance reaches {high:.4g} in {scaled} of {frames} scans, which are divided by {scale:g}; "
+            f"the others are taken as 0..{others[0][0]:g}: store all of them as 0..1"
         )
-    elif high > 255:
-        yield f"reflectance reaches {high:.5g} and is cut off at 255; divide it by its full scale, such as 65535"
-    elif scans.scans_above_one < frames:
+    elif scale > 1:
         yield (
-            f"reflectance reaches {high:.4g} in {scans.scans_above_one} of {frames} scans, which are divided by 255; "
-            "the others are taken as 0..1: store all of them as 0..1"
+            f"reflectance reaches {high:.5g} and is divided by {scale:g} when read: training sees 0 to "
+            f"{min(1, high / scale):.2f}; divide it by its full scale in the files, then no dark scan is taken for one "
+            "of 0..1"
         )
-    else:
+    if scans.above_scale_share > REFLECTANCES_CUT:
         yield (
-            f"reflectance reaches {high:.4g} and is divided by 255 when read: training sees 0 to {high / 255:.2f}; "
-            "divide it by its full scale in the files, then no dark scan is taken for one of 0..1"
+            f"reflectance reaches {high:.4g} and is cut off at {scale:g} in {100 * scans.above_scale_share:.1f} % of "
+            "the points; divide it by its full scale in the files"
         )
 
 

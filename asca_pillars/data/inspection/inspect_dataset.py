@@ -79,8 +79,8 @@ class ScanFacts:
         scans_without_points: those with no point inside the grid.
         outside_share: share of the points seen that lie outside the grid.
         reflectance_stored: lowest and highest in the files.
-        scans_above_one: those whose stored reflectance exceeds 1 and is divided by 255 for it; `lowest_above_one` is
-            the lowest highest value of any of them.
+        reflectance_scales: what reading divides stored reflectances by, and the number of scans of each.
+        above_scale_share: mean share of a scan's points whose reflectance exceeds it and is cut off.
         reflectance: mean reflectance of a scan, in 0..1.
         ground_z_m: height of the ground near the sensor; None where no scan shows it.
         anchor_bottoms_m: lowest and highest bottom of the classes' anchors.
@@ -97,8 +97,8 @@ class ScanFacts:
     scans_without_points: int
     outside_share: float
     reflectance_stored: tuple[float, float]
-    scans_above_one: int
-    lowest_above_one: float | None
+    reflectance_scales: tuple[tuple[float, int], ...]
+    above_scale_share: float
     reflectance: Spread
     ground_z_m: Spread | None
     anchor_bottoms_m: tuple[float, float]
@@ -230,7 +230,6 @@ def _scan_facts(scans: Sequence[ScanMeasure], spec: InspectedSpec) -> ScanFacts:
     points, inside, cells, kind = column["points"], column["inside"].sum(), column["cells"], input_cells(spec)
     highest, ground = column["stored_reflectance_high"], column["ground_z_m"]
     bottoms = [item.z_m - item.height_m / 2 for item in spec.classes]
-    above_one = highest[highest > 1]
     return ScanFacts(
         points=_some(points),
         dropped_points=int(column["dropped"].sum()),
@@ -238,8 +237,8 @@ def _scan_facts(scans: Sequence[ScanMeasure], spec: InspectedSpec) -> ScanFacts:
         scans_without_points=int((column["inside"] == 0).sum()),
         outside_share=_share(points.sum() - inside, points.sum()),
         reflectance_stored=(float(column["stored_reflectance_low"].min()), float(highest.max())),
-        scans_above_one=len(above_one),
-        lowest_above_one=float(above_one.min()) if len(above_one) else None,
+        reflectance_scales=tuple(sorted(Counter(column["reflectance_scale"].tolist()).items())),
+        above_scale_share=float(column["above_scale"].mean()),
         reflectance=_some(column["reflectance"]),
         ground_z_m=_spread(ground[np.isfinite(ground)]),
         anchor_bottoms_m=(min(bottoms), max(bottoms)),

@@ -13,6 +13,7 @@ from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.input_check import FrameDoubt, doubt_frame, ground_z_m
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.scans.scan_reader import decide_scale
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
@@ -38,9 +39,9 @@ class MatchOutcome(IntEnum):
 class ScanMeasure(NamedTuple):
     """A scan as its file has it (stored) and as training sees it, and its pillars or voxels before any limit.
 
-    `inside` counts the points seen inside the grid, `reflectance` is the mean over those seen, in 0..1, and
-    `ground_z_m` is NaN where the ground near the sensor cannot be seen. `crowded` cells have more than max_points,
-    which takes `cut` points away.
+    `inside` counts the points seen inside the grid, `reflectance` is the mean over those seen, in 0..1. Reading divides
+    the stored ones by `reflectance_scale`; the share `above_scale` of them is then cut off. `ground_z_m` is NaN where
+    the ground near the sensor cannot be seen. `crowded` cells have more than max_points, which takes `cut` points away.
     """
 
     points: int
@@ -48,6 +49,8 @@ class ScanMeasure(NamedTuple):
     dropped: int
     stored_reflectance_low: float
     stored_reflectance_high: float
+    reflectance_scale: float
+    above_scale: float
     reflectance: float
     ground_z_m: float
     cells: int
@@ -87,7 +90,9 @@ def measure_frame(
     to_find = replace(frame, labels=np.where(points < data.min_points, IGNORED, frame.labels))
     outcomes, positives = match(to_find, spec, assigner)
     own = frame.labels != IGNORED
-    scan = measure_scan(split.stored_points(frame_id), frame.points, spec)
+    stored = split.stored_points(frame_id)
+    scale = 1.0 if split.one_reflectance_scale else decide_scale(stored[:, 3])[0]
+    scan = measure_scan(stored, frame.points, spec, scale)
     sample = frame.points[:: max(1, len(frame.points) // DOUBT_POINTS)]
     return FrameMeasure(
         types=Counter(split.label_types(frame_id)),
@@ -120,7 +125,9 @@ def match(
     return outcomes, np.bincount(labels[targets.matched], minlength=len(spec.classes))
 
 
-def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: InspectedSpec) -> ScanMeasure:
+def measure_scan(
+    stored: NDArray[np.float32], seen: NDArray[np.float32], spec: InspectedSpec, reflectance_scale: float = 1.0
+) -> ScanMeasure:
     """Measure the points that a file has, (N, 4), and those of them that training sees, (M, 4), in the LiDAR frame."""
     finite = stored[np.isfinite(stored).all(axis=1)]
     ground = ground_z_m(finite)
@@ -133,6 +140,8 @@ def measure_scan(stored: NDArray[np.float32], seen: NDArray[np.float32], spec: I
         dropped=len(stored) - len(finite),
         stored_reflectance_low=float(finite[:, 3].min(initial=0)),
         stored_reflectance_high=float(finite[:, 3].max(initial=0)),
+        reflectance_scale=reflectance_scale,
+        above_scale=float((finite[:, 3] > reflectance_scale).mean()) if len(finite) else 0.0,
         reflectance=float(seen[:, 3].mean(dtype=np.float64)) if len(seen) else 0.0,
         ground_z_m=np.nan if ground is None else ground,
         cells=len(per_cell),

@@ -41,6 +41,7 @@ class KittiSplit:
     name: str = "training"
 
     has_camera = True
+    one_reflectance_scale = False
     mounting = Mounting()
 
     @property

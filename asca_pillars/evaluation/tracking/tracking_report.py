@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from asca_pillars.data.boxes.box_records import NamedRecords
 from asca_pillars.data.boxes.box_split import BoxSplit
@@ -81,8 +82,9 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
     names = about_run.get("classes") or sorted({kind for one in found.values() for kind in one.records.types})
     sequences: dict[str, list[_Frame]] = {}
     labelled: Counter[str] = Counter()
+    numbers: dict[str, int] = {}
     for frame_id in _in_order(split.frame_ids, split.times_s):
-        frame = _frame(split, frame_id, found.get(frame_id), names, about_run.get("ranges_m"))
+        frame = _frame(split, frame_id, found.get(frame_id), names, about_run.get("ranges_m"), numbers)
         labelled.update(frame.types)
         sequences.setdefault(frame_id.rpartition("/")[0], []).append(frame)
     scores = []
@@ -164,22 +166,29 @@ def _of_class(frame: _Frame, name: str) -> TrackedFrame:
 
 
 def _frame(
-    split: BoxSplit, frame_id: str, found: NamedRecords | None, names: Sequence[str], ranges: Any | None
+    split: BoxSplit,
+    frame_id: str,
+    found: NamedRecords | None,
+    names: Sequence[str],
+    ranges: Any | None,
+    numbers: dict[str, int],
 ) -> _Frame:
     records = split.records(frame_id)
     counted = np.array([kind in names for kind in records.types], bool)
     for row, record in enumerate(_label_records(split, frame_id)):
-        counted[row] &= record.get("points", MIN_POINTS) >= MIN_POINTS
-        counted[row] &= record.get("occluded", 0) < UNKNOWN_OCCLUSION
+        counted[row] &= _number(record.get("points"), MIN_POINTS) >= MIN_POINTS
+        counted[row] &= _number(record.get("occluded"), 0) < UNKNOWN_OCCLUSION
     if ranges is not None:
         level = split.labeled_boxes(frame_id).boxes  # ranges are the model's, labels may lie in other axes
         for axis, (low, high) in enumerate(ranges):
             counted &= (level[:, axis] >= low) & (level[:, axis] <= high)
-    labels = Boxes(records.boxes, _ids(records.track_ids, str(split.labels_path)))
+    labels = Boxes(records.boxes, _ids(records.track_ids, str(split.labels_path), numbers))
     if found is None:
-        return _Frame(labels, records.types, counted, Boxes(np.empty((0, 7), np.float32), _ids((), "")), ())
+        return _Frame(labels, records.types, counted, Boxes(np.empty((0, 7), np.float32), np.empty(0, np.int64)), ())
     own = found.records
-    return _Frame(labels, records.types, counted, Boxes(own.boxes, _ids(own.track_ids, found.place)), own.types)
+    return _Frame(
+        labels, records.types, counted, Boxes(own.boxes, _ids(own.track_ids, found.place, numbers)), own.types
+    )
 
 
 def _label_records(split: BoxSplit, frame_id: str) -> list[dict[str, Any]]:
@@ -188,14 +197,19 @@ def _label_records(split: BoxSplit, frame_id: str) -> list[dict[str, Any]]:
     return list(json.loads(path.read_text(encoding="utf-8"))["boxes"]) if path.is_file() else []
 
 
-def _ids(values: Sequence[Any], place: str) -> Any:
-    """Identities (K,) as numbers; other texts than numbers are numbered by their hash."""
+def _number(value: Any, otherwise: float) -> float:
+    """A number that a label states beside its box; others' files may hold anything under the same key."""
+    return value if isinstance(value, int | float) else otherwise
+
+
+def _ids(values: Sequence[Any], place: str, numbers: dict[str, int]) -> NDArray[np.int64]:
+    """Identities (K,) as numbers: those that `numbers` has, and new ones for texts that it has not."""
     if None in values:
         raise DatasetError(f"{place}: a box without `track_id`; write tracks with `asca detect --track`")
     texts = [str(value) for value in values]
     if len(set(texts)) < len(texts):
         raise DatasetError(f"{place}: two boxes of one frame have the same `track_id`")
-    return np.array([int(text) if text.isdecimal() else hash(text) >> 24 for text in texts], np.int64)
+    return np.array([numbers.setdefault(text, len(numbers)) for text in texts], np.int64)
 
 
 def _in_order(frame_ids: Sequence[str], times: Mapping[str, float]) -> list[str]:

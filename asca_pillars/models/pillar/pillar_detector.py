@@ -1,7 +1,8 @@
 """The whole network between pillars and head maps, and its side of training (`models.trainable.Trainable`)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import NamedTuple
 
 import torch
@@ -93,8 +94,16 @@ class PillarDetector(nn.Module):
         return maps
 
     def predict(self, batch: LabeledPillars) -> PillarOutputs:
-        """Head maps (B, channels, H, W) of logits and residuals of B labelled frames, and their cells."""
-        return PillarOutputs(self(batch.pillars), batch.pillars.neck)
+        """Head maps (B, channels, H, W) of logits and residuals of B labelled frames, and their cells.
+
+        Where some normalization would see a single point or cell, those of the training so far are used instead.
+        """
+        pillars, neck = batch.pillars, batch.pillars.neck
+        rows = [len(pillars.features)]
+        if neck is not None:
+            rows += [len(cells) for level in neck.levels for cells in (level.strided_cells, level.cells)]
+        with _running_statistics(self) if self.training and 1 in rows else nullcontext():
+            return PillarOutputs(self(pillars), neck)
 
     def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
         """The terms of eq. (15) by name, unitless scalars, from head maps (B, channels, H, W), see `detection_loss`.
@@ -140,6 +149,23 @@ class PillarDetector(nn.Module):
         row = cells + frame_starts.repeat_interleave(cells.new_tensor(frame_cells))
         canvas = features.new_zeros(frames * rows * columns, channels).index_put((row,), features)
         return as_map(canvas.view(frames, rows, columns, channels))
+
+
+@contextmanager
+def _running_statistics(module: nn.Module) -> Iterator[None]:
+    """Normalize by the statistics of the training so far: a single value per channel has none of its own.
+
+    `SyncBatchNorm` stays as it is: other devices wait for it, and it has their values, too.
+    """
+    norms = [part for part in module.modules() if isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d)]
+    training = [norm for norm in norms if norm.training]
+    for norm in training:
+        norm.eval()
+    try:
+        yield
+    finally:
+        for norm in training:
+            norm.train()
 
 
 def build_pillar_detector(model: PillarModel) -> PillarDetector:

@@ -100,6 +100,18 @@ def test_raw(tmp_path: Path) -> None:
     assert BoxSplit(tmp_path / "out", "train").settings.labeled_view_deg == 81
 
 
+def test_sitting_persons_have_the_name_that_training_and_scores_know(tmp_path: Path) -> None:
+    """The two recordings spell them in other ways than the object benchmark does."""
+    tracking = write_tracking(tmp_path / "tracking")
+    for path in (tracking / "training" / "label_02").iterdir():
+        path.write_text(path.read_text().replace("Van", "Person"))
+    drive = tmp_path / "raw" / "drive"
+    write_scan(drive / "velodyne_points" / "data" / "0000000001.bin")
+    (drive / "tracklet_labels.xml").write_text(TRACKLETS.replace("Van", "Person (sitting)"))
+    for imported in (read_kitti_tracking(tracking), read_kitti_raw(tmp_path / "raw")):
+        assert {kind for frame in imported.frames for kind in frame.records.types} == {"Person_sitting"}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

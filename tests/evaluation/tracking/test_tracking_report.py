@@ -127,6 +127,21 @@ def test_frames_without_times_are_in_natural_order(tmp_path: Path) -> None:
     assert car.clear.identity_switches == 1 and car.clear.mota == pytest.approx(11 / 12)
 
 
+@pytest.mark.parametrize(
+    "change", [{"occluded": "partly"}, {"points": None}, {"track_id": "9" * 20}, {"track_id": "red van"}]
+)
+def test_labels_of_others_may_hold_anything_beside_their_boxes(tmp_path: Path, change: dict[str, Any]) -> None:
+    own = [BOX | {"x_m": 9, "y_m": 0, "track_id": "7"}]
+    root = street(tmp_path / "own", "x-forward", own)
+    label = root / "labels" / "0.json"
+    label.parent.mkdir()
+    label.write_text(json.dumps({"boxes": [own[0] | change]}))
+    settings = root / "dataset.yaml"
+    settings.write_text(settings.read_text().replace("labels.jsonl", "labels"))
+    (car,) = score(root, tmp_path / "out", [{"scan": "0.npy", "boxes": own}]).scores
+    assert car.hota == pytest.approx((1, 1, 1, 1)) and car.clear.labels == 1
+
+
 def test_ranges_are_those_of_the_model_whatever_the_axes(tmp_path: Path) -> None:
     """y-forward: a car 50 m ahead lies at y = 50."""
     own = [BOX | {"x_m": 0, "y_m": 50, "track_id": 1}]

@@ -1,9 +1,12 @@
 """The whole network: Table 1's shapes and sizes, and that a feature cell lies where its anchor stands."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
 
+from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.models.pillar.neck import RPNNeck
 from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
@@ -75,6 +78,25 @@ def test_an_empty_frame_in_a_batch_gives_maps() -> None:
     for cpa in ("none", "paper", "channel", "point"):
         maps = _detector(cpa)(batch_pillars([empty, SPEC.pillarize(_points())]))
         assert torch.isfinite(maps.scores).all() and len(maps.scores) == 2
+
+
+@pytest.mark.parametrize("neck", ["dense", "sparse"])
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_scans_of_a_point_or_a_cell_are_learnt_from(neck: Literal["dense", "sparse"], count: int) -> None:
+    """BatchNorm has no statistics of a single value; a training came to an end at such a scan."""
+    torch.manual_seed(0)
+    detector = build_pillar_detector(PillarModel(spec=SPEC, network=NetworkConfig(neck=neck))).train()
+    points = np.full((count, 4), (10.05, 1.05, -1, 0.5), np.float32)
+    points[:, 0] += np.linspace(0, 0.05, count)
+    nothing = LabeledFrame("0", points, np.empty((0, 7), np.float32), np.empty(0, np.int64))
+    batch = detector.preparation.collate([detector.preparation.prepare(nothing, None)])
+    terms = detector.loss(detector.predict(batch), batch)
+    total = torch.stack(list(terms.values())).sum()
+    total.backward()
+    assert torch.isfinite(total) and all(part.training for part in detector.modules())
+    assert all(weight.grad is None or torch.isfinite(weight.grad).all() for weight in detector.parameters())
+    if count:
+        assert sum(float(weight.grad.abs().sum()) for weight in detector.parameters() if weight.grad is not None) > 0
 
 
 def test_a_frame_does_not_depend_on_its_batch() -> None:
