@@ -20,6 +20,7 @@ from asca_deploy.benchmark import (
     measure_scaling,
     measure_throughput,
 )
+from asca_deploy.benchmark.box_differences import box_difference
 from asca_deploy.benchmark.matrix import ON_THE_CPU
 from asca_pillars.commands import bench_tables as show
 from asca_pillars.errors import ConfigError
@@ -60,9 +61,9 @@ def measure_parts(
     elif detector.provider in ON_THE_CPU:
         # All passes of a scan are in the stage, and the backbone's operations are those of one.
         pass_ms = report.stages_ms["neck+head"].p50 / detector.passes
-        found = measure_roofline(detector.bundle, pass_ms, detector.threads)
-        result["roofline"] = asdict(found)
-        lines.append(show.roofline_line(found))
+        roofline = measure_roofline(detector.bundle, pass_ms, detector.threads)
+        result["roofline"] = asdict(roofline)
+        lines.append(show.roofline_line(roofline))
     console.print(show.stages_table(report))
     for line in (*lines, show.machine_line(report)):
         console.print(line, soft_wrap=True)
@@ -77,8 +78,10 @@ def measure_parts(
     if parts.compare:
         others = {name: _like(detector, folder) for name, folder in list(bundles.items())[1:]}
         compared = compare({next(iter(bundles)): detector} | others, scans, rounds, bar)
-        result["compare"] = asdict(compared)
-        console.print(show.comparison_table(compared))
+        found, *theirs = ([one(points) for points in scans] for one in (detector, *others.values()))
+        boxes = {name: box_difference(found, other) for name, other in zip(others, theirs, strict=True)}
+        result["compare"] = asdict(compared) | {"boxes": {name: asdict(one) for name, one in boxes.items()}}
+        console.print(show.comparison_table(compared, boxes))
     if parts.matrix:
         ways = measure_matrix(bundles, scans, rounds, bar, mounting=detector.mounting)
         result["matrix"] = [asdict(row) | {"way": row.way._asdict()} for row in ways]
@@ -106,10 +109,13 @@ def _like(detector: Detector, folder: Path) -> Detector:
 
 def named_bundles(bundles: Sequence[Path | None]) -> dict[str, Path]:
     """Folders by the names that tables show them by."""
-    folders = [find_bundle(bundle) for bundle in bundles]
+    folders: list[Path] = []
+    for bundle in bundles:
+        folder = find_bundle(bundle)
+        if folder.resolve() in (other.resolve() for other in folders):
+            raise ConfigError(f"--compare {bundle}: a bundle is compared with itself or given twice; name another one")
+        folders.append(folder)
     named = {folder.name: folder for folder in folders}
     if len(named) < len(folders):  # two folders of one name are told apart by their whole path
         named = {str(folder): folder for folder in folders}
-    if len(named) < len(folders):
-        raise ConfigError(f"--compare {bundles[-1]}: a bundle is compared with itself or given twice; name another one")
     return named

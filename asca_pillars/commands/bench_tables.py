@@ -1,6 +1,6 @@
 """What `asca bench` prints: a table or a line for each part of a benchmark."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.table import Table
 
@@ -14,7 +14,10 @@ from asca_deploy.benchmark import (
     ScalingRow,
     Throughput,
 )
+from asca_deploy.benchmark.box_differences import BoxDifference
 from asca_deploy.benchmark.timing import Spread
+
+_BOXES = "boxes: largest difference from the first row's (boxes without a partner)"
 
 
 def stages_table(report: BenchmarkReport) -> Table:
@@ -54,24 +57,24 @@ def roofline_line(found: Roofline) -> str:
     )
 
 
-def comparison_table(found: Comparison) -> Table:
-    """Contestants and how many times as fast as the first they are."""
-    table = _table(f"{found.rounds} rounds in turn", "", "p50 ms", "p95 ms", "FPS", "times as fast")
+def comparison_table(found: Comparison, boxes: Mapping[str, BoxDifference] | None = None) -> Table:
+    """Contestants, how many times as fast as the first they are, and, if known, how far their boxes are from its."""
+    title = "; ".join([f"{found.rounds} rounds in turn", *([_BOXES] if boxes else [])])
+    table = _table(title, "", "p50 ms", "p95 ms", "FPS", "times as fast", *(["boxes"] if boxes else []))
     for one in found.contestants:
-        table.add_row(one.name, *_speed(one))
+        table.add_row(one.name, *_speed(one), *([_apart(boxes[one.name])] if boxes and one.name in boxes else []))
     return table
 
 
 def matrix_table(rows: Sequence[MatrixRow]) -> Table:
     """Every way that runs; see `matrix_reasons` for the others."""
-    title = "Ways to run, in turn; boxes: largest difference from the first row's (boxes without a partner)"
+    title = f"Ways to run, in turn; {_BOXES}"
     columns = ("provider", "precision", "threads", "p50 ms", "FPS", "times as fast", "boxes")
     table = _table(title, "bundle", *columns, names=3)
     for row in rows:
         if row.speed is not None and row.boxes is not None:
             p50_ms, _, fps, speedup = _speed(row.speed)
-            boxes = f"{100 * row.boxes.center_size_m:.1f} cm ({row.boxes.lone})"
-            table.add_row(*row.way[:3], str(row.way.threads), p50_ms, fps, speedup, boxes)
+            table.add_row(*row.way[:3], str(row.way.threads), p50_ms, fps, speedup, _apart(row.boxes))
     return table
 
 
@@ -119,6 +122,10 @@ def _table(title: str, *columns: str, names: int = 1) -> Table:
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index < names else "right")
     return table
+
+
+def _apart(boxes: BoxDifference) -> str:
+    return f"{100 * boxes.center_size_m:.1f} cm ({boxes.lone})"
 
 
 def _speed(one: Contestant) -> tuple[str, str, str, str]:

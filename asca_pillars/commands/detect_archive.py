@@ -20,6 +20,7 @@ from asca_deploy.shipped import find_bundle
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
 from asca_pillars.commands.detect_files import RUN_FILE, RUN_MARK, as_line, scan_content
+from asca_pillars.commands.detect_tables import remark
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions
@@ -137,11 +138,11 @@ def detect_archive(
         require_own(out, "asca detect", RUN_FILE, text=RUN_MARK)
     console = Console(markup=False)
     for line in scan_input.said:
-        console.print(line, style="yellow", soft_wrap=True)
+        remark(console, line)
     job = _job(scan_input.mounting, settings.columns, options, out, score=score, around=around)
     folder = ShardFolder(job.shards)
     wanted = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
-    size = folder.claim(_results_depend_on(job), wanted)
+    size = folder.claim(_results_depend_on(job, scans), wanted)
     shards = cut([(str(path), scan_input.scale(path)) for path in scans], size)
     there = folder.done()
     todo = [shard for shard in shards if shard.name not in there]
@@ -242,9 +243,11 @@ def _job(
     )
 
 
-def _results_depend_on(job: DetectShard) -> dict[str, object]:
-    """Plain values. The reflectance scale of a scan is in its shard's name."""
+def _results_depend_on(job: DetectShard, scans: Sequence[Path]) -> dict[str, object]:
+    """Plain values. Paths of scans, as they were given, and their reflectance scales are in the names of shards."""
+    relative = any(not path.is_absolute() for path in scans)
     return {
+        "working_folder": str(job.start) if relative else None,
         "asca_pillars": package_versions().get("asca-pillars"),
         "bundle_sha256": job.bundle_sha256,
         "provider": job.options.provider,

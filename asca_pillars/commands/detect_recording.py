@@ -1,7 +1,7 @@
 """`asca detect` of a recording: scans of one topic in, boxes with time stamps and identities out."""
 
 import json
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -34,7 +34,7 @@ from asca_pillars.commands.recording_results import (
     said_of_stamps,
     tracked,
 )
-from asca_pillars.commands.rerun_file import RerunFile
+from asca_pillars.commands.rerun_file import RerunFile, require_own_rrd
 from asca_pillars.commands.scan_input import said_of_scale
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.data.mounting import Mounting
@@ -77,8 +77,7 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     require("recordings")
     if task.rerun is not None:
         require("view")
-        if task.rerun.suffix.lower() != ".rrd":
-            raise ConfigError(f"--rerun {task.rerun}: rerun opens .rrd files; choose such a name")
+        require_own_rrd(task.rerun)
     if task.foxglove is not None:
         require_own_file(task.foxglove)
     calibration = None if task.calib is None else read_calibration(task.calib)
@@ -95,7 +94,7 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     if estimate is not None:
         said.append(f"sensor height: {estimate}")
     for line in said:
-        console.print(line, style="yellow", soft_wrap=True)
+        show.remark(console, line)
     births = _thresholds(options.bundle, task.score)
     least = WEAK_SHARE * min(births.values()) if task.track else task.score
     detector = open_detector(options, least, mounting, around=task.around)
@@ -116,9 +115,11 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
         if task.track:
             _check_times(times_ns, task, topic.name, poses, console)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
-        _write(task, results, scans, calibration, about)
+        count, classes = _write(task, results, scans, calibration, about)
         journal.remove()
-    _tell(task, run, detector, seconds, console)
+    boxes = ", ".join(f"{classes[name]} {name}" for name in detector.spec.class_names)
+    console.print(f"{count} scans, in all {boxes}", highlight=False)
+    _tell(task, run, seconds, console)
     if told := [*sorted(filter(None, damages)), *run.skipped()]:
         raise ScanError("; ".join(told))
 
@@ -182,15 +183,16 @@ class _Run:
 
 
 def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
-    """The score of each class from which on a detection begins a track."""
+    """The score of each class from which on a detection begins a track; ConfigError if it is none."""
     spec = load_any_bundle(find_bundle(bundle)).spec
-    return {one.name: one.score_threshold if score is None else score for one in spec.classes}
+    spec = spec if score is None else spec.with_score_threshold(score)
+    return {one.name: one.score_threshold for one in spec.classes}
 
 
 def _check_times(times: Sequence[int], task: RecordingTask, topic: str, poses: Poses | None, console: Console) -> None:
     """Say that stamps are out of order or the odometry is too short; ScanError if it is of another time."""
     if stamps := said_of_stamps(times):
-        console.print(f"{task.path}, {topic}: {stamps}", style="yellow", soft_wrap=True)
+        show.remark(console, f"{task.path}, {topic}: {stamps}")
     if poses is None:
         return
     outside = [time for time in times if not poses.covers(time)]
@@ -201,7 +203,7 @@ def _check_times(times: Sequence[int], task: RecordingTask, topic: str, poses: P
     said = f"{task.path}, {task.odometry}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {share}"
     if len(outside) == len(times):
         raise ScanError(f"{said} are at other times, as of another clock; leave --odometry out")
-    console.print(f"{said} lie outside, with wrong velocities over ground", style="yellow", soft_wrap=True)
+    show.remark(console, f"{said} lie outside, with wrong velocities over ground")
 
 
 def _about(
@@ -243,9 +245,11 @@ def _write(
     scans: RecordedScans,
     calibration: Any,
     about: dict[str, Any],
-) -> None:
-    """All files, none of which appears before all are complete."""
+) -> tuple[int, Counter[str]]:
+    """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
     with ExitStack() as places, ExitStack() as handles:
+        place = places.enter_context(atomic_path(task.out / ABOUT_FILE))
+        place.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")
         text = places.enter_context(atomic_path(task.out / RUN_FILE))
         files: list[ResultFile] = [JsonLines(open_text(handles, text), task.path.name)]
         if calibration is not None:
@@ -260,22 +264,22 @@ def _write(
             rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
             handles.callback(rerun.finish)
             files.append(rerun)
-        with atomic_path(task.out / ABOUT_FILE) as temporary:
-            temporary.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")
+        count = 0
+        classes: Counter[str] = Counter()
         for found in results:
+            count += 1
+            classes.update(found.detections.names)
             for file in files:
                 file.write(found)
         handles.close()  # before the names are changed
+    return count, classes
 
 
-def _tell(task: RecordingTask, run: _Run, detector: Detector, seconds: float, console: Console) -> None:
+def _tell(task: RecordingTask, run: _Run, seconds: float, console: Console) -> None:
     if run.kept:
-        labels = np.concatenate([one.labels for one in run.kept])
-        counts = np.bincount(labels, minlength=len(detector.spec.class_names))
-        found = ", ".join(f"{count} {name}" for count, name in zip(counts, detector.spec.class_names, strict=True))
-        console.print(f"{len(run.kept)} scans, in all {found}; {1e3 * seconds / len(run.kept):.1f} ms of CPU per scan")
+        console.print(f"{1e3 * seconds / len(run.kept):.1f} ms of CPU per scan")
         for line in show.notes(run.kept):
-            console.print(line, style="yellow", soft_wrap=True)
+            show.remark(console, line)
     written = [task.out / RUN_FILE, *(path for path in (task.foxglove, task.rerun) if path is not None)]
     if task.calib is not None:
         written.insert(1, task.out / KITTI_FILE)

@@ -11,7 +11,7 @@ from asca_pillars.commands import detect_tables as show
 from asca_pillars.commands.detect_files import ResultWriter
 from asca_pillars.commands.scan_input import ScanInput
 from asca_pillars.data.scans.find_scans import NamedScan
-from asca_pillars.errors import ScanError
+from asca_pillars.errors import ScanError, printable
 
 TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
 
@@ -46,7 +46,7 @@ def detect_scans(
                 if len(named) == 1:
                     raise
                 unreadable += 1
-                print(f"asca: {error}", file=sys.stderr)
+                print(f"asca: {printable(str(error))}", file=sys.stderr)
                 continue
             results.append(show.Result(path, scan.notes, detections.labels, detections.report))
             write(path, name, scan, detections)
@@ -54,7 +54,7 @@ def detect_scans(
         raise ScanError(f"none of the {len(named)} scans can be read")
     console.print(show.boxes(path, detections) if len(named) == 1 else show.scans(results, detector.spec.class_names))
     for line in (*scan_input.said, *show.notes(results), *write.remarks[:1]):
-        console.print(line, style="yellow", soft_wrap=True)
+        show.remark(console, line)
     reports = [result.report for result in results]
     while len(reports) < TIMED_FRAMES:
         reports.append(detector(scan.points).report)

@@ -9,10 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 from rich.table import Table
 
 from asca_deploy import Detections, Detector, FrameReport
 from asca_pillars.data.scans.scan_reader import ScanNotes
+from asca_pillars.errors import printable
 
 _NUMBER = re.compile(r"\d[\d.,]*")
 
@@ -24,6 +26,11 @@ class Result(NamedTuple):
     notes: ScanNotes
     labels: NDArray[np.int64]
     report: FrameReport
+
+
+def remark(console: Console, text: str) -> None:
+    """Print a line that the user is to notice; it may quote names of files and topics."""
+    console.print(printable(text), style="yellow", soft_wrap=True)
 
 
 def boxes(path: Path, detections: Detections) -> Table:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol
 
@@ -14,6 +15,9 @@ from asca_deploy.tracker import MAX_SCAN_GAP_S, Tracker
 from asca_deploy.tracks import Tracks
 from asca_pillars.commands.recording_journal import Journal
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
+from asca_pillars.geometry.frame_change import FrameChange
+
+_MIRROR = FrameChange(np.diag([1.0, -1.0, 1.0]), np.zeros(3))
 
 
 class Found(NamedTuple):
@@ -55,10 +59,20 @@ def tracked(
     results = list(found)
     for index in tracking_order([one.time_ns for one in results]):
         one = results[index]
-        pose = None if pose_at is None else pose_at(one.time_ns)
-        tracks = tracker(one.detections, one.time_ns * 1e-9, pose)
+        tracks = _track(tracker, one, None if pose_at is None else pose_at(one.time_ns))
         results[index] = one._replace(detections=tracks.detections, tracks=tracks)
     yield from results
+
+
+def _track(tracker: Tracker, found: Found, pose: NDArray[np.float64] | None) -> Tracks:
+    """The next scan; if its frame is a mirror image, so that its pose is none of a body, its own mirror image."""
+    time_s = found.time_ns * 1e-9
+    if pose is None or np.linalg.det(pose[:3, :3]) > 0:
+        return tracker(found.detections, time_s, pose)
+    boxes = _MIRROR.boxes(found.detections.boxes)
+    tracks = tracker(replace(found.detections, boxes=boxes), time_s, pose @ np.diag([1.0, -1.0, 1.0, 1.0]))
+    detections = replace(tracks.detections, boxes=_MIRROR.boxes(tracks.detections.boxes))
+    return Tracks(detections, tracks.track_ids, tracks.velocities_mps @ _MIRROR.axes[:2, :2])
 
 
 def tracking_order(times_ns: Sequence[int]) -> list[int]:

@@ -1,5 +1,6 @@
 """Scans and boxes as a file that the rerun viewer opens: `rerun out.rrd`."""
 
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,28 @@ from numpy.typing import NDArray
 
 from asca_pillars.commands.recording_results import Found
 from asca_pillars.data.recordings.recorded_scans import RecordedScan
+from asca_pillars.errors import ConfigError, OutputError
 
 MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
 TIMELINE = "time"
+APPLICATION = "asca-pillars"
+_HEAD_BYTES = 4096  # of a file, among which the application's name is
+_FLUSH_S = 60.0
+
+
+def require_own_rrd(path: Path) -> None:
+    """Make sure that no recording of others is replaced: OutputError unless `path` is free or an earlier output."""
+    if path.suffix.lower() != ".rrd":
+        raise ConfigError(f"--rerun {path}: rerun opens .rrd files; choose such a name")
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+        if APPLICATION.encode() not in head:
+            raise OutputError(f"{path}: `asca detect` did not write it and would replace it; choose another name")
 
 
 class RerunFile:
-    """Writes an .rrd: `scan` the points, gray by reflectance, `boxes` what was found.
+    """Writes an .rrd: `scan` the points, gray by reflectance, `boxes` what was found. OSError if it cannot.
 
     Args:
         path: to write to.
@@ -26,8 +42,9 @@ class RerunFile:
         import rerun as rr
 
         self._rr, self._scans = rr, scans
-        self._stream = rr.RecordingStream("asca-pillars")
+        self._stream = rr.RecordingStream(APPLICATION)
         self._stream.save(path)
+        self._failed = False
 
     def write(self, found: Found) -> None:
         """One scan with its boxes."""
@@ -38,11 +55,21 @@ class RerunFile:
         gray = (np.clip(0.2 + shown[:, 3], 0, 1) * 255).astype(np.uint8)
         stream.log("scan", rr.Points3D(shown[:, :3], colors=np.repeat(gray[:, None], 3, axis=1), radii=0.03))
         stream.log("boxes", self._boxes(found))
+        self._flush()
 
     def finish(self) -> None:
         """Write what is still in memory."""
-        self._stream.flush()
-        self._stream.disconnect()
+        if not self._failed:
+            self._flush()
+            self._stream.disconnect()
+
+    def _flush(self) -> None:
+        """After each scan: once its writer has failed, rerun says so here, and waits forever anywhere else."""
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_S)
+        except RuntimeError as error:
+            self._failed = True
+            raise OSError(errno.EIO, f"rerun cannot write ({error}); is the disk full?") from None
 
     def _boxes(self, found: Found) -> Any:
         rr, boxes = self._rr, found.detections.boxes

@@ -35,11 +35,11 @@ def test_a_damaged_scan_is_named_and_the_others_are_detected(
 ) -> None:
     for name in ("1.bin", "3.bin"):
         write_scan(tmp_path / "mix" / name, POINTS)
-    (tmp_path / "mix" / "2.bin").write_bytes(b"torn")
+    (tmp_path / "mix" / "\x1b[31m\n2.bin").write_bytes(b"torn")
     with pytest.raises(ScanError, match=r"1 of 3 scans could not be read"):
         detect([tmp_path / "mix"], out=tmp_path / "out", threads=1, pictures=False)
     captured = capsys.readouterr()
-    assert "2.bin: 4 bytes" in captured.err and "3.bin" in captured.out
+    assert r"\x1b[31m\n2.bin: 4 bytes" in captured.err and "3.bin" in captured.out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "3.json", "detections.jsonl"}
 
 

@@ -115,6 +115,20 @@ def test_an_archive_may_grow(scans: Path, bundle: Path, here: Here, tmp_path: Pa
     assert len((tmp_path / "out" / "detections.jsonl").read_text().splitlines()) == SCANS
 
 
+def test_scans_of_the_same_names_below_another_folder_are_others(
+    scans: Path, bundle: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for day in ("monday", "tuesday"):
+        shutil.copytree(scans, tmp_path / day / "scans")
+    monkeypatch.chdir(tmp_path / "monday")
+    run(Path("scans"), tmp_path / "out", bundle)
+    run(Path("scans"), tmp_path / "out", bundle)
+    assert len(here.begun) == 3
+    monkeypatch.chdir(tmp_path / "tuesday")
+    with pytest.raises(OutputError, match=r"working_folder = .*monday, now .*tuesday; choose another folder"):
+        detect([Path("scans")], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
+
+
 def test_another_run_is_refused(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
     run(scans, tmp_path / "out", bundle)
     with pytest.raises(OutputError, match=r"score = None, now 0\.3; choose another folder"):

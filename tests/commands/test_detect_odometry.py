@@ -26,6 +26,16 @@ def test_with_odometry_what_stands_still_has_no_speed(tmp_path: Path, capsys: py
     lines = run(path, tmp_path / "out", track=True, odometry="/odom")
     speeds = [np.hypot(box["vx_mps"], box["vy_mps"]) for box in lines[-1]["boxes"] if box["class"] == "Car"]
     assert len(speeds) >= 3 and np.median(speeds) < 1
+    mirror = np.array([1, -1, 1, 1], np.float32)
+    mirrored = [
+        (time_ns, laid_out((POINTS - np.array([0.5 * i, 0, 0, 0], np.float32)) * mirror, time_ns=time_ns))
+        for i, time_ns in enumerate(stamps(SCANS))
+    ]
+    path_mirrored = write_mcap(tmp_path / "mirrored.mcap", {"/lidar": mirrored}, odometry=poses)
+    seen = run(path_mirrored, tmp_path / "mirrored", track=True, odometry="/odom", axes="x,-y,z")
+    for key, sign in (("x_m", 1), ("y_m", -1), ("vx_mps", 1), ("vy_mps", -1), ("track_id", 1)):
+        expected = [sign * box[key] for box in lines[-1]["boxes"]]
+        assert [box[key] for box in seen[-1]["boxes"]] == pytest.approx(expected, abs=1e-3)
     late = [(time_ns + 37 * 10**9, odometry_message(time_ns + 37 * 10**9, 0.0)) for time_ns in stamps(SCANS)]
     other = write_mcap(tmp_path / "other.mcap", {"/lidar": messages}, odometry=late)
     with pytest.raises(ScanError, match=r"from \+37.0 to \+37.4 s of the first scan; 5 of 5 scans are at other times"):

@@ -41,15 +41,18 @@ def test_all_parts_are_printed_and_written(tiny_bundle: Path, bundle_copy: Path,
     assert 0 < report["outside_share"] < 1
     assert report["roofline"]["gemm_gmac_s"] == {"float32": 100, "int8": 100}
     assert [one["name"] for one in report["compare"]["contestants"]] == ["tiny", "other"]
+    assert report["compare"]["boxes"]["other"]["lone"] == 0, "it is a copy"
+    assert report["compare"]["boxes"]["other"]["pairs"] > 0 and "without a partner" in result.output
     assert {row["way"]["bundle"] for row in report["matrix"]} == {"tiny", "other"}
     assert len(report["scaling"]) > 1 and report["stream"]["stream_fps"] > 0
 
 
-def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path) -> None:
-    with pytest.raises(ConfigError, match="compared with itself"):
-        CliRunner().invoke(
-            app, ["bench", "-b", str(tiny_bundle), "--compare", str(tiny_bundle)], catch_exceptions=False
-        )
+def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tiny_bundle.parent)
+    for others in ([tiny_bundle], [Path(tiny_bundle.name), "asca_sim"]):
+        options = [part for other in others for part in ("--compare", str(other))]
+        with pytest.raises(ConfigError, match=f"--compare {others[0]}: a bundle is compared with itself"):
+            CliRunner().invoke(app, ["bench", "-b", str(tiny_bundle), *options], catch_exceptions=False)
 
 
 def test_a_bundle_to_compare_with_is_looked_at_first(

@@ -10,13 +10,13 @@ from asca_pillars.data.scans.find_scans import is_scan, natural_order
 from asca_pillars.errors import ScanError
 
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
-METADATA_FILE = "metadata.yaml"
+METADATA_FILE, METADATA_KEY = "metadata.yaml", "rosbag2_bagfile_information"
 
 
 def is_recording(path: Path) -> bool:
     """Whether it is a recording by its name: a file, or a folder with the metadata.yaml or the files of rosbag2."""
     if path.is_dir():
-        return (path / METADATA_FILE).is_file() or bool(_files(path))
+        return _has_metadata(path) or bool(_files(path))
     return path.suffix.lower() in RECORDING_SUFFIXES
 
 
@@ -38,7 +38,7 @@ def open_recording(path: Path) -> Recording:
         raise ScanError(f"{path}: no such file or folder; check the path")
     if path.is_dir():
         files = _files(path)
-        if not (path / METADATA_FILE).is_file():
+        if not _has_metadata(path):
             if scan := next((file for file in sorted(path.iterdir()) if is_scan(Path(file.name))), None):
                 raise ScanError(f"{path}: holds {files[0].name} and scans such as {scan.name}; give one or the other")
             if len(files) == 1:
@@ -52,6 +52,12 @@ def open_recording(path: Path) -> Recording:
     if path.stat().st_size == 0:
         raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
     return McapRecording(path, [path]) if path.suffix.lower() == ".mcap" else RosBag(path)
+
+
+def _has_metadata(folder: Path) -> bool:
+    """Whether there is rosbag2's metadata.yaml; others use that name, too."""
+    path = folder / METADATA_FILE
+    return path.is_file() and METADATA_KEY in path.read_text(encoding="utf-8", errors="replace")
 
 
 def _is_compressed(metadata: Path) -> bool:

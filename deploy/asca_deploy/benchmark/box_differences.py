@@ -27,10 +27,10 @@ def box_difference(expected: Sequence[Detections], found: Sequence[Detections]) 
     pairs = lone = 0
     largest_m = largest_score = 0.0
     for ours, theirs in zip(expected, found, strict=True):
-        free = np.ones(len(theirs), bool)
-        for box, score, label in zip(ours.boxes, ours.scores, ours.labels, strict=True):
+        free, names = np.ones(len(theirs), bool), np.array(theirs.names, dtype=str)
+        for box, score, name in zip(ours.boxes, ours.scores, ours.names, strict=True):
             distances = np.linalg.norm(theirs.boxes[:, :3] - box[:3], axis=1)
-            distances[~free | (theirs.labels != label)] = np.inf
+            distances[~free | (names != name)] = np.inf
             if distances.min(initial=np.inf) > SAME_OBJECT_M:
                 lone += 1
                 continue

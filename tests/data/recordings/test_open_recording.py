@@ -57,6 +57,12 @@ def test_a_recording_among_scans_is_refused(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
+def test_a_metadata_yaml_of_others_makes_no_recording(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", cloud_points(0))
+    (tmp_path / "metadata.yaml").write_text("weather: rain\n")
+    assert not is_recording(tmp_path)
+
+
 def test_a_suffix_in_capitals(tmp_path: Path) -> None:
     path = tmp_path / "DRIVE.BAG"
     write_recording(tmp_path / "drive.bag", iter([(stamps(1)[0], cloud_points(0))]))
