@@ -37,6 +37,10 @@ class ClusterError(AscaError):
     """A cluster that cannot be reached, or whose machines are not set up alike."""
 
 
+class WorkerError(AscaError):
+    """A process that shared the work was killed."""
+
+
 class TrainingError(AscaError):
     """A training run that cannot start or must not go on."""
 

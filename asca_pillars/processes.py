@@ -10,11 +10,14 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.progress import track
 
+from asca_pillars.errors import WorkerError
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # How many threads linear algebra, OpenCV and PyTorch use.
 _THREADS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OMP_NUM_THREADS")
+_LOOK_AGAIN_S = 1.0
 _job: Callable[[Any], Any] | None = None
 
 
@@ -41,17 +44,36 @@ def in_processes(
 
     Raises:
         Exception: that of the job.
+        WorkerError: a process was killed.
     """
     workers = min(workers, math.ceil(len(todo) / at_once))
     with contextlib.ExitStack() as stack:
         if workers > 1:
             stack.enter_context(_one_thread_per_process())
+            others = {process.pid for process in multiprocessing.active_children()}
             # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
             pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(workers, _take_job, (job,)))
-            results: Iterator[Result] = pool.imap(_do_job, todo, at_once)
+            own = {process.pid for process in multiprocessing.active_children()} - others
+            shares = (todo[first : first + at_once] for first in range(0, len(todo), at_once))
+            results = _while_all_live(pool.imap(_do_job, shares), own)
         else:
             results = map(job, todo)
         yield from track(results, title, total=len(todo), console=console, disable=not progress)
+
+
+def _while_all_live(shares: Any, processes: set[int | None]) -> Iterator[Any]:
+    """The results of `pool.imap`, which waits forever for those of a process that was killed."""
+    while True:
+        try:
+            yield from shares.next(timeout=_LOOK_AGAIN_S)
+        except StopIteration:
+            return
+        except multiprocessing.TimeoutError:
+            if dead := processes - {process.pid for process in multiprocessing.active_children()}:
+                raise WorkerError(
+                    f"{len(dead)} of {len(processes)} worker processes were killed, perhaps for want of memory; "
+                    "use fewer workers"
+                ) from None
 
 
 def _take_job(job: Callable[[Any], Any]) -> None:
@@ -60,9 +82,9 @@ def _take_job(job: Callable[[Any], Any]) -> None:
     _job = job
 
 
-def _do_job(item: Any) -> Any:
+def _do_job(items: Sequence[Any]) -> list[Any]:
     assert _job is not None
-    return _job(item)
+    return [_job(item) for item in items]
 
 
 @contextlib.contextmanager

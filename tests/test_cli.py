@@ -212,6 +212,12 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     exported = run_here(*export, "--score", "Pedestrian=0.21", "--with-weights")
     assert exported.returncode == 0, exported.stderr
     assert (bundle / "weights.ckpt").read_bytes() == (run / "checkpoints" / "weights.ckpt").read_bytes()
+    shutil.copytree(bundle, tmp_path / "torn")
+    with (tmp_path / "torn" / "weights.ckpt").open("r+b") as file:
+        file.seek(3000)
+        file.write(b"bits")
+    torn = run_here("export", tmp_path / "torn", "-o", tmp_path / "of_torn", "--scans", scans)
+    assert "weights.ckpt: is damaged, or of another bundle" in refusal(torn)
     golden = ("export", bundle, "--golden", "-o", tmp_path / "golden")
     assert run_here(*golden).returncode == 0
     assert "--with-weights is for a checkpoint" in refusal(run_here(*golden, "--with-weights"))

@@ -1,6 +1,7 @@
 """Jobs in processes: the results of one process, in its order, whatever their number."""
 
 import os
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from asca_pillars.errors import DatasetError
+from asca_pillars.errors import DatasetError, WorkerError
 from asca_pillars.processes import in_processes
 
 
@@ -46,6 +47,19 @@ def test_the_error_of_a_job_is_raised(workers: int) -> None:
     assert next(results)[0] == 9
     with pytest.raises(DatasetError, match="-1: is negative"):
         next(results)
+
+
+def killed(number: int) -> int:
+    if number == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_a_process_that_is_killed_ends_the_work() -> None:
+    """The kernel does that where memory runs out; the pool of the standard library then waits forever."""
+    results = in_processes(killed, range(40), 2, "Killed", progress=False)
+    with pytest.raises(WorkerError, match=r"1 of 2 worker processes were killed, .*; use fewer workers"):
+        list(results)
 
 
 def test_the_job_is_sent_once(tmp_path: Path) -> None:

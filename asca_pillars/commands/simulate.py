@@ -108,6 +108,8 @@ def simulate(
         require("cluster")
     from rich.console import Console
 
+    from asca_pillars.commands.models import open_model
+    from asca_pillars.commands.options import RuntimeOptions
     from asca_pillars.data.kitti import KittiSplit
     from asca_pillars.errors import ConfigError
     from asca_pillars.files import require_own
@@ -120,6 +122,8 @@ def simulate(
         raise ConfigError(f"--length {length} is for drives: give --sequences N, too, or --frames N for single scans")
     if like is not None:
         KittiSplit(like).frame_ids  # noqa: B018 - a wrong folder is named before the work
+    if bundle is not None:
+        open_model(RuntimeOptions(bundle=bundle), 0.0)  # and so is a wrong bundle
     console = Console(markup=False)
     settings = load_simulation_config(config, view)
     if sequences is not None:

@@ -22,6 +22,9 @@ KERNELS = "asca_pillars.geometry.nms_kernels"
 _NMS_BLOCK = 64
 
 
+LEAST_LOGIT = -1e3
+"""Of anything that can be reported: a score of 0 in every type. Cells that a masked neck never looks at lie below."""
+
 MOST = 2**31 - 1
 """Of anything that is counted in settings: what an index of 32 bits can name."""
 
@@ -241,7 +244,7 @@ def _labels(anchor: NDArray[np.int64], row: NDArray[np.int64], labels: NDArray[n
 
 def _logit(probability: float) -> float:
     if probability <= 0:
-        return -math.inf
+        return LEAST_LOGIT
     return math.inf if probability >= 1 else math.log(probability / (1 - probability))
 
 

@@ -15,17 +15,20 @@ _Integers = NDArray[np.int64]
 _Masks = NDArray[np.uint64]
 
 _ONE, _SHAPE = np.uint64(1), types.UniTuple(types.int64, 3)
-_EDGES = (given(types.float32),) * 3
+_EDGES = (*(given(types.float32),) * 3, given(types.int64))
 
 
 @compiled(given(types.float32, 2), *_EDGES, _SHAPE, written(types.int64))
 def cells_of_points(
-    points: _Floats, lows_m: _Floats, highs_m: _Floats, sizes_m: _Floats, shape: Shape, cells: _Integers
+    points: _Floats,
+    lows_m: _Floats,
+    highs_m: _Floats,
+    sizes_m: _Floats,
+    last: _Integers,
+    shape: Shape,
+    cells: _Integers,
 ) -> None:
     """`voxels._cells_of_points`: (M, >=3) in metres -> flat indices (M,)."""
-    last = np.empty(3, np.int64)
-    for axis in range(3):
-        last[axis] = int(np.rint((highs_m[axis] - lows_m[axis]) / sizes_m[axis])) - 1
     for i in range(len(points)):
         cells[i] = -1
         if (

@@ -15,6 +15,7 @@ from asca_pillars.tables.cell_map import MAX_Z_CELLS, CellMap
 from asca_pillars.tables.convolution import Shape
 
 KERNELS = "asca_pillars.tables.voxel_kernels"
+_TOLERANCE = 1e-2  # of a number of voxels: room for float dust and for sizes written with few digits
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class VoxelGrid(Strict):
             if not (math.isfinite(size) and size > 0):
                 raise ConfigError(f"size_m: {size:g} along {name} must be a positive size in metres")
             cells = (high - low) / size
-            if round(cells) < 1 or abs(cells - round(cells)) > 1e-4 * cells:
+            if round(cells) < 1 or abs(cells - round(cells)) > _TOLERANCE:
                 nearest = (high - low) / max(round(cells), 1)
                 raise ConfigError(
                     f"{name}_range_m [{low:g}, {high:g}] is not a whole number of voxels of {size:g} m; "
@@ -102,11 +103,13 @@ class VoxelGrid(Strict):
         points = np.require(points, np.float32, ["C", "ALIGNED"])
         lows_m, highs_m = (np.array(ends, np.float32) for ends in zip(*self.ranges_m, strict=True))
         sizes_m = np.array(self.size_m, np.float32)
+        z, y, x = self.shape
+        last = np.array([x, y, z - self.empty_layers]) - 1
         kernels = load_kernels(KERNELS)
         if kernels is None:
-            return _cells_of_points(points[:, :3], lows_m, highs_m, sizes_m, self.shape)
+            return _cells_of_points(points[:, :3], lows_m, highs_m, sizes_m, last, self.shape)
         cells = np.empty(len(points), np.int64)
-        kernels.cells_of_points(points, lows_m, highs_m, sizes_m, self.shape, cells)
+        kernels.cells_of_points(points, lows_m, highs_m, sizes_m, last, self.shape, cells)
         return cells
 
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -161,13 +164,13 @@ def _cells_of_points(
     lows_m: NDArray[np.float32],
     highs_m: NDArray[np.float32],
     sizes_m: NDArray[np.float32],
+    last: NDArray[np.int64],
     shape: Shape,
 ) -> NDArray[np.int64]:
     """(M,) flat index of each point's voxel, -1 outside; a border belongs to the voxel above it."""
     inside = ((xyz >= lows_m) & (xyz < highs_m)).all(axis=1)
     # float32 throughout, and the quotient may round up to the range's end: its last voxel has the point.
     chosen = np.floor((xyz[inside] - lows_m) / sizes_m).astype(np.int64)
-    last = np.round((highs_m - lows_m) / sizes_m).astype(np.int64) - 1
     x, y, z = np.minimum(chosen, last).T
     cells = np.full(len(xyz), -1, np.int64)
     cells[inside] = (y * shape[2] + x) * shape[0] + z

@@ -207,8 +207,12 @@ class Provenance(Strict):
     bundles made before it was recorded."""
     weights_file: Literal["weights.ckpt"] | None = None
     """Checkpoint beside the graphs that holds the trained arrays in 16 bits; None where it was not asked for."""
+    weights_file_sha256: str | None = None
+    """Of that file; None in bundles made before it was recorded."""
 
     def __post_init__(self) -> None:
+        if self.weights_file_sha256 is not None:
+            _require_sha256(self.weights_file_sha256, "weights_file")
         if self.weights_sha256 is not None:
             _require_sha256(self.weights_sha256, "the weights")
 

@@ -1,9 +1,11 @@
 """What comes with the package, by name: bundles and a scan; and where a bundle is that a user names."""
 
+import hashlib
 from importlib import resources
 from pathlib import Path
 
 from asca_deploy.bundle import MANIFEST, WEIGHTS
+from asca_deploy.manifest import load_any_bundle
 from asca_pillars.errors import BundleError
 
 
@@ -41,15 +43,20 @@ def find_weights(bundle: str | Path) -> Path:
     """The checkpoint that a bundle (folder, or name of one that ships) holds beside its graphs.
 
     Raises:
-        BundleError: there is no such bundle, or it holds none.
+        BundleError: there is no such bundle, it is damaged, it holds none, or another one than it was exported with.
     """
-    path = find_bundle(bundle) / WEIGHTS
+    folder = find_bundle(bundle)
+    path = folder / WEIGHTS
     if not path.is_file():
         having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS).is_file()]
         raise BundleError(
             f"{bundle}: holds no {WEIGHTS}, which `asca export --with-weights` adds to a bundle; of those that ship "
             f"{', '.join(having) or 'none'} has one"
         )
+    known = (folder / MANIFEST).is_file()  # weights alone in a folder are weights, too
+    expected = load_any_bundle(folder).provenance.weights_file_sha256 if known else None
+    if expected is not None and hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+        raise BundleError(f"{path}: is damaged, or of another bundle; copy the whole bundle again")
     return path
 
 
@@ -57,7 +64,7 @@ def find_checkpoint(source: str | Path) -> Path:
     """A checkpoint itself, by its suffix, or the one that a bundle (folder, or name of one that ships) holds.
 
     Raises:
-        BundleError: there is no such bundle, or it holds none.
+        BundleError: as `find_weights`.
     """
     path = Path(source)
     return path if path.is_file() or path.suffix == Path(WEIGHTS).suffix else find_weights(source)

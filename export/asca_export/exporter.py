@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -178,7 +179,9 @@ def write_proven(
     """
     if weights is not None:
         save_weights(weights, folder / WEIGHTS)
-        draft = dataclasses.replace(draft, provenance=dataclasses.replace(draft.provenance, weights_file=WEIGHTS))
+        digest = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+        kept = dataclasses.replace(draft.provenance, weights_file=WEIGHTS, weights_file_sha256=digest)
+        draft = dataclasses.replace(draft, provenance=kept)
     signed = graphs.sign(folder, draft)
     write_bundle_manifest(folder, signed)
     opened = load_any_bundle(folder)

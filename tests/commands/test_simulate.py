@@ -65,6 +65,9 @@ def test_objects_are_compared_with_those_of_a_real_folder(tmp_path: Path, capsys
 def test_a_wrong_real_folder_and_a_bundle_without_one_are_told_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no \*\.bin scans"):
         command.simulate(tmp_path / "sim", frames=2, workers=1, view="camera", like=tmp_path / "nothing")
+    real = write_set(tmp_path / "real")
+    with pytest.raises(AscaError, match="asca_smal_sim: no such folder"):
+        command.simulate(tmp_path / "sim", frames=2, workers=1, like=real, bundle=Path("asca_smal_sim"))
     with pytest.raises(AscaError, match="give --like"):
         command.simulate(tmp_path / "sim", frames=2, workers=1, view="camera", bundle=Path("asca_small_sim"))
     assert not (tmp_path / "sim").exists()

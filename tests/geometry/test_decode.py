@@ -139,6 +139,14 @@ def test_thresholds_of_zero_and_one(threshold: float, reported: int) -> None:
     assert len(decode(quiet_maps(), ANCHORS, classes, PostProcess())) == reported
 
 
+def test_cells_that_a_masked_neck_never_looks_at_are_not_reported_at_threshold_zero() -> None:
+    classes = tuple(dataclasses.replace(spec, score_threshold=0.0) for spec in CLASSES)
+    maps = quiet_maps()
+    maps.scores[:] = -1e4
+    write(maps, 0, 5, 10, ANCHORS[5, 10, 0], -20.0)
+    assert len(decode(maps, ANCHORS, classes, PostProcess())) == 1
+
+
 def test_nothing_found() -> None:
     detections = decode(quiet_maps(), ANCHORS, CLASSES, PostProcess())
     assert len(detections) == 0 and detections.boxes.shape == (0, 7)

@@ -48,6 +48,21 @@ def test_voxels_are_the_same_in_numpy(seed: int, count: int, spread_m: float, od
     assert found.features.dtype == expected.features.dtype == np.float32
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 9000), st.sampled_from([0.01, 0.03, 0.05, 0.1, 0.16]), st.floats(-200, 200))
+def test_the_last_point_of_a_range_is_in_its_last_voxel(count: int, size_m: float, low_m: float) -> None:
+    """Far from 0 float32 rounds more than a voxel's share; a point was then put one row on, or beyond the map."""
+    grid = VoxelGrid((low_m, low_m + count * size_m), (0, 0.2), (0, 0.2), (size_m, 0.1, 0.1), empty_layers=0)
+    ends = np.array([low_m, low_m + count * size_m], np.float32)
+    points = np.array([[ends[0], 0.15, 0.15], [np.nextafter(ends[1], ends[0]), 0.15, 0.15]], np.float32)
+    cells = grid.cells(points)
+    with patch("asca_pillars.tables.voxels.load_kernels", lambda _: None):
+        np.testing.assert_array_equal(cells, grid.cells(points))
+    inside = cells >= 0
+    assert ((cells[inside] // 2) % count + count == cells[inside] // 2).all(), "in the second row of y"
+    assert grid.shape == (2, 2, count)
+
+
 @pytest.mark.parametrize("form", [lambda p: voxelize(p, GRID, CellMap(GRID.shape)), lambda p: in_numpy(p, GRID)])
 def test_voxels_hold_the_mean_of_their_first_points(form: object) -> None:
     points = cloud(7, 400, 0.5, 0.0)
