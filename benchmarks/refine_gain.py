@@ -83,7 +83,7 @@ def _refined(path: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostPro
         raise ConfigError(f"{path}: of kind {checkpoint.config.model.kind}; give a bundle of it")
     settings = detector.model.refine
     stage = open_first_stage(detector.model.first_stage)
-    cache = ProposalCache(Path(frames.root) / "prepared", stage, settings.seen)
+    cache = ProposalCache(Path(frames.root) / "prepared", frames.pool, stage, settings.seen)
     cache.fill(frames, console=Console(markup=False))
     found = {}
     for frame_id in frames.frame_ids:

@@ -22,6 +22,7 @@ from asca_deploy.benchmark import (
 )
 from asca_deploy.benchmark.box_differences import box_difference
 from asca_deploy.benchmark.matrix import ON_THE_CPU
+from asca_deploy.bundle import AnyBundle, Bundle
 from asca_pillars.commands import bench_tables as show
 from asca_pillars.errors import ConfigError
 
@@ -63,7 +64,7 @@ def measure_parts(
         pass_ms = report.stages_ms["neck+head"].p50 / detector.passes
         roofline = measure_roofline(detector.bundle, pass_ms, detector.threads)
         result["roofline"] = asdict(roofline)
-        lines.append(show.roofline_line(roofline))
+        lines.append(show.roofline_line(roofline, sparse=_has_sparse_backbone(detector.bundle)))
     console.print(show.stages_table(report))
     for line in (*lines, show.machine_line(report)):
         console.print(line, soft_wrap=True)
@@ -93,6 +94,11 @@ def measure_parts(
         result["cold"] = asdict(cold)
         console.print(show.cold_line(cold), soft_wrap=True)
     return result
+
+
+def _has_sparse_backbone(bundle: AnyBundle) -> bool:
+    """Whether what it multiplies differs from scan to scan."""
+    return not isinstance(bundle, Bundle) or bundle.pillar.neck == "sparse"
 
 
 def _like(detector: Detector, folder: Path) -> Detector:

@@ -48,12 +48,13 @@ def machine_line(report: BenchmarkReport) -> str:
     return f"{report.cpu}, {report.threads} threads, {report.runs_on}; {versions}"
 
 
-def roofline_line(found: Roofline) -> str:
-    """Achieved beside possible."""
+def roofline_line(found: Roofline, *, sparse: bool) -> str:
+    """Achieved beside possible; of a sparse neck both are by the mean of the scans that it was exported with."""
     rates = ", ".join(f"{kind} {rate:.0f}" for kind, rate in found.gemm_gmac_s.items())
     return (
         f"roofline: backbone {found.gmac:.1f} GMAC at {found.achieved_gmac_s:.0f} GMAC/s, {found.share:.0%} of this "
         f"machine's {found.type} matrix product (GMAC/s measured in onnxruntime, {found.threads} threads: {rates})"
+        + ("; GMAC of the mean scan of the export, these may have more or fewer" if sparse else "")
     )
 
 

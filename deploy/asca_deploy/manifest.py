@@ -184,6 +184,10 @@ def _read_manifest(manifest: Path) -> dict[str, Any]:
         text = manifest.read_text(encoding="utf-8")
         data = json.loads(text, object_pairs_hook=_without_duplicates, parse_constant=_no_number)
     except (FileNotFoundError, NotADirectoryError):
+        if (last := manifest.parent / "checkpoints" / "last.ckpt").is_file():
+            raise BundleError(
+                f"{manifest.parent} is the folder of a training run, no model bundle; give its checkpoint, {last}"
+            ) from None
         raise BundleError(
             f"{manifest.parent} is no model bundle, it holds no {MANIFEST}; make one with `asca export`"
         ) from None

@@ -17,6 +17,11 @@ _NO_SPARSE_NECK = {
     "openvino": "it needs outputs of fixed shapes",
     "tensorrt": "it would build another engine for every number of pillars",
 }
+_DENSE_FORMS = {
+    "pillar": ", or what `asca export SOURCE --dense-neck` writes of the checkpoint, or of asca_sim",
+    "pillar_refine": "",
+}
+"""Of each kind, which bundles besides."""
 
 
 def encoder_interface(bundle: Bundle) -> Interface:
@@ -76,6 +81,5 @@ def check_neck(bundle: Bundle, provider: str) -> None:
     if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
         raise ProviderError(
             f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
-            "choose provider cpu, or a dense neck: `asca export --dense-neck` writes the same detector with one, "
-            "asca_small_sim comes with one"
+            f"choose provider cpu, or a bundle with a dense neck: asca_small_sim{_DENSE_FORMS[bundle.kind]}"
         )

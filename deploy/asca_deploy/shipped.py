@@ -48,6 +48,8 @@ def find_weights(bundle: str | Path) -> Path:
     folder = find_bundle(bundle)
     path = folder / WEIGHTS
     if not path.is_file():
+        if (last := folder / "checkpoints" / "last.ckpt").is_file():
+            raise BundleError(f"{bundle}: is the folder of a training run; give its checkpoint, {last}")
         having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS).is_file()]
         raise BundleError(
             f"{bundle}: holds no {WEIGHTS}, which `asca export --with-weights` adds to a bundle; of those that ship "

@@ -91,13 +91,25 @@ def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, 
     inserter = Inserter(
         split, insert, spec.ranges, camera_view, data.min_points, prepared, database, tuple(shares.tolist())
     )
-    for name, share, objects in zip(spec.class_names, shares, inserter.candidates, strict=True):
+    each = zip(spec.class_names, shares, inserter.candidates, strict=True)
+    for label, (name, share, objects) in enumerate(each):
         if share > 0 and not len(objects):
             raise DatasetError(
-                f"{split.root}: list `{split.name}` has no {name} with {insert.min_points} or more points to insert; "
-                "lower augment.insert.min_points, or name the other classes in augment.insert.proportions"
+                _nothing_to_insert(split, name, insert.min_points, int((database.labels == label).sum()))
             )
     return inserter
+
+
+def _nothing_to_insert(split: LabeledSplit, name: str, min_points: int, objects: int) -> str:
+    if not objects:
+        return (
+            f"{split.root}: list `{split.name}` has no {name} with a point in it; "
+            "`asca inspect --propose` writes a configuration with the classes that are labelled"
+        )
+    return (
+        f"{split.root}: list `{split.name}` has no {name} with {min_points} or more points to insert; "
+        "lower augment.insert.min_points, or name the other classes in augment.insert.proportions"
+    )
 
 
 def insertion_shares(per_frame: NDArray[np.float64], wanted: NDArray[np.float64], objects: int) -> NDArray[np.float64]:

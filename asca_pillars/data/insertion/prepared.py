@@ -5,10 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from asca_pillars.config import DataConfig
+from asca_pillars.data.scans.find_scans import PREPARED_FILE, PREPARED_NOTE
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path, require_own
-
-_NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
 
 
 def prepared_folder(root: str | Path, data: DataConfig) -> Path:
@@ -23,9 +22,11 @@ def require_writable(folder: Path) -> None:
         DatasetError: it cannot be written.
         OutputError: it holds other files.
     """
-    require_own(folder, "asca prepare", "README.txt", text=_NOTE)
-    with writing(folder / "README.txt") as temporary:
-        temporary.write_text(_NOTE, encoding="utf-8")
+    # Proposals of earlier versions lie in a folder that has no note of its own.
+    notes = (PREPARED_FILE, *(path.relative_to(folder).as_posix() for path in folder.glob(f"*/*/{PREPARED_FILE}")))
+    require_own(folder, "asca prepare", *notes, text=PREPARED_NOTE)
+    with writing(folder / PREPARED_FILE) as temporary:
+        temporary.write_text(PREPARED_NOTE, encoding="utf-8")
 
 
 @contextlib.contextmanager

@@ -10,6 +10,9 @@ from typing import NamedTuple
 from asca_pillars.errors import ScanError
 
 SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
+PREPARED_FILE = "README.txt"
+PREPARED_NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
+"""What the file says in a folder that is computed from a dataset: what lies there are no scans."""
 
 
 class NamedScan(NamedTuple):
@@ -22,7 +25,7 @@ class NamedScan(NamedTuple):
 def find_scans(path: str | Path) -> list[Path]:
     """The scan at `path`, or those in the folder at `path`, to any depth, in natural order (2.bin before 10.bin).
 
-    Hidden files and folders are left out, links to folders are followed.
+    Hidden files and folders are left out, and what `asca prepare` computed; links to folders are followed.
 
     Raises:
         ScanError: there is no scan.
@@ -41,15 +44,23 @@ def find_scans(path: str | Path) -> list[Path]:
 def files_below(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[Path]:
     """Every file below a folder, to any depth, in any order; links to folders are followed.
 
-    Folders that may not be read are left out, and links that lead to a folder which they are in (`above`).
+    Folders that may not be read are left out, those that `asca prepare` wrote, and links that lead to a folder which
+    they are in (`above`).
     """
     here = above | {folder.resolve()}
     with contextlib.suppress(PermissionError):
+        if _is_prepared(folder):
+            return
         for entry in folder.iterdir():
             if not entry.is_dir():
                 yield entry
             elif entry.resolve() not in here:
                 yield from files_below(entry, here)
+
+
+def _is_prepared(folder: Path) -> bool:
+    path = folder / PREPARED_FILE
+    return path.is_file() and path.read_text(encoding="utf-8", errors="replace") == PREPARED_NOTE
 
 
 def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:

@@ -58,18 +58,19 @@ class ProposalCache:
 
     Args:
         prepared: folder of what is computed once per dataset, see `data.insertion.prepared`.
+        pool: what the frames' names are unique in.
         stage: the first stage; can be sent to a process, where several fill the cache.
         camera_view: whether the first stage sees only the points in the image.
     """
 
     def __init__(
-        self, prepared: Path, stage: FirstStage, settings: FirstStageSettings, *, camera_view: bool = True
+        self, prepared: Path, pool: str, stage: FirstStage, settings: FirstStageSettings, *, camera_view: bool = True
     ) -> None:
-        self.stage, self.settings, self.camera_view = stage, settings, camera_view
+        self.prepared, self.stage, self.settings, self.camera_view = prepared, stage, settings, camera_view
         about = {"format": _FORMAT, "stage": stage.identity, "spec": to_dict(stage.spec), "camera_view": camera_view}
         about |= to_dict(settings)
         key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
-        self.files = ProposalFiles(prepared / f"proposals-{key}", stage.spec.class_names)
+        self.files = ProposalFiles(prepared / pool / f"proposals-{key}", stage.spec.class_names)
 
     def fill(self, split: LabeledSplit, *, workers: int = 1, console: Console | None = None) -> None:
         """Compute what is missing or outdated. Each file appears when it is complete, so a killed run just goes on.
@@ -84,7 +85,7 @@ class ProposalCache:
         """
         todo = [frame_id for frame_id in split.frame_ids if not self._is_current(split, frame_id)]
         if todo:
-            require_writable(self.files.folder)
+            require_writable(self.prepared)
         propose = partial(_propose, self.files, split, self.stage, self.settings, self.camera_view)
         for _ in in_processes(propose, todo, workers, "Proposing", progress=console is not None, console=console):
             pass

@@ -126,9 +126,9 @@ def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig
     """
     model = with_first_stage(model)
     stage = open_first_stage(model.first_stage)
-    folder = prepared_folder(split.root, data) / split.pool
+    folder = prepared_folder(split.root, data)
     view = data.camera_view and split.has_camera
-    cache = ProposalCache(folder, stage, model.refine.seen, camera_view=view)
+    cache = ProposalCache(folder, split.pool, stage, model.refine.seen, camera_view=view)
     cache.fill(split, workers=max(data.workers, 1), console=Console(stderr=True))
     return RefinePreparation(model.refine, CachedProposals(cache.files))
 

@@ -1,9 +1,11 @@
 """Which files are scans, in which order, and that no two of them get one name for their results."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
+from asca_pillars.data.insertion.prepared import require_writable
 from asca_pillars.data.scans.find_scans import find_scans, name_scans
 from asca_pillars.errors import ScanError
 
@@ -37,6 +39,17 @@ def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> Non
     (scans / "again").symlink_to(scans)
     (real / "b" / "home").symlink_to(scans)
     assert [scan.relative_to(scans).as_posix() for scan in find_scans(scans)] == ["a/1.bin", "b/1.bin", "b/2.bin"]
+
+
+def test_what_was_prepared_for_training_holds_no_scans(tmp_path: Path) -> None:
+    touch(tmp_path, "a/1.bin", "prepared/objects/train.npy", "prepared/objects/maps/2.npy", "other/3.npy")
+    assert names(tmp_path) == ["a/1", "other/3", "prepared/objects/maps/2", "prepared/objects/train"]
+    shutil.rmtree(tmp_path / "prepared")
+    require_writable(tmp_path / "prepared")
+    touch(tmp_path, "prepared/objects/train.npy")
+    assert names(tmp_path) == ["a/1", "other/3"]
+    with pytest.raises(ScanError, match="no scans in this folder"):
+        find_scans(tmp_path / "prepared")
 
 
 def test_what_is_no_scan_is_said(tmp_path: Path) -> None:

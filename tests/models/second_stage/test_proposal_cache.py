@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.insertion.prepared import require_writable
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.errors import AscaError, DatasetError
@@ -24,7 +25,7 @@ def split(tmp_path: Path) -> KittiSplit:
 
 def test_reads_what_was_computed(split: KittiSplit, tmp_path: Path) -> None:
     stage = RandomStage()
-    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", stage, SETTINGS)
     cache.fill(split)
     for frame_id in split.frame_ids:
         wanted = propose_on(RandomStage(), split.points(frame_id, camera_view=True), SETTINGS)
@@ -37,7 +38,7 @@ def test_reads_what_was_computed(split: KittiSplit, tmp_path: Path) -> None:
 
 def test_several_processes_write_the_same(tmp_path: Path) -> None:
     split = KittiSplit(write_dataset(tmp_path / "data", 6))
-    one, two = (ProposalCache(tmp_path / name, RandomStage(), SETTINGS) for name in ("one", "two"))
+    one, two = (ProposalCache(tmp_path / name, "pool", RandomStage(), SETTINGS) for name in ("one", "two"))
     one.fill(split)
     two.fill(split, workers=2)
     for frame_id in split.frame_ids:
@@ -46,7 +47,7 @@ def test_several_processes_write_the_same(tmp_path: Path) -> None:
 
 def test_only_what_is_missing_is_computed(split: KittiSplit, tmp_path: Path) -> None:
     stage = RandomStage()
-    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", stage, SETTINGS)
     cache.fill(split)
     assert stage.calls == 2
     cache.files.path(split.frame_ids[1]).unlink()
@@ -56,7 +57,7 @@ def test_only_what_is_missing_is_computed(split: KittiSplit, tmp_path: Path) -> 
 
 def test_frames_that_changed_are_computed_again(split: KittiSplit, tmp_path: Path) -> None:
     stage = RandomStage()
-    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", stage, SETTINGS)
     cache.fill(split)
     write_scan(split.scan_path("000001"), split.points("000000", camera_view=False))
     cache.fill(split)
@@ -73,7 +74,7 @@ def test_frames_that_changed_are_computed_again(split: KittiSplit, tmp_path: Pat
 def test_other_axes_are_other_proposals(tmp_path: Path) -> None:
     root = write_box_dataset(tmp_path / "own", 2)
     stage = RandomStage()
-    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", stage, SETTINGS)
     cache.fill(BoxSplit(root))
     (root / "dataset.yaml").write_text("axes: y-forward")
     cache.fill(BoxSplit(root))
@@ -82,7 +83,7 @@ def test_other_axes_are_other_proposals(tmp_path: Path) -> None:
 
 def test_a_damaged_file_and_one_that_does_not_tell_are_computed_again(split: KittiSplit, tmp_path: Path) -> None:
     stage = RandomStage()
-    cache = ProposalCache(tmp_path, stage, SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", stage, SETTINGS)
     cache.fill(split)
     damaged, silent = (cache.files.path(frame_id) for frame_id in split.frame_ids)
     damaged.write_bytes(damaged.read_bytes()[:100])
@@ -95,7 +96,7 @@ def test_a_damaged_file_and_one_that_does_not_tell_are_computed_again(split: Kit
 
 
 def test_a_scan_that_is_gone_is_named(split: KittiSplit, tmp_path: Path) -> None:
-    cache = ProposalCache(tmp_path, RandomStage(), SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", RandomStage(), SETTINGS)
     cache.fill(split)
     split.scan_path("000001").unlink()
     with pytest.raises(AscaError, match=r"000001\.bin"):
@@ -103,7 +104,7 @@ def test_a_scan_that_is_gone_is_named(split: KittiSplit, tmp_path: Path) -> None
 
 
 def test_a_killed_run_leaves_no_half_file(split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache = ProposalCache(tmp_path, RandomStage(), SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", RandomStage(), SETTINGS)
 
     def broken(file: object, **_: object) -> None:
         file.write(b"PK")  # type: ignore[attr-defined]
@@ -117,7 +118,7 @@ def test_a_killed_run_leaves_no_half_file(split: KittiSplit, tmp_path: Path, mon
 
 def test_another_stage_or_setting_is_another_folder(tmp_path: Path) -> None:
     folders = {
-        ProposalCache(tmp_path, RandomStage(identity), settings, camera_view=view).files.folder
+        ProposalCache(tmp_path / "prepared", "pool", RandomStage(identity), settings, camera_view=view).files.folder
         for identity, settings, view in (
             ("a", SETTINGS, True),
             ("b", SETTINGS, True),
@@ -126,13 +127,13 @@ def test_another_stage_or_setting_is_another_folder(tmp_path: Path) -> None:
         )
     }
     limited = dataclasses.replace(SPEC, limits=dataclasses.replace(SPEC.limits, max_points=8))
-    folders.add(ProposalCache(tmp_path, RandomStage("a", limited), SETTINGS).files.folder)
+    folders.add(ProposalCache(tmp_path / "prepared", "pool", RandomStage("a", limited), SETTINGS).files.folder)
     assert len(folders) == 5
-    assert ProposalCache(tmp_path, RandomStage("a"), SETTINGS).files.folder in folders
+    assert ProposalCache(tmp_path / "prepared", "pool", RandomStage("a"), SETTINGS).files.folder in folders
 
 
 def test_missing_and_damaged_files_are_named(split: KittiSplit, tmp_path: Path) -> None:
-    cache = ProposalCache(tmp_path, RandomStage(), SETTINGS)
+    cache = ProposalCache(tmp_path / "prepared", "pool", RandomStage(), SETTINGS)
     with pytest.raises(DatasetError, match=r"000000\.npz: no proposals"):
         cache.files.read("000000")
     cache.fill(split)
@@ -140,3 +141,13 @@ def test_missing_and_damaged_files_are_named(split: KittiSplit, tmp_path: Path) 
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(DatasetError, match=f"{path.name}: damaged"):
         cache.files.read(split.frame_ids[0])
+
+
+def test_what_trains_with_inserted_objects_finds_a_folder_of_its_own(split: KittiSplit, tmp_path: Path) -> None:
+    """Both keep what they compute in the dataset's folder; proposals of earlier versions left no note there."""
+    prepared = tmp_path / "prepared"
+    ProposalCache(prepared, "pool", RandomStage(), SETTINGS).fill(split)
+    require_writable(prepared)
+    (prepared / "README.txt").rename(next((prepared / "pool").iterdir()) / "README.txt")
+    require_writable(prepared)
+    assert (prepared / "README.txt").is_file()
