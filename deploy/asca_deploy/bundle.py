@@ -211,10 +211,8 @@ class Provenance(Strict):
     """Of that file; None in bundles made before it was recorded."""
 
     def __post_init__(self) -> None:
-        if self.weights_file_sha256 is not None:
-            _require_sha256(self.weights_file_sha256, "weights_file")
-        if self.weights_sha256 is not None:
-            _require_sha256(self.weights_sha256, "the weights")
+        _require_sha256(self.weights_file_sha256, "weights_file")
+        _require_sha256(self.weights_sha256, "the weights")
 
 
 @dataclass(frozen=True)
@@ -297,6 +295,6 @@ class PvRcnnBundle(AnyBundle):
         return (*GRAPHS[self.kind], *shifts)
 
 
-def _require_sha256(text: str, of: str) -> None:
-    if not re.fullmatch("[0-9a-f]{64}", text):
+def _require_sha256(text: str | None, of: str) -> None:
+    if text is not None and not re.fullmatch("[0-9a-f]{64}", text):
         raise ConfigError(f"sha256 {text[:_LONGEST_NAME]!r} of {of} is no SHA-256")

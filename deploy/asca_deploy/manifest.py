@@ -177,6 +177,13 @@ def _verify_refine(manifest: Path, bundle: Bundle) -> None:
         raise BundleError(f"{manifest}: `refine.seen.proposals.quotas` has not one for each class; {_EXPORT_AGAIN}")
 
 
+def refuse_run_folder(folder: Path) -> None:
+    """Raise BundleError, which names the checkpoint, if it is the folder of a training run."""
+    last = folder / "checkpoints" / "last.ckpt"
+    if last.is_file():
+        raise BundleError(f"{folder} is the folder of a training run, no model bundle; give its checkpoint, {last}")
+
+
 def _read_manifest(manifest: Path) -> dict[str, Any]:
     try:
         if manifest.stat().st_size > _LARGEST_BYTES:
@@ -184,10 +191,7 @@ def _read_manifest(manifest: Path) -> dict[str, Any]:
         text = manifest.read_text(encoding="utf-8")
         data = json.loads(text, object_pairs_hook=_without_duplicates, parse_constant=_no_number)
     except (FileNotFoundError, NotADirectoryError):
-        if (last := manifest.parent / "checkpoints" / "last.ckpt").is_file():
-            raise BundleError(
-                f"{manifest.parent} is the folder of a training run, no model bundle; give its checkpoint, {last}"
-            ) from None
+        refuse_run_folder(manifest.parent)
         raise BundleError(
             f"{manifest.parent} is no model bundle, it holds no {MANIFEST}; make one with `asca export`"
         ) from None

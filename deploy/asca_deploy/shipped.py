@@ -5,7 +5,7 @@ from importlib import resources
 from pathlib import Path
 
 from asca_deploy.bundle import MANIFEST, WEIGHTS
-from asca_deploy.manifest import load_any_bundle
+from asca_deploy.manifest import load_any_bundle, refuse_run_folder
 from asca_pillars.errors import BundleError
 
 
@@ -48,8 +48,7 @@ def find_weights(bundle: str | Path) -> Path:
     folder = find_bundle(bundle)
     path = folder / WEIGHTS
     if not path.is_file():
-        if (last := folder / "checkpoints" / "last.ckpt").is_file():
-            raise BundleError(f"{bundle}: is the folder of a training run; give its checkpoint, {last}")
+        refuse_run_folder(folder)
         having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS).is_file()]
         raise BundleError(
             f"{bundle}: holds no {WEIGHTS}, which `asca export --with-weights` adds to a bundle; of those that ship "

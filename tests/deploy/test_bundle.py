@@ -27,6 +27,11 @@ def test_weights_lie_in_some_bundles(tiny_bundle: Path, tmp_path: Path, monkeypa
     monkeypatch.setattr(shipped, "shipped_bundles", lambda: ships)
     with pytest.raises(BundleError, match=r"plain: holds no weights\.ckpt, .*--with-weights.* ship none has one"):
         shipped.find_weights("plain")
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
+    for read in (shipped.find_weights, load_any_bundle):
+        with pytest.raises(BundleError, match=r"training run, no model bundle; give its checkpoint, .*last\.ckpt"):
+            read(tmp_path / "run")
     ships["heavy"] = with_weights
     with pytest.raises(BundleError, match=r"tiny: holds no weights\.ckpt, .* of those that ship heavy has one"):
         shipped.find_weights(tiny_bundle)

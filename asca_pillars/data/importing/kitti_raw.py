@@ -15,13 +15,11 @@ import numpy as np
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG
+from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG, TYPES
 from asca_pillars.data.scans.find_scans import files_below
 from asca_pillars.errors import DatasetError
 
 LABELS = "tracklet_labels.xml"
-_TYPES = {"Person (sitting)": "Person_sitting"}
-"""What the object benchmark calls otherwise, and detectors know as a pedestrian's neighbor."""
 
 
 class _Labels(NamedTuple):
@@ -75,7 +73,7 @@ def _read_tracklets(path: Path) -> dict[int, _Labels]:
                     raise ValueError(f"tracklet {number} has a number that is not finite")
                 own = labels[first + offset]
                 own.boxes.append([x, y, bottom + height / 2, length, width, height, yaw])
-                own.types.append(_TYPES.get(kind, kind))
+                own.types.append(TYPES.get(kind, kind))
                 own.tracks.append(str(number))
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None

@@ -16,8 +16,8 @@ from asca_pillars.errors import DatasetError
 
 LABELED_VIEW_DEG = 81.0
 """Of KITTI's left color camera: 1242 pixels at a focal length of 721."""
-_TYPES = {"Person": "Person_sitting"}
-"""What the object benchmark calls otherwise, and detectors know as a pedestrian's neighbor."""
+TYPES = {"Person": "Person_sitting", "Person (sitting)": "Person_sitting"}
+"""Names in KITTI's recordings, here and in the raw ones, of what its object benchmark calls otherwise."""
 _Tracked = tuple[KittiObject, str]
 
 
@@ -53,9 +53,7 @@ def _frames(folder: Path, labels: Path) -> list[ImportedFrame]:
 def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
     objects = [item for item, _ in own]
     boxes = boxes_from_objects(objects, calibration)
-    return records_from(
-        boxes, [_TYPES.get(item.type, item.type) for item in objects], None, [track for _, track in own]
-    )
+    return records_from(boxes, [TYPES.get(item.type, item.type) for item in objects], None, [track for _, track in own])
 
 
 def _read_tracked(path: Path) -> dict[int, list[_Tracked]]:
