@@ -1,6 +1,7 @@
-"""The whole configuration as one typed tree. Its defaults are the paper's values (ASCA-PointPillars, section 4.1).
+"""The whole configuration as one typed tree. Its defaults are the values of ASCA-PointPillars, section 4.1.
 
-One is not: inserting objects reads a prepared dataset, so it is off until a config asks for it, as the paper's does.
+What the paper does not give is in docs/READING.md ("What section 4.1 leaves out"). One default is not the paper's:
+inserting objects reads a prepared dataset, so it is off until a config asks for it, as that of the paper's recipe does.
 """
 
 import math
@@ -133,7 +134,7 @@ class DataConfig(Strict):
 
 @dataclass(frozen=True)
 class TrainConfig(Strict):
-    """The recipe. Defaults: section 4.1 of the paper.
+    """The recipe. Defaults: section 4.1 of the paper, which does not clip gradients.
 
     Attributes:
         schedule: `step` multiplies the rate by `decay` every `decay_epochs`; `one_cycle` rises to

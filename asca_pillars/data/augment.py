@@ -1,4 +1,4 @@
-"""Random changes of a labelled frame, every one drawn from the generator that is passed in (section 4.1)."""
+"""Random changes of a labelled frame, every one drawn from the generator that is passed in."""
 
 from dataclasses import replace
 

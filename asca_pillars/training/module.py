@@ -92,8 +92,8 @@ class DetectionModule(L.LightningModule):
                 optimizer,
                 max_lr=recipe.learning_rate,
                 total_steps=recipe.epochs * steps,
-                pct_start=0.3,
-                div_factor=10,
+                pct_start=0.3,  # of fast.ai's one cycle, torch's default, stated because it is the recipe
+                div_factor=10,  # as OpenPCDet starts it
             )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 

@@ -40,8 +40,8 @@ class PillarDetector(nn.Module):
     Args:
         spec: grid, limits and classes that its parts were made for.
         loss_weights: what training weighs its terms with.
-        encode: points of pillars to pillar features (section 3.2 and 3.3).
-        neck: pseudo-image, or pillars and tables, to features (section 3.4).
+        encode: points of pillars to pillar features (section 3.2).
+        neck: pseudo-image, or pillars and tables, to features (section 3.3).
         head: features to head maps.
     """
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.refine.point_mlp import mlp
-from asca_pillars.models.refine.set_abstraction import SetAbstraction
+from asca_pillars.models.refine.set_abstraction import SetAbstraction, found_once
 from asca_pillars.points.point_scales import PointScale
 
 _SHARE = 4  # by which the impact's hidden layer is narrower, which the paper does not give
@@ -65,7 +65,7 @@ class AdaptiveScales(nn.Module):
         for lift, adjust, scale in zip(self.lift, self.adjust, scales, strict=True):
             assert isinstance(lift, SetAbstraction)
             grouped = lift.grouped(positions, features, scale.positions, scale.groups)  # (M, T, C)
-            features = adjust(grouped, _first_of_each(scale.groups, positions.shape[0])).max(dim=1).values
+            features = adjust(grouped, found_once(scale.groups, positions.shape[0])).max(dim=1).values
             positions = scale.positions
             found.append(features)
         joined = found[-1]
@@ -73,12 +73,6 @@ class AdaptiveScales(nn.Module):
             joined = torch.cat([finer, _interpolated(joined, scale)], dim=1)
         described: Tensor = self.join(joined)
         return described
-
-
-def _first_of_each(groups: Tensor, count: int) -> Tensor:
-    """(M, T) 1 for what `ball_query` found, 0 where it repeats a group's first member, and for index `count`."""
-    again = (groups[:, 1:] != groups[:, :1]) & (groups[:, 1:] < count)
-    return torch.cat([groups[:, :1] < count, again], dim=1).float()
 
 
 def _interpolated(features: Tensor, scale: PointScale[Tensor]) -> Tensor:

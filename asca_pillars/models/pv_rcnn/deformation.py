@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
+from asca_pillars.models.refine.set_abstraction import found_once
+
 _OFFSET_CHANNELS = 16  # of f', which the paper does not give
 _INITIAL_STD = 1e-3  # of the last weights: training starts at almost undeformed keypoints, and all weights learn
 
@@ -46,26 +48,30 @@ class PaperDeformation(nn.Module):
         index = around.indices[-1]
         offsets = F.pad(self.offset(around.features), (0, 0, 0, 1))  # linear: W (f_i - f_j) = W f_i - W f_j
         own = (_gathered(offsets, around.nearest) * around.nearest_weights[:, :, None]).sum(dim=1)  # (K, 16)
-        relative, found = _relative(around, index)  # v_j - v_i
+        relative, _ = _relative(around, index)  # v_j - v_i
+        found = found_once(index, around.positions.shape[0]).to(own)  # the sum has every neighbor once
         difference = (own[:, None] - _gathered(offsets, index)) * found[:, :, None]
         mean = difference.transpose(1, 2) @ -relative / found.sum(dim=1).clamp(min=1)[:, None, None]  # (K, 16, 3)
         return [around.keypoints + torch.tanh(self.align(torch.relu(mean).flatten(1)))]
 
 
 class AuthorsDeformation(nn.Module):
-    """v_i + mean_j tanh(W [v_j - v_i ; f_j]) * (v_j - v_i), a place for each radius, as in the authors' code."""
+    """v_i + mean_j tanh(W [v_j - v_i ; f_j]) * (v_j - v_i), a place for each radius, as in the authors' code.
 
-    def __init__(self, channels: int, radii: int) -> None:
+    There the mean is over a whole ball's row, in which a neighbor that fills it counts again and again.
+    """
+
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.offsets = nn.ModuleList(nn.Linear(3 + channels, 3, bias=False) for _ in range(radii))
+        self.offset = nn.Linear(3 + channels, 3, bias=False)
 
     def forward(self, around: Surroundings) -> list[Tensor]:
         """Of each radius (K, 3), metres."""
         shifted = []
-        for layer, index in zip(self.offsets, around.indices, strict=True):
+        for index in around.indices:
             relative, found = _relative(around, index)
             features = _gathered(F.pad(around.features, (0, 0, 0, 1)), index)
-            share = torch.tanh(layer(torch.cat([relative, features], dim=2)))
+            share = torch.tanh(self.offset(torch.cat([relative, features], dim=2)))
             mean = (share * relative).sum(dim=1) / found.sum(dim=1).clamp(min=1)[:, None]
             shifted.append(around.keypoints + mean)
         return shifted

@@ -215,7 +215,7 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
         deform={
             each.source: PaperDeformation(channels[each.source])
             if settings.deform == "paper"
-            else AuthorsDeformation(channels[each.source], len(each.radii_m))
+            else AuthorsDeformation(channels[each.source])
             for each in settings.deformed
         },
         scales=AdaptiveScales(channels["points"], network.scale_widths, network.scale_channels)

@@ -65,3 +65,9 @@ class SetAbstraction(nn.Module):
         for layer, norm in zip(self.layers[1:], self.norms[1:], strict=True):
             pairs = torch.relu(norm(layer(pairs)))
         return pairs
+
+
+def found_once(indices: Tensor, count: int) -> Tensor:
+    """(Q, T) 1 for what `ball_query` found, 0 where it repeats a ball's first member, and for index `count`."""
+    again = (indices[:, 1:] != indices[:, :1]) & (indices[:, 1:] < count)
+    return torch.cat([indices[:, :1] < count, again], dim=1).float()
