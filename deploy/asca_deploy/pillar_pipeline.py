@@ -1,19 +1,19 @@
 """The pillar family's pipeline: pillarize, encode, scatter or tables, neck and head, decode (paper section 3)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK, Bundle, CanvasFormat
-from asca_deploy.graph import Session, check_interface
+from asca_deploy.graph import Session, check_interface, run_graph
 from asca_deploy.pillar_backbone import HeadAnswer, Maps, PillarBackbone
 from asca_deploy.pillar_graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
-from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pipeline import Laps, Pipeline, channels_first, take_free
 from asca_pillars.geometry.decode import HeadMaps, decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.kernels import load_kernels
@@ -23,8 +23,6 @@ from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.points.first_stage import FirstPass
 from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables, table_inputs
-
-T = TypeVar("T")
 
 
 class PreparedPillars(NamedTuple):
@@ -181,7 +179,7 @@ class CanvasBackbone:
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
         """Pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
-        canvas = _take(self._free, self.new_canvas)
+        canvas = take_free(self._free, self.new_canvas)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
         canvas.scatter(pillar_features, cells)
@@ -197,7 +195,7 @@ class CanvasBackbone:
         """As `run`, and the neck's map (H, W, C), which a second stage reads; for graphs with the output NECK."""
         *maps, neck = self._session.run((*HeadMaps._fields, NECK), {"canvas": placed.image})
         self._free.append(placed)
-        return FirstPass(_channels_first(maps), neck[0])
+        return FirstPass(channels_first(maps), neck[0])
 
     def new_canvas(self) -> Canvas:
         """An empty canvas of this bundle's format."""
@@ -205,7 +203,7 @@ class CanvasBackbone:
 
     def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
         """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
-        return _channels_first(self._session.run(HeadMaps._fields, {"canvas": canvas}))
+        return channels_first(self._session.run(HeadMaps._fields, {"canvas": canvas}))
 
 
 class PlacedPillars(NamedTuple):
@@ -237,7 +235,7 @@ class TableBackbone:
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
         """Pillar features (P, C) with the tables that their cells, flat indices (P,), make."""
-        builder = _take(self._free, self._new_builder)
+        builder = take_free(self._free, self._new_builder)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
         tables = builder.build(cells)
@@ -257,26 +255,12 @@ class TableBackbone:
         if not len(placed.tables.head_cells):
             return [np.empty((0, self._channels[name]), np.float32) for name in names]
         given = {PILLAR_FEATURES: placed.features, **table_inputs(placed.tables)}
-        # A graph takes what its layers read.
-        return list(self._session.run(names, {name: given[name] for name in self._session.inputs}))
+        return run_graph(self._session, names, given)
 
     def _new_builder(self) -> NeckTableBuilder:
         rule = self._bundle.pillar.active_cells
         assert rule is not None
         return NeckTableBuilder(*self._bundle.spec.grid.map_shape, rule)
-
-
-def _take(free: list[T], make: Callable[[], T]) -> T:
-    """One that is free, or a new one."""
-    try:
-        return free.pop()  # atomic, as append is: two threads never get the same one
-    except IndexError:
-        return make()
-
-
-def _channels_first(channels_last: Sequence[NDArray[Any]]) -> Maps:
-    scores, boxes, directions = (maps[0].transpose(2, 0, 1) for maps in channels_last)
-    return HeadMaps(scores, boxes, directions)
 
 
 _: type[Pipeline[PreparedPillars, HeadAnswer]] = PillarPipeline  # mypy compares them

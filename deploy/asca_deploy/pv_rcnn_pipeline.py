@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
-from asca_deploy.graph import Interface, Session, check_interface
-from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.graph import Interface, Session, check_interface, run_graph
+from asca_deploy.pipeline import Laps, Pipeline, channels_first, take_free
 from asca_deploy.pv_rcnn_graphs import (
     OUT,
     backbone_interface,
@@ -131,7 +131,7 @@ class PvRcnnPipeline:
             return PreparedVoxels(scan, {}, None)
         levels = self.encode(scan)
         laps.append(("voxels", perf_counter()))
-        canvas = self._canvases.pop() if self._canvases else self._new_canvas()
+        canvas = take_free(self._canvases, self._new_canvas)
         canvas.scatter(levels.pop(OUT), scan.levels[-1].cells)
         laps.append(("scatter", perf_counter()))
         return PreparedVoxels(scan, levels, canvas)
@@ -176,7 +176,7 @@ class PvRcnnPipeline:
 
     def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
         """Points (N, 4), metres, LiDAR frame, and reflectance -> what voxels.onnx reads."""
-        builder = self._builders.pop() if self._builders else self.spec.table_builder()
+        builder = take_free(self._builders, self.spec.table_builder)
         voxelized = voxel_levels(points, self.spec, builder)
         self._builders.append(builder)
         return voxelized
@@ -187,19 +187,18 @@ class PvRcnnPipeline:
         Those of OUT are whole steps where the map is.
         """
         names = list(self._voxels.outputs)
-        return dict(zip(names, _run(self._voxels, names, voxel_inputs(scan.features, scan.levels)), strict=True))
+        return dict(zip(names, run_graph(self._voxels, names, voxel_inputs(scan.features, scan.levels)), strict=True))
 
     def neck_and_head(self, canvas: NDArray[Any]) -> HeadMaps[NDArray[np.float32]]:
         """The map (1, H, W, C) -> scores (A * classes, H, W), boxes (7A, H, W), directions (2A, H, W)."""
-        found = self._backbone.run(HeadMaps._fields, {"canvas": canvas})
-        return HeadMaps(*(part[0].transpose(2, 0, 1) for part in found))
+        return channels_first(self._backbone.run(HeadMaps._fields, {"canvas": canvas}))
 
     def deform(self, scan: VoxelScan, levels: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
         """Around which places (K, 3), metres, keypoints look at levels with features (N, C); by name, none without."""
         if self._deform is None:
             return {}
         names = list(self._deform.outputs)
-        return dict(zip(names, _run(self._deform, names, deform_inputs(scan, self.settings, levels)), strict=True))
+        return dict(zip(names, run_graph(self._deform, names, deform_inputs(scan, self.settings, levels)), strict=True))
 
     def describe(
         self,
@@ -219,7 +218,7 @@ class PvRcnnPipeline:
             balls: what `balls_around` gave.
         """
         given = keypoint_inputs(scan, self.settings.sources, levels, bev, balls) | dict(places)
-        return _run(self._keypoints, ["features"], given)[0]
+        return run_graph(self._keypoints, ["features"], given)[0]
 
     def refine(
         self, keypoints: NDArray[np.float32], features: NDArray[np.float32], grid: GridNeighbors
@@ -229,16 +228,11 @@ class PvRcnnPipeline:
             return np.empty(0, np.float32), np.empty((0, 7), np.float32)
         grids = {f"grid_{number}": indices for number, indices in enumerate(grid.indices)}
         given = {"keypoints": keypoints, "features": features, "grid_points": grid.points, **grids}
-        confidence, residuals = _run(self._refine, OUTPUTS, given)
+        confidence, residuals = run_graph(self._refine, OUTPUTS, given)
         return confidence, residuals
 
     def _new_canvas(self) -> VoxelCanvas:
         return VoxelCanvas(self.spec.level_shapes[-1], self._map_channels, self._map_type)
-
-
-def _run(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-    """The outputs of these names; an exporter drops inputs that the network does not use."""
-    return session.run(outputs, {name: given[name] for name in session.inputs})
 
 
 _: type[Pipeline[PreparedVoxels, FirstAnswer]] = PvRcnnPipeline  # mypy compares them

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import REFINE, Bundle, RefineSection
-from asca_deploy.graph import Interface, Session, Tensor, check_interface
+from asca_deploy.graph import Interface, Session, Tensor, check_interface, run_graph
 from asca_deploy.pillar_pipeline import PillarPipeline, PreparedPillars
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.errors import BundleError
@@ -115,7 +115,7 @@ class RefinePipeline:
         """Confidence logits (R,) and residuals (R, 7) of the proposals of a scan, from its `refine_inputs`."""
         if not len(inputs["roi_features"]):
             return np.empty(0, np.float32), np.empty((0, 7), np.float32)
-        confidence, residuals = self._second.run(OUTPUTS, {name: inputs[name] for name in self._second.inputs})
+        confidence, residuals = run_graph(self._second, OUTPUTS, inputs)
         return confidence, residuals
 
 
