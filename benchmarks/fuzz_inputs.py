@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from asca_deploy import default_bundle_path, load_bundle
+from asca_deploy import default_bundle_path
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.config import Config, load_config
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan
@@ -149,7 +150,7 @@ def _bundle(folder: Path) -> Path:
 
 
 def _manifest(path: Path) -> Any:
-    return to_dict(load_bundle(path.parent))
+    return to_dict(load_pillar_bundle(path.parent))
 
 
 def _sections(text: str) -> list[tuple[str, str]]:

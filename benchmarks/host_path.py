@@ -18,8 +18,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from asca_deploy import Bundle, default_bundle_path, load_bundle, sample_scan_path
+from asca_deploy import default_bundle_path, sample_scan_path
+from asca_deploy.bundle import PillarBundle
 from asca_deploy.detector import usable_points
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.input_check import check_input
 from asca_pillars.data.scans.scan_reader import read_scan
@@ -39,7 +41,7 @@ def main(
     rounds: Annotated[int, typer.Option(help="Rounds of each form.")] = 51,
 ) -> None:
     """Print a table for each scan, as it is and as the camera sees it, and one for suppression."""
-    bundle = load_bundle(default_bundle_path())
+    bundle = load_pillar_bundle(default_bundle_path())
     print(f"{cpu_model()}, bundle {bundle.name}, {rounds} rounds\n")
     for path in scans or [sample_scan_path()]:
         points = read_scan(path).points
@@ -56,7 +58,7 @@ def camera_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(seen.all(axis=1))
 
 
-def host_path(points: NDArray[np.float32], bundle: Bundle) -> dict[str, Callable[[], Any]]:
+def host_path(points: NDArray[np.float32], bundle: PillarBundle) -> dict[str, Callable[[], Any]]:
     """What one frame asks for, stage by stage; the head's maps are noise in which 60 anchors find something."""
     spec, rng = bundle.spec, np.random.default_rng(0)
     height, width, count, _ = spec.anchors.shape

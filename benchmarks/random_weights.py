@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import nn
 
-from asca_deploy import Bundle, sample_scan_path
+from asca_deploy import sample_scan_path
+from asca_deploy.bundle import PillarBundle
 from asca_export.exporter import MIN_SCANS, export_bundle
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.config import load_config
@@ -48,7 +49,7 @@ def main(
 
 def export_random_weights(
     model: Checkpoint, points: NDArray[np.float32], out: Path, *, int8: bool, progress: Callable[[str], None]
-) -> Bundle:
+) -> PillarBundle:
     """Export, in 8 bits calibrated on a scan (N, 4), metres, LiDAR frame, each time without another eighth of it."""
     thinned = [np.delete(points, slice(part, None, MIN_SCANS), axis=0) for part in range(MIN_SCANS)]
     return export_bundle(

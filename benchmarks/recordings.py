@@ -23,7 +23,7 @@ import numpy as np
 import typer
 
 from asca_deploy import Detections, Detector, ScanQueue, Tracker
-from asca_deploy.manifest import load_bundle
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import find_bundle
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.boxes.box_records import FIELDS
@@ -103,7 +103,7 @@ def _tracker_cost(lines: list[dict[str, Any]]) -> str:
 def _paced(data: Path, threads: int, count: int) -> str:
     """Scans that come at their own pace: how many were dropped."""
     queue, detector = ScanQueue("drop"), Detector(threads=threads)
-    births = {one.name: one.score_threshold for one in load_bundle(find_bundle(None)).spec.classes}
+    births = {one.name: one.score_threshold for one in load_pillar_bundle(find_bundle(None)).spec.classes}
     tracker = Tracker(birth_score=births)
     scans = [item for _, item in zip(range(count), stamped_scans(data), strict=False)]
     detector(scans[0][1])

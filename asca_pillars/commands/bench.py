@@ -79,7 +79,7 @@ def bench(
     from rich.console import Console
 
     from asca_deploy import sample_scan_path
-    from asca_deploy.manifest import load_any_bundle
+    from asca_deploy.manifest import load_bundle
     from asca_pillars.commands.bench_parts import Parts, measure_parts, named_bundles
     from asca_pillars.commands.json_file import require_writable_json
     from asca_pillars.commands.models import open_detector
@@ -106,7 +106,7 @@ def bench(
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
     bundles = named_bundles([bundle, *(compare or ())])
     for folder in bundles.values():
-        load_any_bundle(folder)  # a damaged one is named now and not after minutes
+        load_bundle(folder)  # a damaged one is named now and not after minutes
     require_writable_json(json)
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     detector = open_detector(options, mounting=scan_input.mounting, around=around)

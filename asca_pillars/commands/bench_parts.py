@@ -22,7 +22,7 @@ from asca_deploy.benchmark import (
 )
 from asca_deploy.benchmark.box_differences import box_difference
 from asca_deploy.benchmark.matrix import ON_THE_CPU
-from asca_deploy.bundle import AnyBundle, Bundle
+from asca_deploy.bundle import Bundle, PillarBundle
 from asca_pillars.commands import bench_tables as show
 from asca_pillars.errors import ConfigError
 
@@ -96,9 +96,9 @@ def measure_parts(
     return result
 
 
-def _has_sparse_backbone(bundle: AnyBundle) -> bool:
+def _has_sparse_backbone(bundle: Bundle) -> bool:
     """Whether what it multiplies differs from scan to scan."""
-    return not isinstance(bundle, Bundle) or bundle.pillar.neck == "sparse"
+    return not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "sparse"
 
 
 def _like(detector: Detector, folder: Path) -> Detector:

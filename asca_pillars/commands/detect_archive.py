@@ -15,7 +15,7 @@ from rich.console import Console
 
 from asca_deploy import Detector
 from asca_deploy.bundle import MANIFEST
-from asca_deploy.manifest import load_any_bundle
+from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_bundle
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
@@ -222,7 +222,7 @@ def _job(
     mounting: Mounting, columns: int | None, options: RuntimeOptions, out: Path, *, score: float | None, around: bool
 ) -> DetectShard:
     bundle = find_bundle(options.bundle)
-    spec = load_any_bundle(bundle).spec  # a damaged one is named here, not by every worker
+    spec = load_bundle(bundle).spec  # a damaged one is named here, not by every worker
     if score is not None:
         spec.with_score_threshold(score)
     given = options.bundle

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_deploy import Detector, find_bundle
-from asca_deploy.manifest import load_any_bundle
+from asca_deploy.manifest import load_bundle
 from asca_deploy.tracker import Tracker
 from asca_pillars.commands import detect_tables as show
 from asca_pillars.commands.detect_files import RUN_FILE, RUN_MARK
@@ -184,7 +184,7 @@ class _Run:
 
 def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track; ConfigError if it is none."""
-    spec = load_any_bundle(find_bundle(bundle)).spec
+    spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)
     return {one.name: one.score_threshold for one in spec.classes}
 

@@ -111,7 +111,7 @@ def export(
     import numpy as np
     from rich.console import Console
 
-    from asca_deploy.bundle import MANIFEST, AnyBundle
+    from asca_deploy.bundle import MANIFEST, Bundle
     from asca_export.exporter import export_bundle, require_maskable
     from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
     from asca_export.refine_exporter import export_refine_bundle
@@ -142,7 +142,7 @@ def export(
     kind = loaded.config.model.kind
     if dense_neck:
         require_maskable(loaded.config.model, int8=int8)
-    kinds: dict[str, Callable[..., AnyBundle]] = {
+    kinds: dict[str, Callable[..., Bundle]] = {
         "pillar": partial(export_bundle, dense_neck=dense_neck),
         "pillar_refine": export_refine_bundle,
         "pv_rcnn": export_pv_rcnn_bundle,
@@ -161,7 +161,7 @@ def export(
     keeps = with_weights or source.path.parent.resolve() == out.resolve()
     weights = source.path if keeps else None
     with console.status("Exporting") as status:
-        bundle: AnyBundle = export_kind(
+        bundle: Bundle = export_kind(
             loaded,
             out,
             points,

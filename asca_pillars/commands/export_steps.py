@@ -11,7 +11,7 @@ from rich.progress import track
 from rich.table import Table
 
 from asca_deploy.bundle import Quantization
-from asca_deploy.manifest import load_any_bundle
+from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_checkpoint
 from asca_pillars.commands.extras import require
 from asca_pillars.data.scans.find_scans import find_scans
@@ -49,7 +49,7 @@ def open_source(source: Path) -> Source:
     if path == source:
         command = run_environment(source).get("command", "not recorded")
         return Source(path, checkpoint, {}, "not stated", command)
-    bundle = load_any_bundle(path.parent)
+    bundle = load_bundle(path.parent)
     scores = {each.name: each.score_threshold for each in bundle.spec.classes}
     return Source(path, checkpoint, scores, bundle.provenance.trained_on, bundle.provenance.command)
 

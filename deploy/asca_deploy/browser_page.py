@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 
 from asca_deploy.bundle import MANIFEST
-from asca_deploy.manifest import load_bundle
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import BundleError, ConfigError
 from asca_pillars.files import atomic_directory, write_json
@@ -41,7 +41,7 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
         ConfigError: the package is not one.
         OutputError: `out` holds something else.
     """
-    manifest = load_bundle(bundle)
+    manifest = load_pillar_bundle(bundle)
     if manifest.kind != "pillar" or manifest.spec.grid.pools:
         raise BundleError(
             f"{bundle}: kind {manifest.kind}, {manifest.spec.grid.map} map; the page runs kind pillar on a warped map"

@@ -239,7 +239,7 @@ class PvRcnnSection(Strict):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnyBundle(Strict):
+class Bundle(Strict):
     """What bundle.json holds of a detector of any kind."""
 
     name: str
@@ -270,7 +270,7 @@ class AnyBundle(Strict):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bundle(AnyBundle):
+class PillarBundle(Bundle):
     """Of a pillar detector, with or without a second stage; but for `pillar.layout`, which follows from `spec`."""
 
     kind: Literal["pillar", "pillar_refine"]
@@ -281,7 +281,7 @@ class Bundle(AnyBundle):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PvRcnnBundle(AnyBundle):
+class PvRcnnBundle(Bundle):
     """Of PV-RCNN."""
 
     kind: Literal["pv_rcnn"]

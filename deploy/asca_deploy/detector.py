@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
-from asca_deploy.bundle import AnyBundle
-from asca_deploy.manifest import load_any_bundle
+from asca_deploy.bundle import Bundle
+from asca_deploy.manifest import load_bundle
 from asca_deploy.open_pipeline import open_pipeline
 from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pipeline import Laps
@@ -110,7 +110,7 @@ class Detector:
         self.threads = check_threads(threads)
         check_onnxruntime()
         providers.require(provider, precision or "float32")
-        self.bundle: AnyBundle = load_any_bundle(self.folder)
+        self.bundle: Bundle = load_bundle(self.folder)
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
         self.pipeline, self.provider, self.precision, self.candidates = open_pipeline(

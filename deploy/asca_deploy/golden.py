@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import Bundle
+from asca_deploy.bundle import PillarBundle
 from asca_deploy.detector import Detector
 from asca_deploy.pillar_backbone import HeadAnswer
 from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
@@ -54,7 +54,7 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
     """
     detector = Detector(bundle, threads=1)
     described = detector.bundle
-    if not (isinstance(described, Bundle) and isinstance(detector.pipeline, PillarPipeline | RefinePipeline)):
+    if not (isinstance(described, PillarBundle) and isinstance(detector.pipeline, PillarPipeline | RefinePipeline)):
         raise BundleError(f"{bundle}: golden vectors are written of pillar detectors, and this is {described.kind}")
     stages = golden_stages(detector.pipeline, read_scan(scan).points)
     with atomic_directory(out, "asca export --golden", GOLDEN) as folder:
@@ -134,7 +134,7 @@ def _answered(answer: HeadAnswer) -> dict[str, NDArray[Any]]:
     return {**dict(zip(HeadMaps._fields, answer.maps, strict=True)), "cells": answer.cells}
 
 
-def _contents(bundle: Bundle, scan: Path, stages: Stages) -> dict[str, Any]:
+def _contents(bundle: PillarBundle, scan: Path, stages: Stages) -> dict[str, Any]:
     return {
         "schema_version": SCHEMA_VERSION,
         "bundle": bundle.name,

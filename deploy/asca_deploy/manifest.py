@@ -15,9 +15,9 @@ from asca_deploy.bundle import (
     MANIFEST,
     PILLAR_GRAPHS,
     SCHEMA_VERSION,
-    AnyBundle,
     Bundle,
     GraphFile,
+    PillarBundle,
     PvRcnnBundle,
 )
 from asca_deploy.layout import difference, layout_of
@@ -46,19 +46,21 @@ _LONGEST_REASON = 300
 _EXPORT_AGAIN = "export the bundle again with `asca export`"
 
 
-def load_bundle(folder: str | Path) -> Bundle:
-    """A pillar detector's bundle, with or without a second stage, see `load_any_bundle`.
+def load_pillar_bundle(folder: str | Path) -> PillarBundle:
+    """A pillar detector's bundle, with or without a second stage, see `load_bundle`.
 
     Raises:
-        BundleError: as `load_any_bundle`, or the bundle is of another kind.
+        BundleError: as `load_bundle`, or the bundle is of another kind.
     """
-    bundle = load_any_bundle(folder)
-    if not isinstance(bundle, Bundle):
-        raise BundleError(f"{folder}: a bundle of kind {bundle.kind}, where one of a pillar detector is needed")
+    bundle = load_bundle(folder)
+    if not isinstance(bundle, PillarBundle):
+        raise BundleError(
+            f"{folder}: a bundle of kind {bundle.kind}, where one of a pillar detector is needed, such as asca_sim"
+        )
     return bundle
 
 
-def load_any_bundle(folder: str | Path) -> AnyBundle:
+def load_bundle(folder: str | Path) -> Bundle:
     """Read and verify a bundle: every key, the graphs' SHA-256, their stamped metadata, the derived layout.
 
     Raises:
@@ -73,8 +75,8 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
     if old:
         data = upgrade_schema_2(data)
     data |= {name: first | data[name] for name, first in _LATER_KEYS.items() if isinstance(data.get(name), dict)}
-    family: type[AnyBundle] = PvRcnnBundle if data.get("kind") == "pv_rcnn" else Bundle
-    layout = _take_out_layout(manifest, data) if family is Bundle else None
+    family: type[Bundle] = PvRcnnBundle if data.get("kind") == "pv_rcnn" else PillarBundle
+    layout = _take_out_layout(manifest, data) if family is PillarBundle else None
     try:
         bundle = parse(family, data, str(manifest))
         if ignored := _first_difference(data, to_dict(bundle)):
@@ -84,7 +86,7 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
         raise BundleError(f"{_blamed(manifest, error)}; {_EXPORT_AGAIN}") from None
     except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
         raise BundleError(f"{manifest}: a value makes no sense ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
-    if isinstance(bundle, Bundle):
+    if isinstance(bundle, PillarBundle):
         _verify_refine(manifest, bundle)
     if set(bundle.graphs) != set(bundle.graph_names):
         raise BundleError(
@@ -93,7 +95,7 @@ def load_any_bundle(folder: str | Path) -> AnyBundle:
         )
     for graph in bundle.graphs.values():
         _verify_graph(folder, graph, stamped)
-    if isinstance(bundle, Bundle) and (differs := difference(layout, layout_of(bundle.spec))):
+    if isinstance(bundle, PillarBundle) and (differs := difference(layout, layout_of(bundle.spec))):
         raise BundleError(
             f"{manifest}: `pillar.layout.{differs}` is not what this version derives from `spec`; {_EXPORT_AGAIN}"
         )
@@ -133,7 +135,7 @@ def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def write_bundle_manifest(folder: str | Path, bundle: AnyBundle) -> None:
+def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
     """Write bundle.json beside the graphs in `folder`, which must lie there already, stamped with `essentials`."""
     data = bundle_to_json(bundle)
     for graph in bundle.graphs.values():
@@ -142,17 +144,17 @@ def write_bundle_manifest(folder: str | Path, bundle: AnyBundle) -> None:
         path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def bundle_to_json(bundle: AnyBundle) -> dict[str, Any]:
+def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
     """What bundle.json holds: the bundle's fields, and the layout that readers in other languages need."""
     data = {"schema_version": bundle.schema_version, **to_dict(bundle)}
-    if isinstance(bundle, Bundle):
+    if isinstance(bundle, PillarBundle):
         data["pillar"]["layout"] = layout_of(bundle.spec)
         if bundle.refine is None:
             del data["refine"]
     return data
 
 
-def essentials(bundle: AnyBundle) -> dict[str, Any]:
+def essentials(bundle: Bundle) -> dict[str, Any]:
     """What the export stamps into the metadata of each graph, see ESSENTIALS."""
     data = bundle_to_json(bundle)
     return {key: data[key] for key in _stamped_keys(data)}
@@ -168,7 +170,7 @@ def _stamped_keys(data: dict[str, Any]) -> tuple[str, ...]:
     return _ESSENTIALS_OF.get(str(data.get("kind")), ESSENTIALS)
 
 
-def _verify_refine(manifest: Path, bundle: Bundle) -> None:
+def _verify_refine(manifest: Path, bundle: PillarBundle) -> None:
     if bundle.kind != "pillar_refine":
         return
     if bundle.refine is None:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from asca_deploy import auto, providers
-from asca_deploy.bundle import AnyBundle, Bundle, PvRcnnBundle
+from asca_deploy.bundle import Bundle, PillarBundle, PvRcnnBundle
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
@@ -16,7 +16,7 @@ from asca_pillars.geometry.detections import Detections
 
 def open_pipeline(
     folder: Path,
-    bundle: AnyBundle,
+    bundle: Bundle,
     provider: providers.Provider | Literal["auto"],
     precision: providers.Precision | None,
     threads: int,
@@ -25,7 +25,7 @@ def open_pipeline(
 
     Args:
         folder: of the bundle.
-        bundle: its manifest, verified by `load_any_bundle`.
+        bundle: its manifest, verified by `load_bundle`.
         provider, threads: of the slowest network.
         precision: None for float32, with auto for any.
 
@@ -37,7 +37,7 @@ def open_pipeline(
     def open_on(name: providers.Provider, digits: providers.Precision) -> Pipeline[Any, Any]:
         if isinstance(bundle, PvRcnnBundle):
             return PvRcnnPipeline(folder, bundle, name, digits, threads)
-        assert isinstance(bundle, Bundle), "there are no other kinds"
+        assert isinstance(bundle, PillarBundle), "there are no other kinds"
         family = PillarPipeline if bundle.kind == "pillar" else RefinePipeline
         return family(folder, bundle, name, digits, threads)
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from asca_deploy import providers
-from asca_deploy.bundle import ENCODER, NECK, Bundle
+from asca_deploy.bundle import ENCODER, NECK, PillarBundle
 from asca_deploy.graph import Interface, Session, Tensor, check_interface
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.decode import HeadMaps
@@ -24,7 +24,7 @@ _DENSE_FORMS = {
 """Of each kind, which bundles besides."""
 
 
-def encoder_interface(bundle: Bundle) -> Interface:
+def encoder_interface(bundle: PillarBundle) -> Interface:
     """Of encoder.onnx: features of M points in P pillars -> features of the pillars."""
     inputs = {
         "features": Tensor("float32", (None, len(FEATURES))),
@@ -34,7 +34,7 @@ def encoder_interface(bundle: Bundle) -> Interface:
     return inputs, {PILLAR_FEATURES: Tensor(bundle.pillar.canvas.type, (None, bundle.pillar.channels))}
 
 
-def output_channels(bundle: Bundle, neck_channels: int = 0) -> dict[str, int]:
+def output_channels(bundle: PillarBundle, neck_channels: int = 0) -> dict[str, int]:
     """Of backbone.onnx; with `neck_channels` also those of NECK."""
     anchors = bundle.spec.anchors.shape[2]
     counts = (bundle.spec.scores_per_anchor * anchors, 7 * anchors, 2 * anchors)
@@ -42,7 +42,7 @@ def output_channels(bundle: Bundle, neck_channels: int = 0) -> dict[str, int]:
     return {**channels, NECK: neck_channels} if neck_channels else channels
 
 
-def backbone_interface(bundle: Bundle, neck_channels: int = 0, neck_type: str = "float32") -> Interface:
+def backbone_interface(bundle: PillarBundle, neck_channels: int = 0, neck_type: str = "float32") -> Interface:
     """Of backbone.onnx: a pseudo-image -> maps, channels last; with a sparse neck rows and tables -> rows.
 
     NECK is float32, or the uint8 steps of an 8-bit neck, which refine.onnx scales: `neck_type`.
@@ -62,7 +62,7 @@ def backbone_interface(bundle: Bundle, neck_channels: int = 0, neck_type: str = 
     return inputs, {name: Tensor(types[name], (None, count)) for name, count in channels.items()}
 
 
-def open_encoder(folder: Path, bundle: Bundle) -> Session:
+def open_encoder(folder: Path, bundle: PillarBundle) -> Session:
     """Open encoder.onnx of the bundle in this folder, on the CPU.
 
     Raises:
@@ -76,7 +76,7 @@ def open_encoder(folder: Path, bundle: Bundle) -> Session:
     return check_interface(path, session, *encoder_interface(bundle))
 
 
-def check_neck(bundle: Bundle, provider: str) -> None:
+def check_neck(bundle: PillarBundle, provider: str) -> None:
     """Raise ProviderError, which says what to choose, if this provider cannot run the bundle's neck."""
     if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
         raise ProviderError(

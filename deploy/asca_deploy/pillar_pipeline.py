@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
-from asca_deploy.bundle import BACKBONE, NECK, Bundle, CanvasFormat
+from asca_deploy.bundle import BACKBONE, NECK, CanvasFormat, PillarBundle
 from asca_deploy.graph import Session, check_interface, run_graph
 from asca_deploy.pillar_backbone import HeadAnswer, Maps, PillarBackbone
 from asca_deploy.pillar_graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
@@ -37,7 +37,7 @@ class PillarPipeline:
 
     Args:
         folder: of the bundle.
-        bundle: its manifest, verified by `load_bundle`.
+        bundle: its manifest, verified by `load_pillar_bundle`.
         provider, precision, threads: of the backbone.
 
     Raises:
@@ -50,7 +50,7 @@ class PillarPipeline:
     def __init__(
         self,
         folder: Path,
-        bundle: Bundle,
+        bundle: PillarBundle,
         provider: providers.Provider = "cpu",
         precision: providers.Precision = "float32",
         threads: int = 1,
@@ -100,7 +100,7 @@ class PillarPipeline:
 
 def open_backbone(
     path: Path,
-    bundle: Bundle,
+    bundle: PillarBundle,
     provider: providers.Provider,
     precision: providers.Precision,
     threads: int,
@@ -173,7 +173,7 @@ class CanvasBackbone:
 
     stage = "scatter"
 
-    def __init__(self, session: Session, bundle: Bundle) -> None:
+    def __init__(self, session: Session, bundle: PillarBundle) -> None:
         self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
         self._free = [self.new_canvas()]
 
@@ -228,7 +228,7 @@ class TableBackbone:
 
     stage = "tables"
 
-    def __init__(self, session: Session, bundle: Bundle, neck_channels: int = 0) -> None:
+    def __init__(self, session: Session, bundle: PillarBundle, neck_channels: int = 0) -> None:
         self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
         self._channels = output_channels(bundle, neck_channels)
         self._free = [self._new_builder()]

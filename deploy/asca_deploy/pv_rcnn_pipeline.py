@@ -78,7 +78,7 @@ class PvRcnnPipeline:
 
     Args:
         folder: of the bundle.
-        bundle: its manifest, verified by `load_any_bundle`.
+        bundle: its manifest, verified by `load_bundle`.
         provider, precision, threads: of the backbone; the other graphs have as many threads.
 
     Raises:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
-from asca_deploy.bundle import REFINE, Bundle, RefineSection
+from asca_deploy.bundle import REFINE, PillarBundle, RefineSection
 from asca_deploy.graph import Interface, Session, Tensor, check_interface, run_graph
 from asca_deploy.pillar_pipeline import PillarPipeline, PreparedPillars
 from asca_deploy.pipeline import Laps, Pipeline
@@ -56,7 +56,7 @@ class RefinePipeline:
 
     Args:
         folder: of the bundle.
-        bundle: its manifest, verified by `load_bundle`.
+        bundle: its manifest, verified by `load_pillar_bundle`.
         provider, precision, threads: of the backbone; the second stage has as many threads.
 
     Raises:
@@ -69,7 +69,7 @@ class RefinePipeline:
     def __init__(
         self,
         folder: Path,
-        bundle: Bundle,
+        bundle: PillarBundle,
         provider: providers.Provider = "cpu",
         precision: providers.Precision = "float32",
         threads: int = 1,

@@ -5,7 +5,7 @@ from importlib import resources
 from pathlib import Path
 
 from asca_deploy.bundle import MANIFEST, WEIGHTS
-from asca_deploy.manifest import load_any_bundle, refuse_run_folder
+from asca_deploy.manifest import load_bundle, refuse_run_folder
 from asca_pillars.errors import BundleError
 
 
@@ -55,7 +55,7 @@ def find_weights(bundle: str | Path) -> Path:
             f"{', '.join(having) or 'none'} has one"
         )
     known = (folder / MANIFEST).is_file()  # weights alone in a folder are weights, too
-    expected = load_any_bundle(folder).provenance.weights_file_sha256 if known else None
+    expected = load_bundle(folder).provenance.weights_file_sha256 if known else None
     if expected is not None and hashlib.sha256(path.read_bytes()).hexdigest() != expected:
         raise BundleError(f"{path}: is damaged, or of another bundle; copy the whole bundle again")
     return path

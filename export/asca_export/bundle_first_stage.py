@@ -10,7 +10,7 @@ import onnx
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import BACKBONE
-from asca_deploy.manifest import load_bundle
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
 from asca_deploy.shipped import find_bundle
 from asca_export.neck_output import add_neck_output
@@ -38,7 +38,7 @@ class BundleFirstStage:
     ) -> None:
         self._source = bundle, threads, precision
         folder = find_bundle(bundle)
-        manifest = load_bundle(folder)
+        manifest = load_pillar_bundle(folder)
         require_pillar_kind(folder, manifest.kind)
         if manifest.precision != precision:
             raise ExportError(f"{folder}: a bundle in {manifest.precision}; give one in {precision}")

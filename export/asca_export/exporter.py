@@ -16,15 +16,15 @@ from asca_deploy.bundle import (
     ENCODER,
     MANIFEST,
     WEIGHTS,
-    AnyBundle,
     Bundle,
     CanvasFormat,
     Parity,
+    PillarBundle,
     PillarSection,
     Provenance,
     RefineSection,
 )
-from asca_deploy.manifest import load_any_bundle, write_bundle_manifest
+from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
@@ -45,7 +45,7 @@ from asca_pillars.system import cpu_model, default_threads, git_revision, packag
 MIN_SCANS = 8
 LICENSE = "Apache-2.0"
 
-Described = TypeVar("Described", bound=AnyBundle)
+Described = TypeVar("Described", bound=Bundle)
 
 
 def export_bundle(
@@ -59,7 +59,7 @@ def export_bundle(
     dense_neck: bool = False,
     weights: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
-) -> Bundle:
+) -> PillarBundle:
     """Write the two graphs and bundle.json, and prove on `scans` that they are the checkpoint's detector.
 
     With `calibration` the proven float graphs then become 8-bit ones, and the bundle says how far those are from them.
@@ -98,7 +98,7 @@ def export_bundle(
         section = PillarSection(network.cpa, network.pillar_channels, CanvasFormat(), neck, cells)
         draft = draft_bundle(checkpoint, scans, trained_on, command, pillar=section, backbone_gmac=gmac)
 
-        def prove(signed: Bundle) -> Parity:
+        def prove(signed: PillarBundle) -> Parity:
             return prove_parity(detector, PillarPipeline(folder, signed, threads=default_threads()), scans)
 
         bundle = write_proven(folder, draft, prove, weights)
@@ -140,7 +140,7 @@ def draft_bundle(
     pillar: PillarSection,
     backbone_gmac: float,
     refine: RefineSection | None = None,
-) -> Bundle:
+) -> PillarBundle:
     """The manifest of a checkpoint in float32, without graphs and proof; scans (N, 4) and words as in `export_bundle`.
 
     Args:
@@ -149,7 +149,7 @@ def draft_bundle(
         refine: of the second stage, if there is one.
     """
     config, expected = checkpoint.config, checkpoint.expected_input
-    return Bundle(
+    return PillarBundle(
         name=config.name,
         kind="pillar" if refine is None else "pillar_refine",
         spec=pillar_spec(config),
@@ -184,7 +184,7 @@ def write_proven(
         draft = dataclasses.replace(draft, provenance=kept)
     signed = graphs.sign(folder, draft)
     write_bundle_manifest(folder, signed)
-    opened = load_any_bundle(folder)
+    opened = load_bundle(folder)
     assert isinstance(opened, type(draft)), "as it was written"
     bundle = dataclasses.replace(signed, parity=prove(opened))
     write_bundle_manifest(folder, bundle)

@@ -15,7 +15,7 @@ import torch
 from onnxscript import opset20 as op
 from torch import Tensor, nn
 
-from asca_deploy.bundle import AnyBundle
+from asca_deploy.bundle import Bundle
 from asca_deploy.manifest import essentials, graph_files
 from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
@@ -24,7 +24,7 @@ from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillar_config import TRACED_PILLARS
 from asca_pillars.pillars.pillarize import FEATURES
 
-B = TypeVar("B", bound=AnyBundle)
+B = TypeVar("B", bound=Bundle)
 
 OPSET = 20
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max

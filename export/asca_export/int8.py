@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, ENCODER, AnyBundle, Bundle, CanvasFormat, LayerQuantization, Quantization
+from asca_deploy.bundle import BACKBONE, ENCODER, Bundle, CanvasFormat, LayerQuantization, PillarBundle, Quantization
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
@@ -32,7 +32,7 @@ MAX_LOGIT_ERROR = 0.08
 SAME_IOU = 0.5
 
 Points = NDArray[np.float32]
-B = TypeVar("B", bound=AnyBundle)
+B = TypeVar("B", bound=Bundle)
 
 
 class Sensitivity(NamedTuple):
@@ -90,12 +90,12 @@ def calibration_scans(
 
 def quantize_bundle(
     folder: Path,
-    bundle: Bundle,
+    bundle: PillarBundle,
     detector: PillarDetector,
     calibration: Sequence[Points],
     scans: Sequence[Points],
     progress: Callable[[str], None] = lambda _: None,
-) -> Bundle:
+) -> PillarBundle:
     """Replace the graphs and the manifest in `folder` by 8-bit ones.
 
     Args:

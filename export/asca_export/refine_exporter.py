@@ -10,9 +10,9 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Bundle, Parity, RefineSection
+from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Parity, PillarBundle, RefineSection
 from asca_deploy.detector import Detector
-from asca_deploy.manifest import load_bundle
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
@@ -42,7 +42,7 @@ def export_refine_bundle(
     calibration: Sequence[NDArray[np.float32]] | None = None,
     weights: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
-) -> Bundle:
+) -> PillarBundle:
     """Write the first stage's graphs, refine.onnx and bundle.json, and prove on `scans` that they are the checkpoint's.
 
     Arguments as of `exporter.export_bundle`. The first stage is the one that the checkpoint was trained on. With
@@ -64,7 +64,7 @@ def export_refine_bundle(
         calibration = calibration_scans(calibration, scans, model.spec).used
     with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, "asca export", MANIFEST) as folder:
         first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, progress)
-        proposing = load_bundle(first)
+        proposing = load_pillar_bundle(first)
         _copy_first_stage(first, proposing, folder)
         progress("Exporting the second stage and proving parity")
         path, classes = graphs.graph_path(folder, REFINE), len(model.spec.classes)
@@ -80,7 +80,7 @@ def export_refine_bundle(
             refine=section,
         )
 
-        def prove(signed: Bundle) -> Parity:
+        def prove(signed: PillarBundle) -> Parity:
             pipeline = RefinePipeline(folder, signed, threads=default_threads())
             return prove_refine_parity(detector.refiner, stage, pipeline, model, scans)
 
@@ -92,21 +92,21 @@ def export_refine_bundle(
         return _in_eight_bits(folder, bundle, first, eight_bit, scans, calibration)
 
 
-def _copy_first_stage(first: Path, proposing: Bundle, folder: Path) -> None:
+def _copy_first_stage(first: Path, proposing: PillarBundle, folder: Path) -> None:
     shutil.copyfile(first / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
     onnx.save(add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file)), graphs.graph_path(folder, BACKBONE))
 
 
 def _in_eight_bits(
     folder: Path,
-    bundle: Bundle,
+    bundle: PillarBundle,
     first: Path,
     eight_bit: Path,
     scans: Sequence[NDArray[np.float32]],
     calibration: Sequence[NDArray[np.float32]],
-) -> Bundle:
+) -> PillarBundle:
     """Replace the first stage's graphs in `folder` by those of `eight_bit`, and compare the refined boxes."""
-    proposing = load_bundle(eight_bit)
+    proposing = load_pillar_bundle(eight_bit)
     alike = proposing.spec.grid == bundle.spec.grid and proposing.pillar.neck == bundle.pillar.neck
     if proposing.quantization is None or not alike:
         raise ExportError(f"{eight_bit}: not the 8-bit form of the first stage; export it again")

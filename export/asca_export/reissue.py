@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from asca_deploy.bundle import MANIFEST, WEIGHTS
-from asca_deploy.manifest import load_bundle, write_bundle_manifest
+from asca_deploy.manifest import load_pillar_bundle, write_bundle_manifest
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
 from asca_pillars.data.measure_input import measure_expected_input
@@ -37,7 +37,7 @@ def main(
     if out.exists():
         raise typer.BadParameter(f"{out} exists; name another folder")
     source = find_bundle(bundle)
-    loaded = load_bundle(source)
+    loaded = load_pillar_bundle(source)
     expected = measure_expected_input((read_scan(path).points for path in find_scans(scans)), camera_view)
     with atomic_directory(out, "asca export", MANIFEST) as folder:
         for name, graph in loaded.graphs.items():

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_deploy import Bundle, Detector, default_bundle_path, load_bundle
+from asca_deploy import Detector, default_bundle_path
+from asca_deploy.bundle import PillarBundle
+from asca_deploy.manifest import load_pillar_bundle
 from benchmarks.host_path import camera_view, host_path, report
 from benchmarks.sparse_neck import compare_views, export_both
 from tests.scenes import make_scene
@@ -27,7 +29,7 @@ def test_both_necks_are_exported_once(tmp_path: Path) -> None:
     bundles = {neck: Detector(folder).bundle for neck, folder in folders.items()}
     for neck in ("dense", "sparse"):
         bundle = bundles[neck]
-        assert isinstance(bundle, Bundle) and bundle.pillar.neck == neck and bundle.precision == "float32"
+        assert isinstance(bundle, PillarBundle) and bundle.pillar.neck == neck and bundle.precision == "float32"
     assert bundles["sparse"].backbone_gmac < bundles["dense"].backbone_gmac
     count = len(said)
     assert export(progress=said.append) == folders and len(said) == count > 0
@@ -52,6 +54,6 @@ def test_the_camera_sees_ahead() -> None:
 
 
 def test_the_host_path_is_timed_with_its_tables(capsys: pytest.CaptureFixture[str]) -> None:
-    report(partial(host_path, make_scene(0)[0], load_bundle(default_bundle_path())), rounds=1)
+    report(partial(host_path, make_scene(0)[0], load_pillar_bundle(default_bundle_path())), rounds=1)
     rows = [row for row in capsys.readouterr().out.splitlines() if row.startswith("|")][2:]
     assert [row.split("|")[1].strip() for row in rows] == ["input", "pillarize", "decode", "tables", "all"]

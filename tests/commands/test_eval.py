@@ -13,7 +13,8 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 
-from asca_deploy import default_bundle_path, load_bundle
+from asca_deploy import default_bundle_path
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.commands import eval as command
 from asca_pillars.commands.eval_steps import Protocol
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
@@ -142,7 +143,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
     report = evaluate(data=root, out=out, gallery=1)
     assert "asca_sim_int8 on" in report["subject"] and report["frames"] == 2
     assert report["model"]["min_score"] == 0.05 and len(report["model"]["sha256"]["encoder"]) == 64
-    own = {spec.name: spec.score_threshold for spec in load_bundle(default_bundle_path()).spec.classes}
+    own = {spec.name: spec.score_threshold for spec in load_pillar_bundle(default_bundle_path()).spec.classes}
     assert {point["class_name"]: point["score"] for point in report["operating_points"]} == own
     names = {path.name for path in (out / "predictions").iterdir()}
     assert names == {"000001.txt", "000002.txt", "made_by.json"}

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from asca_deploy import Detector, load_bundle
+from asca_deploy import Detector
 from asca_deploy.bundle import WEIGHTS
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.models.checkpoint import load_checkpoint, weights_sha256
 from tests.export.test_sparse_bundle import sparse_checkpoint
@@ -39,7 +40,7 @@ def test_a_bundle_with_its_weights_gets_a_dense_neck(with_weights: Path, scans: 
     out = tmp_path / "dense"
     exported = run_here("export", with_weights, "--dense-neck", "-o", out, "--scans", scans, "--score", "Cyclist=0.06")
     assert exported.returncode == 0, exported.stderr
-    before, after = load_bundle(with_weights), load_bundle(out)
+    before, after = load_pillar_bundle(with_weights), load_pillar_bundle(out)
     assert (before.pillar.neck, after.pillar.neck) == ("sparse", "dense")
     assert [each.score_threshold for each in after.spec.classes] == [0.05, 0.02, 0.06], "the bundle's, then the option"
     assert after.provenance.trained_on == "random numbers" and after.provenance.weights_file is None
@@ -54,7 +55,7 @@ def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path
     for score in (0.1, 0.2):
         exported = run_here("export", folder, "-o", folder, "--scans", scans, "--score", f"Car={score}")
         assert exported.returncode == 0, exported.stderr
-        assert load_bundle(folder).spec.classes[0].score_threshold == score
+        assert load_pillar_bundle(folder).spec.classes[0].score_threshold == score
     weights, kept = (load_checkpoint(each / WEIGHTS).detector.state_dict() for each in (with_weights, folder))
     assert weights_sha256(weights) == weights_sha256(kept)
 

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from asca_deploy.bundle import Bundle, CanvasFormat, PillarSection, Provenance
+from asca_deploy.bundle import CanvasFormat, PillarBundle, PillarSection, Provenance
 from asca_deploy.manifest import essentials, graph_files, write_bundle_manifest
 from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_pillars.data.expected_input import ExpectedInput
@@ -151,7 +151,7 @@ def write_bundle(folder: Path, uses_counts: bool = True, active_cells: MaskRule 
         versions={"onnx": onnx.__version__},
         machine="test",
     )
-    bundle = Bundle(
+    bundle = PillarBundle(
         name="tiny",
         kind="pillar",
         spec=SPEC,
@@ -170,7 +170,7 @@ def write_bundle(folder: Path, uses_counts: bool = True, active_cells: MaskRule 
     return folder
 
 
-def sign(folder: Path, bundle: Bundle) -> None:
+def sign(folder: Path, bundle: PillarBundle) -> None:
     """Stamp the graphs in `folder` with the essentials of `bundle`, and write it with their SHA-256."""
     for name in ("encoder.onnx", "backbone.onnx"):
         model = onnx.load(folder / name)

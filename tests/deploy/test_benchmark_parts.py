@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_deploy import Detector, load_bundle
+from asca_deploy import Detector
 from asca_deploy.benchmark import cold, cold_start, measure_roofline, measure_scaling, measure_throughput
 from asca_deploy.benchmark import resident_memory as process_memory
 from asca_deploy.benchmark.roofline import SIZE, gemm_rate
 from asca_deploy.benchmark.scaling import resample
 from asca_deploy.benchmark.throughput import FRAMES
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.data.mounting import Mounting, read_pose
 from asca_pillars.errors import AscaError
 from asca_pillars.geometry.frame_change import FrameChange
@@ -87,7 +88,7 @@ def test_the_product_of_matrices_runs_and_its_rate_is_counted_in_macs(
 def test_roofline(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {"float32": 100.0, "int8": 400.0}
     monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: rates[kind] * threads)
-    bundle = replace(load_bundle(tiny_bundle), backbone_gmac=5.0)
+    bundle = replace(load_pillar_bundle(tiny_bundle), backbone_gmac=5.0)
     found = measure_roofline(bundle, backbone_ms=50.0, threads=2)
     assert found.achieved_gmac_s == pytest.approx(100)
     assert (found.type, found.share) == ("float32", pytest.approx(0.5))

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_deploy import load_bundle, sample_scan_path, shipped_bundles
+from asca_deploy import sample_scan_path, shipped_bundles
 from asca_deploy.golden import write_golden
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ScanError
 from asca_pillars.geometry.overlap import bev_iou
@@ -70,7 +71,7 @@ def assert_same_stages(golden: Path, bundle: Path) -> None:
         assert float(difference) <= (1e-5 if name.endswith((".boxes", ".scores")) else 0), (name, difference)
     compared = {"dense": 12, "sub": 11 + 3 * len(("strided", "same", "places"))}
     compared["fine"] = compared["sub"] + 1  # first_0
-    assert len(differences) == compared[load_bundle(bundle).pillar.active_cells or "dense"]
+    assert len(differences) == compared[load_pillar_bundle(bundle).pillar.active_cells or "dense"]
 
 
 def test_overlaps_of_random_boxes() -> None:

@@ -15,9 +15,10 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from asca_deploy import Detector, load_bundle, sample_scan_path, shipped_bundles
+from asca_deploy import Detector, sample_scan_path, shipped_bundles
 from asca_deploy.browser_page import ORT_FILES, find_ort_web, write_page
 from asca_deploy.golden import golden_stages
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_pillars.cli import app
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
@@ -181,9 +182,9 @@ def test_a_folder_of_something_else_is_left_alone(made_up_package: Path, tmp_pat
 
 
 def test_a_bundle_that_the_page_cannot_run(made_up_package: Path, tmp_path: Path, monkeypatch) -> None:
-    bundle = load_bundle(shipped_bundles()["asca_sim_int8"])
+    bundle = load_pillar_bundle(shipped_bundles()["asca_sim_int8"])
     pooled = replace(bundle.spec, grid=replace(bundle.spec.grid, zones=3, map="pooled"))
-    monkeypatch.setattr("asca_deploy.browser_page.load_bundle", lambda _: replace(bundle, spec=pooled))
+    monkeypatch.setattr("asca_deploy.browser_page.load_pillar_bundle", lambda _: replace(bundle, spec=pooled))
     with pytest.raises(BundleError, match="kind pillar, pooled map; the page runs"):
         write_page(tmp_path / "page", tmp_path, sample_scan_path(), made_up_package)
     with pytest.raises(BundleError, match="kind pillar_refine, warped map; the page runs"):

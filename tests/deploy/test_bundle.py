@@ -4,7 +4,7 @@ import pytest
 
 from asca_deploy import shipped
 from asca_deploy.bundle import CanvasFormat, PillarSection
-from asca_deploy.manifest import load_any_bundle
+from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
 from asca_pillars.errors import BundleError, ConfigError
 
@@ -29,7 +29,7 @@ def test_weights_lie_in_some_bundles(tiny_bundle: Path, tmp_path: Path, monkeypa
         shipped.find_weights("plain")
     (tmp_path / "run" / "checkpoints").mkdir(parents=True)
     (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
-    for read in (shipped.find_weights, load_any_bundle):
+    for read in (shipped.find_weights, load_bundle):
         with pytest.raises(BundleError, match=r"training run, no model bundle; give its checkpoint, .*last\.ckpt"):
             read(tmp_path / "run")
     ships["heavy"] = with_weights
@@ -40,7 +40,7 @@ def test_weights_lie_in_some_bundles(tiny_bundle: Path, tmp_path: Path, monkeypa
 
 def test_shipped_files_lie_in_the_package() -> None:
     assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "asca_sim_int8")
-    assert [(name, load_any_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
+    assert [(name, load_bundle(folder).name) for name, folder in shipped_bundles().items()] == [
         ("asca_refine_sim", "asca_refine_sim"),
         ("asca_refine_sim_int8", "asca_refine_sim_int8"),
         ("asca_sim", "asca_sim"),

@@ -8,7 +8,8 @@ import onnxruntime
 import pytest
 from numpy.typing import NDArray
 
-from asca_deploy import Detections, Detector, load_bundle
+from asca_deploy import Detections, Detector
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.errors import BundleError, ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.pillarize import PillarCounts
@@ -23,7 +24,7 @@ def same(a: Detections, b: Detections) -> bool:
 
 def detect_by_hand(bundle: Path, points: Points) -> Detections:
     """The same chain out of plain parts: raw sessions, and a scatter by loop onto fresh zeros."""
-    spec = load_bundle(bundle).spec
+    spec = load_pillar_bundle(bundle).spec
     pillars = spec.pillarize(points)
     encoder = onnxruntime.InferenceSession(bundle / "encoder.onnx", providers=["CPUExecutionProvider"])
     backbone = onnxruntime.InferenceSession(bundle / "backbone.onnx", providers=["CPUExecutionProvider"])
@@ -91,7 +92,7 @@ def test_two_million_points(tiny_bundle: Path, scan: Points) -> None:
     detections = detector(crowded)
     assert same(detections, detect_by_hand(tiny_bundle, crowded))
     counts = detections.report.counts
-    limits = load_bundle(tiny_bundle).spec.limits
+    limits = load_pillar_bundle(tiny_bundle).spec.limits
     assert counts.points == 2_000_000
     kept = counts.points - counts.points_outside - counts.points_over_limit
     assert 0 < kept <= limits.max_pillars * limits.max_points
@@ -188,7 +189,7 @@ def test_report(tiny_bundle: Path, scan: Points) -> None:
     assert tuple(report.times_ms) == ("input", *STAGES)
     assert all(time_ms > 0 for time_ms in report.times_ms.values())
     assert report.total_ms == pytest.approx(sum(report.times_ms.values()))
-    assert report.counts == load_bundle(tiny_bundle).spec.pillarize(scan).stats
+    assert report.counts == load_pillar_bundle(tiny_bundle).spec.pillarize(scan).stats
     assert report.warnings == ()
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from asca_deploy import Detector, load_bundle
+from asca_deploy import Detector
 from asca_deploy.golden import write_golden
+from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.cli import app
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.errors import ConfigError, OutputError
@@ -58,7 +59,7 @@ def test_the_manifest_says_which_bundle_and_scan(tiny_bundle: Path, scan_path: P
     assert "boxes of a.bin" in " ".join(result.output.split())
     contents = json.loads((tmp_path / "golden" / "golden.json").read_text())
     assert (contents["bundle"], contents["scan"], contents["precision"]) == ("tiny", "a.bin", "float32")
-    assert contents["graphs"] == {name: graph.sha256 for name, graph in load_bundle(tiny_bundle).graphs.items()}
+    assert contents["graphs"] == {name: graph.sha256 for name, graph in load_pillar_bundle(tiny_bundle).graphs.items()}
     for entry in contents["stages"]:
         for array in entry["arrays"].values():
             stored = np.load(tmp_path / "golden" / array["file"])

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.manifest import load_bundle
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.providers import Provider
 from asca_pillars.errors import BundleError
 from tests.deploy.conftest import needs_openvino, sign
@@ -18,7 +18,7 @@ by_provider = pytest.mark.parametrize("provider", ["cpu", pytest.param("openvino
 
 def respoil(bundle: Path, graph: str, spoil: Callable[[onnx.ModelProto], None]) -> Path:
     """Change a graph and sign it again, so that only its contents are wrong."""
-    good = load_bundle(bundle)
+    good = load_pillar_bundle(bundle)
     model = onnx.load(bundle / graph)
     spoil(model)
     onnx.save(model, bundle / graph)
@@ -74,7 +74,7 @@ def test_outputs_are_found_by_name_not_by_order(
     ],
 )
 def test_graphs_of_another_model(bundle_copy: Path, field: str, value: float, message: str) -> None:
-    good = load_bundle(bundle_copy)
+    good = load_pillar_bundle(bundle_copy)
     if field == "channels":
         other = replace(good, pillar=replace(good.pillar, channels=int(value)))
     else:
@@ -87,7 +87,7 @@ def test_graphs_of_another_model(bundle_copy: Path, field: str, value: float, me
 
 @by_provider
 def test_fewer_classes_than_the_head(bundle_copy: Path, provider: Provider) -> None:
-    good = load_bundle(bundle_copy)
+    good = load_pillar_bundle(bundle_copy)
     sign(bundle_copy, replace(good, spec=replace(good.spec, classes=good.spec.classes[:1])))
     with pytest.raises(BundleError, match=r"output `scores` is .*\(1, 12, 28, 6\).*needs .*\(1, 12, 28, 2\)"):
         Detector(bundle_copy, provider=provider)

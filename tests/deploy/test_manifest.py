@@ -10,7 +10,7 @@ import pytest
 
 from asca_deploy.bundle import MANIFEST, SCHEMA_VERSION, GraphFile, Parity
 from asca_deploy.layout import difference, layout_of
-from asca_deploy.manifest import bundle_to_json, graph_files, load_bundle, write_bundle_manifest
+from asca_deploy.manifest import bundle_to_json, graph_files, load_pillar_bundle, write_bundle_manifest
 from asca_pillars.errors import BundleError
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -28,22 +28,22 @@ def edit(bundle: Path, change: Callable[[dict[str, Any]], object]) -> Path:
 
 def assert_refused(bundle: Path, message: str) -> None:
     with pytest.raises(BundleError, match=message) as caught:
-        load_bundle(bundle)
+        load_pillar_bundle(bundle)
     text = str(caught.value)
     assert text.isprintable() and len(text) < 1500
     assert str(bundle) in text  # whose fault it is
 
 
 def test_round_trip(bundle_copy: Path) -> None:
-    bundle = load_bundle(bundle_copy)
+    bundle = load_pillar_bundle(bundle_copy)
     proven = replace(bundle, parity=Parity(2e-6, 1e-5, 1e-6, scans=8, tolerance=1e-3))
     write_bundle_manifest(bundle_copy, proven)
-    assert load_bundle(str(bundle_copy)) == proven
+    assert load_pillar_bundle(str(bundle_copy)) == proven
     assert json.loads((bundle_copy / MANIFEST).read_text()) == bundle_to_json(proven)
 
 
 def test_layout_of_the_papers_grid(tiny_bundle: Path) -> None:
-    bundle = replace(load_bundle(tiny_bundle), spec=PillarSpec())
+    bundle = replace(load_pillar_bundle(tiny_bundle), spec=PillarSpec())
     layout = bundle_to_json(bundle)["pillar"]["layout"]
     # 69.12 m in three zones of 23.04 m: 72 x 0.32, 144 x 0.16 and 288 x 0.08 (DESIGN 4.1).
     assert layout["x_zones"] == [
@@ -59,7 +59,7 @@ def test_layout_of_the_papers_grid(tiny_bundle: Path) -> None:
 
 def test_layout_of_a_uniform_grid_is_one_zone(tiny_bundle: Path) -> None:
     grid = PillarGrid(x_range_m=(3.0, 15.8), y_range_m=(-2.56, 1.28), v_max_m=0.16, zones=1)
-    layout = bundle_to_json(replace(load_bundle(tiny_bundle), spec=PillarSpec(grid=grid)))["pillar"]["layout"]
+    layout = bundle_to_json(replace(load_pillar_bundle(tiny_bundle), spec=PillarSpec(grid=grid)))["pillar"]["layout"]
     assert layout["x_zones"] == [{"start_m": 3.0, "pillar_m": 0.16, "pillars": 80}]
 
 
@@ -80,7 +80,7 @@ NOT_THE_GRAPHS = r"`{}` is not the one that \w+\.onnx was exported with; .*expor
 def test_a_layout_that_does_not_follow_from_the_spec(
     tiny_bundle: Path, change: Callable[[dict[str, Any]], object], key: str
 ) -> None:
-    layout = layout_of(load_bundle(tiny_bundle).spec)
+    layout = layout_of(load_pillar_bundle(tiny_bundle).spec)
     written = json.loads(json.dumps(layout))
     assert difference(written, layout) is None
     change(written)
@@ -89,7 +89,7 @@ def test_a_layout_that_does_not_follow_from_the_spec(
 
 
 def test_a_layout_within_rounding_is_accepted(tiny_bundle: Path) -> None:
-    layout = layout_of(load_bundle(tiny_bundle).spec)
+    layout = layout_of(load_pillar_bundle(tiny_bundle).spec)
     written = json.loads(json.dumps(layout))
     written["x_zones"][0].update(start_m=2.0000000004)
     assert difference(written, layout) is None
@@ -97,7 +97,7 @@ def test_a_layout_within_rounding_is_accepted(tiny_bundle: Path) -> None:
 
 def test_a_signed_layout_that_does_not_follow_from_the_spec(bundle_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a version whose features meant something else would have written it."""
-    bundle = load_bundle(bundle_copy)
+    bundle = load_pillar_bundle(bundle_copy)
     other = layout_of(bundle.spec) | {"features": ["z", "y", "x"]}
     with monkeypatch.context() as patched:
         patched.setattr("asca_deploy.manifest.layout_of", lambda spec: other)
@@ -139,9 +139,9 @@ def test_wrong_keys_and_values(bundle_copy: Path, change: Callable[[dict[str, An
 
 
 def test_provenance_need_not_say_which_weights(bundle_copy: Path) -> None:
-    before = load_bundle(bundle_copy)
+    before = load_pillar_bundle(bundle_copy)
     edit(bundle_copy, lambda data: data["provenance"].pop("weights_sha256"))
-    assert load_bundle(bundle_copy) == before
+    assert load_pillar_bundle(bundle_copy) == before
 
 
 @pytest.mark.parametrize("version", [None, "1", 1.0, True, [1]])
@@ -196,11 +196,11 @@ def test_no_bundle_there(tmp_path: Path) -> None:
 
 
 def test_a_manifest_is_not_written_for_graphs_that_are_not_there(bundle_copy: Path, tmp_path: Path) -> None:
-    bundle = load_bundle(bundle_copy)
+    bundle = load_pillar_bundle(bundle_copy)
     swapped = replace(bundle, graphs={**bundle.graphs, "backbone": GraphFile("other.onnx", "0" * 64)})
     with pytest.raises(BundleError, match=r"other\.onnx is missing"):
         write_bundle_manifest(bundle_copy, swapped)
-    assert load_bundle(bundle_copy) == bundle
+    assert load_pillar_bundle(bundle_copy) == bundle
 
 
 def test_an_edit_of_what_boxes_depend_on_is_noticed(bundle_copy: Path) -> None:
@@ -209,7 +209,7 @@ def test_an_edit_of_what_boxes_depend_on_is_noticed(bundle_copy: Path) -> None:
 
 
 def test_graphs_without_a_stamp(bundle_copy: Path) -> None:
-    bundle = load_bundle(bundle_copy)
+    bundle = load_pillar_bundle(bundle_copy)
     model = onnx.load(bundle_copy / "encoder.onnx")
     del model.metadata_props[:]
     onnx.save(model, bundle_copy / "encoder.onnx")
@@ -218,7 +218,7 @@ def test_graphs_without_a_stamp(bundle_copy: Path) -> None:
 
 
 def test_graphs_with_external_data(bundle_copy: Path) -> None:
-    bundle = load_bundle(bundle_copy)
+    bundle = load_pillar_bundle(bundle_copy)
     model = onnx.load(bundle_copy / "backbone.onnx")
     onnx.save(model, bundle_copy / "backbone.onnx", save_as_external_data=True, location="w.bin", size_threshold=0)
     data = json.loads((bundle_copy / MANIFEST).read_text())

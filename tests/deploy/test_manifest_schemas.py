@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.bundle import MANIFEST, PvRcnnBundle
-from asca_deploy.manifest import graph_files, load_any_bundle, load_bundle
+from asca_deploy.manifest import graph_files, load_bundle, load_pillar_bundle
 from asca_deploy.shipped import shipped_bundles
 from asca_pillars.errors import BundleError
 from asca_pillars.schema import to_dict
@@ -44,7 +44,7 @@ def as_schema_2(folder: Path) -> Path:
 def test_a_bundle_that_names_no_neck_has_a_dense_one(tmp_path: Path) -> None:
     folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
     assert "neck" not in json.loads((folder / MANIFEST).read_text())["pillar"]
-    section = load_bundle(folder).pillar
+    section = load_pillar_bundle(folder).pillar
     assert (section.neck, section.active_cells) == ("dense", None)
     edit(folder, lambda data: data["pillar"].update(neck="sparse", active_cells="fine"))
     assert_refused(folder, NOT_THE_GRAPHS.format("pillar"))
@@ -61,12 +61,12 @@ def test_refined_boxes_of_an_older_bundle_have_the_scores_that_they_had(tmp_path
         onnx.save(model, folder / graph["file"])
     data["graphs"] = {name: to_dict(file) for name, file in graph_files(folder, data["graphs"]).items()}
     (folder / MANIFEST).write_text(json.dumps(data))
-    bundle = load_any_bundle(folder)
+    bundle = load_bundle(folder)
     assert isinstance(bundle, PvRcnnBundle) and bundle.pv_rcnn.scores == "second"
 
 
 def test_schema_2_is_read_as_kind_pillar(tiny_bundle: Path, bundle_copy: Path, scan: NDArray[np.float32]) -> None:
-    now, then = load_bundle(tiny_bundle), load_bundle(as_schema_2(bundle_copy))
+    now, then = load_pillar_bundle(tiny_bundle), load_pillar_bundle(as_schema_2(bundle_copy))
     expected = replace(now.expected_input, camera_view=True)
     assert then == replace(now, graphs=then.graphs, expected_input=expected, expected_input_from="export")
     assert np.array_equal(Detector(bundle_copy)(scan).boxes, Detector(tiny_bundle)(scan).boxes)
@@ -122,7 +122,7 @@ def test_every_field_is_refused_or_harmless(tmp_path: Path, old: bool) -> None:
     folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
     if old:
         as_schema_2(folder)
-    good, text = load_bundle(folder), (folder / MANIFEST).read_text()
+    good, text = load_pillar_bundle(folder), (folder / MANIFEST).read_text()
     paths = [path for path in leaves(json.loads(text)) if path]
     assert len(paths) > 150
     rng = np.random.default_rng(0)
@@ -139,7 +139,7 @@ def test_every_field_is_refused_or_harmless(tmp_path: Path, old: bool) -> None:
                 parent[path[-1]] = HOSTILE[mutation]
             (folder / MANIFEST).write_text(json.dumps(data))
             try:
-                found = load_bundle(folder)
+                found = load_pillar_bundle(folder)
             except BundleError as error:
                 assert str(error).isprintable() and len(str(error)) < 1500 and str(folder) in str(error)
                 refused += 1

@@ -14,8 +14,8 @@ import pytest
 import torch
 import typer
 
-from asca_deploy import Detector, load_bundle
-from asca_deploy.manifest import write_bundle_manifest
+from asca_deploy import Detector
+from asca_deploy.manifest import load_pillar_bundle, write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs, reissue
 from asca_export.exporter import export_bundle
@@ -40,7 +40,7 @@ READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point")
 
 @pytest.mark.parametrize("cpa", READINGS)
 def test_bundle_is_the_same_detector(exported: Exports, cpa: CpaReading) -> None:
-    bundle = load_bundle(exported(cpa))
+    bundle = load_pillar_bundle(exported(cpa))
     assert bundle.spec == SPEC and bundle.pillar.cpa == cpa and bundle.provenance.steps == 0
     parity = bundle.parity
     assert parity is not None and parity.scans == len(SCANS)
@@ -107,18 +107,18 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
 
 
 def test_the_expected_input_is_the_checkpoints_own(exported: Exports, tmp_path: Path) -> None:
-    checkpoint, measured = tiny_checkpoint("none"), load_bundle(exported("none"))
+    checkpoint, measured = tiny_checkpoint("none"), load_pillar_bundle(exported("none"))
     assert measured.expected_input == measure_expected_input(SCANS, checkpoint.config.data.camera_view)
     assert measured.expected_input_from == "export"
     known = ExpectedInput((1, 2), (0.1, 0.2), None, camera_view=False)
     copied = export_bundle(checkpoint._replace(expected_input=known), tmp_path / "copied", SCANS)
-    assert load_bundle(tmp_path / "copied") == copied
+    assert load_pillar_bundle(tmp_path / "copied") == copied
     assert (copied.expected_input, copied.expected_input_from) == (known, "training")
 
 
 def test_a_bundle_issued_again_runs_the_same_networks(exported: Exports, tmp_path: Path) -> None:
     folder = shutil.copytree(exported("none"), tmp_path / "old")
-    described = load_bundle(folder)
+    described = load_pillar_bundle(folder)
     provenance = replace(described.provenance, weights_file="weights.ckpt")
     write_bundle_manifest(folder, replace(described, provenance=provenance))
     (folder / "weights.ckpt").write_bytes(b"weights")
@@ -126,7 +126,7 @@ def test_a_bundle_issued_again_runs_the_same_networks(exported: Exports, tmp_pat
     for number, points in enumerate(SCANS[:2]):
         write_scan(tmp_path / "scans" / f"{number}.bin", points)
     reissue.main(folder, tmp_path / "scans", tmp_path / "new", camera_view=True, training=True)
-    old, new = load_bundle(folder), load_bundle(tmp_path / "new")
+    old, new = load_pillar_bundle(folder), load_pillar_bundle(tmp_path / "new")
     assert (tmp_path / "new" / "weights.ckpt").read_bytes() == b"weights"
     assert new.expected_input == measure_expected_input(SCANS[:2], camera_view=True)
     assert new == replace(old, expected_input=new.expected_input, expected_input_from="training", graphs=new.graphs)

@@ -11,7 +11,9 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
-from asca_deploy import Bundle, Detector, load_bundle
+from asca_deploy import Detector
+from asca_deploy.bundle import PillarBundle
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar_pipeline import CanvasBackbone, PillarPipeline
 from asca_export import graphs, int8
 from asca_export.exporter import export_bundle
@@ -24,7 +26,7 @@ from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 Exports = Callable[[CpaReading], Path]
 
 
-def export_int8(folder: Path) -> Bundle:
+def export_int8(folder: Path) -> PillarBundle:
     checkpoint = tiny_checkpoint("channel")
     spec = pillar_spec(checkpoint.config).with_score_threshold(0.02)  # random weights are never sure of anything
     checkpoint = checkpoint._replace(
@@ -34,12 +36,12 @@ def export_int8(folder: Path) -> Bundle:
     return export_bundle(checkpoint, folder, SCANS, calibration=[*CALIBRATION, SCANS[3], SCANS[0].copy()])
 
 
-def quantize(folder: Path, copy: Path, calibration: list[np.ndarray]) -> Bundle:
+def quantize(folder: Path, copy: Path, calibration: list[np.ndarray]) -> PillarBundle:
     """The second half of such an export, on a copy of a proven float bundle."""
     shutil.copytree(folder, copy)
     detector = tiny_checkpoint("channel").detector
     assert isinstance(detector, PillarDetector)
-    return int8.quantize_bundle(copy, load_bundle(copy), detector, calibration, SCANS)
+    return int8.quantize_bundle(copy, load_pillar_bundle(copy), detector, calibration, SCANS)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_bundle_says_what_it_is(folder: Path) -> None:
-    bundle = load_bundle(folder)
+    bundle = load_pillar_bundle(folder)
     assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny_int8", "int8", "uint8")
     assert len(bundle.pillar.canvas.empty) == bundle.pillar.channels
     assert any(bundle.pillar.canvas.empty), "attention makes features negative, so zero is not the lowest step"
@@ -105,7 +107,7 @@ def test_an_empty_scan_and_a_frame_that_inherits_nothing(folder: Path) -> None:
 def test_layers_that_hurt_stay_in_floating_point(
     folder: Path, exported: Exports, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = load_bundle(folder).quantization
+    whole = load_pillar_bundle(folder).quantization
     assert whole is not None
     monkeypatch.setattr(int8, "MAX_LOGIT_ERROR", 0.8 * whole.logit_rms_error)
     bundle = quantize(exported("channel"), tmp_path / "bundle", CALIBRATION)

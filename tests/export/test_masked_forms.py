@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_deploy import Detector, load_bundle
+from asca_deploy import Detector
+from asca_deploy.manifest import load_pillar_bundle
 from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import export_bundle
 from asca_export.masked_forms import NEVER, MarkedEncoder, MaskedBackbone
@@ -83,10 +84,10 @@ def test_masks_give_what_tables_give(rule: str) -> None:
 
 def test_the_bundles_find_the_same(bundles: tuple[Path, Path]) -> None:
     sparse, dense = (Detector(folder, score_threshold=0.02) for folder in bundles)
-    manifest = load_bundle(bundles[1])
+    manifest = load_pillar_bundle(bundles[1])
     assert (manifest.pillar.neck, manifest.pillar.active_cells) == ("dense", None)
     assert manifest.parity is not None and manifest.parity.scans == len(SCANS)
-    assert manifest.provenance.weights_sha256 == load_bundle(bundles[0]).provenance.weights_sha256
+    assert manifest.provenance.weights_sha256 == load_pillar_bundle(bundles[0]).provenance.weights_sha256
     assert sum(len(sparse(points)) for points in SCANS) > 20
     for points in (*SCANS, *LEFT, ONE_POINT, NOTHING):
         ours, theirs = dense(points), sparse(points)

@@ -8,7 +8,8 @@ import numpy as np
 import onnx
 import pytest
 
-from asca_deploy import Detector, load_bundle
+from asca_deploy import Detector
+from asca_deploy.manifest import load_pillar_bundle
 from asca_export.exporter import export_bundle
 from asca_export.int8 import quantize_bundle
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
@@ -37,7 +38,7 @@ def sparse(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_runtime_and_pytorch_find_the_same(request: pytest.FixtureRequest, tmp_path: Path, neck: str) -> None:
     assert POOLED.grid.zones > 1
     folder, checkpoint = request.getfixturevalue(neck), tiny_checkpoint("channel", POOLED, neck=neck)
-    bundle = load_bundle(folder)
+    bundle = load_pillar_bundle(folder)
     assert bundle.spec.grid.map == "pooled" and bundle.pillar.neck == neck
     assert isinstance(checkpoint.detector, PillarDetector)
     runtime, torch_detector = Detector(folder), ScanDetector(checkpoint.detector, POOLED)

@@ -15,7 +15,7 @@ import torch
 
 from asca_deploy import Detector
 from asca_deploy.bundle import DEFORM, GRAPHS, MANIFEST, PvRcnnBundle, PvRcnnSection
-from asca_deploy.manifest import load_any_bundle, load_bundle
+from asca_deploy.manifest import load_bundle, load_pillar_bundle
 from asca_deploy.pv_rcnn_graphs import balls_around, deform_inputs, keeps_memory
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.voxel_canvas import VoxelCanvas
@@ -55,7 +55,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
 def test_train_export_detect(trained: Trained, tmp_path: Path) -> None:
     checkpoint, folder = trained
-    bundle = load_any_bundle(folder)
+    bundle = load_bundle(folder)
     assert isinstance(bundle, PvRcnnBundle) and set(bundle.graphs) == {*GRAPHS["pv_rcnn"], DEFORM}
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.backbone_gmac > 0
     assert_same_detector(checkpoint, folder, tmp_path)
@@ -135,12 +135,12 @@ def test_manifests_that_were_changed(
     trained: Trained, tmp_path: Path, change: Callable[[Any], object], message: str
 ) -> None:
     with pytest.raises(BundleError, match=message):
-        load_any_bundle(changed_manifest(trained[1], tmp_path / "bundle", change))
+        load_bundle(changed_manifest(trained[1], tmp_path / "bundle", change))
 
 
 def test_a_pillar_detector_is_another_kind(trained: Trained, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="kind pv_rcnn, where one of a pillar detector is needed"):
-        load_bundle(trained[1])
+        load_pillar_bundle(trained[1])
     with pytest.raises(ExportError, match=r"model\.kind pillar: not PV-RCNN"):
         export_pv_rcnn_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS)
     with pytest.raises(ExportError, match="at least 8"):
@@ -159,7 +159,7 @@ def test_a_pillar_detector_is_another_kind(trained: Trained, tmp_path: Path) -> 
 )
 def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) -> None:
     checkpoint, folder = trained
-    bundle, detector = load_any_bundle(folder), checkpoint.detector
+    bundle, detector = load_bundle(folder), checkpoint.detector
     assert isinstance(bundle, PvRcnnBundle) and isinstance(detector, PvRcnnDetector)
     weight = detector.network.get_parameter(part)
     kept = weight.detach().clone()
@@ -176,7 +176,7 @@ def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) ->
 
 
 def test_pooling_of_balls(trained: Trained, tmp_path: Path) -> None:
-    bundle = load_any_bundle(trained[1])
+    bundle = load_bundle(trained[1])
     assert isinstance(bundle, PvRcnnBundle) and bundle.pv_rcnn.settings.vector_cells
     bundle = dataclasses.replace(bundle, pv_rcnn=dataclasses.replace(bundle.pv_rcnn, settings=SETTINGS))
     network = tiny_detector().eval().network
@@ -197,7 +197,7 @@ def test_pooling_of_balls(trained: Trained, tmp_path: Path) -> None:
 
 
 def test_a_place_for_each_radius(trained: Trained, tmp_path: Path) -> None:
-    bundle = load_any_bundle(trained[1])
+    bundle = load_bundle(trained[1])
     assert isinstance(bundle, PvRcnnBundle)
     settings = dataclasses.replace(
         SETTINGS, sources=(SETTINGS.sources[0], SourceBalls("conv2", (0.8, 1.6), (4, 6))), deform="authors"

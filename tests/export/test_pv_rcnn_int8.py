@@ -15,7 +15,7 @@ from torch import nn
 
 from asca_deploy import Detector
 from asca_deploy.bundle import KEYPOINTS, REFINE, PvRcnnBundle
-from asca_deploy.manifest import load_any_bundle, write_bundle_manifest
+from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.pv_rcnn_graphs import OUT, voxel_inputs
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_export import graphs, int8
@@ -53,7 +53,7 @@ def random_checkpoint() -> Checkpoint:
 
 def quantize(folder: Path, copy: Path) -> PvRcnnBundle:
     """The second half of such an export, on a copy of a proven float bundle."""
-    bundle, detector = load_any_bundle(shutil.copytree(folder, copy)), random_checkpoint().detector
+    bundle, detector = load_bundle(shutil.copytree(folder, copy)), random_checkpoint().detector
     assert isinstance(bundle, PvRcnnBundle) and isinstance(detector, PvRcnnDetector)
     # Two of the compared scans are given to calibrate on as well.
     return quantize_pv_rcnn_bundle(copy, bundle, detector.network, [*CALIBRATION, SCANS[3], SCANS[0].copy()], SCANS)
@@ -78,7 +78,7 @@ def opened(folder: Path) -> tuple[Detector, PvRcnnPipeline]:
 
 
 def test_the_bundle_says_what_it_is(folders: tuple[Path, Path]) -> None:
-    bundle = load_any_bundle(folders[1])
+    bundle = load_bundle(folders[1])
     assert isinstance(bundle, PvRcnnBundle)
     assert (bundle.name, bundle.precision) == ("tiny_pv_rcnn_int8", "int8")
     report = bundle.quantization
@@ -97,7 +97,7 @@ def test_its_report_by_both_bundles(folders: tuple[Path, Path]) -> None:
     for pipeline in (floating, eight_bit):
         maps = [pipeline.infer(pipeline.prepare(points, []), []).maps for points in SCANS]
         scores.append([each.scores for each in maps if each is not None])
-    report = load_any_bundle(folders[1]).quantization
+    report = load_bundle(folders[1]).quantization
     assert report is not None
     assert logit_error(scores[0], iter(scores[1]), SPEC) == pytest.approx(report.logit_rms_error, rel=1e-3)
     assert sum(len(exact(points)) for points in SCANS) == report.boxes
@@ -214,7 +214,7 @@ def test_steps_change_nothing_before_they_are_rounded() -> None:
 def test_layers_that_hurt_stay_in_floating_point(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = load_any_bundle(folders[1]).quantization
+    whole = load_bundle(folders[1]).quantization
     assert whole is not None
     monkeypatch.setattr(int8, "MAX_LOGIT_ERROR", 0.9 * whole.logit_rms_error)
     report = quantize(folders[0], tmp_path / "bundle").quantization
@@ -236,7 +236,7 @@ def test_what_is_not_put_in_8_bits(tmp_path: Path) -> None:
 
 def test_a_manifest_of_another_precision(folders: tuple[Path, Path], tmp_path: Path) -> None:
     """Graphs in float32 whose manifest and stamps say 8 bits are refused by what they take."""
-    copied = load_any_bundle(shutil.copytree(folders[0], tmp_path / "bundle"))
+    copied = load_bundle(shutil.copytree(folders[0], tmp_path / "bundle"))
     signed = graphs.sign(tmp_path / "bundle", dataclasses.replace(copied, precision="int8"))
     write_bundle_manifest(tmp_path / "bundle", signed)
     with pytest.raises(BundleError, match=r"voxels\.onnx: output `out` is float32 .* needs uint8"):

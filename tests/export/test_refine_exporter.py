@@ -14,7 +14,7 @@ import torch
 from asca_deploy import Detector
 from asca_deploy.bundle import GRAPHS, MANIFEST
 from asca_deploy.golden import golden_stages
-from asca_deploy.manifest import load_bundle
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.refine_pipeline import RefinePipeline
 from asca_export import refine_exporter
 from asca_export.exporter import export_bundle
@@ -67,7 +67,7 @@ def test_golden_vectors_of_both_stages(trained: tuple[Path, Path]) -> None:
 
 def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None:
     last, folder = trained
-    bundle = load_bundle(folder)
+    bundle = load_pillar_bundle(folder)
     assert (bundle.kind, set(bundle.graphs)) == ("pillar_refine", set(GRAPHS["pillar_refine"]))
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.refine is not None
     assert_same_detector(load_checkpoint(last), folder, tmp_path)
@@ -96,7 +96,7 @@ def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Pat
     quantized = export_refine_bundle(checkpoint, tmp_path / "a", SCANS, calibration=CALIBRATION, weights=trained[0])
     assert load_checkpoint(tmp_path / "a" / "weights.ckpt").config == checkpoint.config
     assert (quantized.name, quantized.precision, quantized.kind) == ("tiny_refine_int8", "int8", "pillar_refine")
-    assert load_bundle(tmp_path / "a") == quantized
+    assert load_pillar_bundle(tmp_path / "a") == quantized
     report = quantized.quantization
     assert report is not None and report.boxes > 5 and report.boxes_matched > report.boxes / 2
     assert 0 < report.logit_rms_error <= MAX_LOGIT_ERROR
@@ -183,7 +183,7 @@ def test_manifests_that_were_changed(trained: tuple[Path, Path], tmp_path: Path,
     change(data)  # type: ignore[operator]
     (tmp_path / MANIFEST).write_text(json.dumps(data))
     with pytest.raises(BundleError, match=message):
-        load_bundle(tmp_path)
+        load_pillar_bundle(tmp_path)
 
 
 def test_a_refiner_with_other_weights_is_no_parity(

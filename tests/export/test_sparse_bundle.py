@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from asca_deploy import Detections, Detector, load_bundle
+from asca_deploy import Detections, Detector
 from asca_deploy.benchmark import benchmark
 from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.golden import golden_stages
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
 from asca_export.exporter import export_bundle
 from asca_pillars.errors import ConfigError, ProviderError
@@ -51,7 +52,7 @@ def same(ours: Detections, theirs: Detections) -> bool:
 
 def test_the_bundle_finds_what_pytorch_finds(float_bundle: tuple[Path, Checkpoint]) -> None:
     folder, checkpoint = float_bundle
-    bundle, runtime = load_bundle(folder), Detector(folder)
+    bundle, runtime = load_pillar_bundle(folder), Detector(folder)
     model = checkpoint.config.model
     assert isinstance(model, PillarModel)
     assert (bundle.pillar.neck, bundle.pillar.active_cells) == ("sparse", model.network.active_cells)
@@ -81,7 +82,7 @@ def test_golden_vectors_hold_the_tables(float_bundle: tuple[Path, Checkpoint]) -
 
 
 def test_eight_bits_report_how_near_they_are(int8_bundle: Path) -> None:
-    bundle = load_bundle(int8_bundle)
+    bundle = load_pillar_bundle(int8_bundle)
     assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny_int8", "int8", "uint8")
     report = bundle.quantization
     assert report is not None and len(report.layers) == 6 + 3 + 1
@@ -115,7 +116,7 @@ def test_reports_name_the_stages_of_this_pipeline(int8_bundle: Path) -> None:
 
 @pytest.mark.parametrize("provider", ["openvino", "tensorrt"])
 def test_a_provider_that_cannot_run_it_says_why(int8_bundle: Path, provider: Any) -> None:
-    bundle = load_bundle(int8_bundle)
+    bundle = load_pillar_bundle(int8_bundle)
     with pytest.raises(ProviderError, match=f"{provider} cannot run the sparse neck of tiny_int8: .*provider cpu"):
         open_backbone(int8_bundle / "backbone.onnx", bundle, provider, "float32", 1)
 

@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import AnyBundle
+from asca_deploy.bundle import Bundle
 
 SIZE = 2048
 """Rows and columns of the constant matrix in both graphs."""
@@ -36,7 +36,7 @@ class Roofline:
     threads: int
 
 
-def measure_roofline(bundle: AnyBundle, backbone_ms: float, threads: int) -> Roofline:
+def measure_roofline(bundle: Bundle, backbone_ms: float, threads: int) -> Roofline:
     """Measure the machine and relate `backbone_ms` to it, the p50 of neck and head in one pass; up to two seconds.
 
     Args:

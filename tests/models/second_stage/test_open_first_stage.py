@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from asca_deploy import load_bundle
 from asca_deploy.bundle import MANIFEST
+from asca_deploy.manifest import load_pillar_bundle
 from asca_export.bundle_first_stage import BundleFirstStage
 from asca_export.exporter import export_bundle
 from asca_pillars.errors import ConfigError, ExportError
@@ -58,7 +58,7 @@ def test_the_same_weights_are_taken_from_any_file_and_others_are_refused(tmp_pat
     bundles = [tmp_path / name for name in ("bundle", "again")]
     for folder, calibration in zip(bundles, (None, CALIBRATION), strict=True):
         export_bundle(checkpoint, folder, SCANS, calibration=calibration)
-    one, eight_bit = (load_bundle(folder) for folder in bundles)
+    one, eight_bit = (load_pillar_bundle(folder) for folder in bundles)
     assert one.provenance.weights_sha256 == eight_bit.provenance.weights_sha256 and one.graphs != eight_bit.graphs
     model = with_first_stage(tiny_refine_model(first))
     assert model.first_stage_identity == one.provenance.weights_sha256
