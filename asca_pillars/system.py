@@ -1,7 +1,6 @@
 """The computer, and what a result depends on beside its inputs: cores granted, versions, source revision."""
 
 import importlib.metadata
-import json
 import math
 import os
 import platform
@@ -9,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from asca_pillars.errors import ConfigError
 
@@ -130,16 +130,15 @@ def command_line() -> str:
     return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def describe_environment() -> str:
-    """JSON text of all of it, to be saved beside a result."""
-    description = {
+def describe_environment() -> dict[str, Any]:
+    """All of it as plain values, to be saved beside a result."""
+    return {
         "command": command_line(),
         "git_revision": git_revision(),
         "platform": platform.platform(),
         "cpu": cpu_model(),
         "packages": package_versions(),
     }
-    return json.dumps(description, indent=2) + "\n"
 
 
 def _limit(group: Path) -> float:

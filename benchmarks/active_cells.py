@@ -18,7 +18,7 @@ from asca_pillars.commands.run_command import run_command
 from asca_pillars.config import load_config, pillar_spec
 from asca_pillars.data.frames import read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.pillars.map_pooling import map_cells
 from asca_pillars.pillars.pillar_spec import PillarSpec

@@ -23,7 +23,7 @@ from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.score_threshold import MatchInput, match_class
 from asca_pillars.evaluation.kitti.states import is_type
 from asca_pillars.evaluation.predictions import ScoredFrames
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from benchmarks.transfer import FOUND_IOU, read_evaluation
 
 PLACES, SIZES = ("farther", "to the right", "lower"), ("higher", "wider", "longer")

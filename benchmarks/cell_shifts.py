@@ -23,7 +23,7 @@ from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.geometry.assignment import greedy_matches
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou

@@ -18,7 +18,7 @@ from asca_pillars.commands.run_command import run_command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.score_threshold import MatchInput, match_class
 from asca_pillars.evaluation.kitti.states import is_type
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from benchmarks.transfer import read_evaluation
 
 DISTANCES_M = (0, 20, 40, 80)

@@ -25,7 +25,7 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.input_check import check_input
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.geometry.decode import HeadMaps, rotated_nms
 from asca_pillars.pillars.map_pooling import map_cells
 from asca_pillars.system import cpu_model

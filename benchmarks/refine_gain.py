@@ -31,7 +31,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError
 from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.checkpoint import load_checkpoint

@@ -20,7 +20,7 @@ from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.operating_point import OperatingPoint, best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 
 FOUND_IOU = {name: BEV_IOU.get(name, SMALL_BEV_IOU) for name in CLASS_NAMES}
 OVERLAPS = (FOUND_IOU, {"Car": 0.7})  # the first ones choose the scores

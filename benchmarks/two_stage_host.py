@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from asca_deploy import sample_scan_path
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.points.ball_query import ball_query, three_nearest
 from asca_pillars.points.cube_neighbors import nearest_in_cubes
 from asca_pillars.points.farthest_points import farthest_points, points_near_boxes

@@ -9,7 +9,7 @@ from typing import Any
 from asca_pillars.ablation.ablation_runs import Run
 from asca_pillars.ablation.family import Family
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 
 BANDS_M = ((0.0, 40.0), (40.0, 80.0))
 

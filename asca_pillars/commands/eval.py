@@ -91,6 +91,7 @@ def evaluate(
     from rich.console import Console
 
     from asca_pillars.commands import eval_steps as steps
+    from asca_pillars.commands.eval_files import claim
     from asca_pillars.commands.models import open_model
     from asca_pillars.data.kitti import KittiSplit
     from asca_pillars.errors import ConfigError
@@ -122,7 +123,7 @@ def evaluate(
         raise ConfigError("--around needs labels in every direction: give --protocol iou or distance, too")
     steps.check_arguments(model, data, predictions, labels, gallery, score)
     steps.check_protocol(protocol, data, gallery, score)
-    steps.claim(out, json)
+    claim(out, json)
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:
         assert frames_of is not None, "checked with the arguments"

@@ -1,22 +1,13 @@
 """The steps of `asca eval --protocol iou` and `distance`: any class, boxes in the LiDAR frame, no camera."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_steps import (
-    COMMAND,
-    MADE_BY,
-    TEXT_SCORE,
-    check_score,
-    claim,
-    model_scores,
-    remove_predictions_of_another,
-    warn_of_unlike_scans,
-)
+from asca_pillars.commands.eval_files import COMMAND, MADE_BY, claim, write_report
+from asca_pillars.commands.eval_steps import TEXT_SCORE, check_score, model_scores, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.data.boxes.box_split import BoxSplit
@@ -26,8 +17,8 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation.boxes.box_predictions import BoxFrames, read_box_predictions, write_box_predictions
 from asca_pillars.evaluation.boxes.box_report import BoxProtocol, box_json, box_notes, box_report, box_tables
 from asca_pillars.evaluation.boxes.fixed_scores import fixed_scores
-from asca_pillars.evaluation.report import markdown_page, print_tables
-from asca_pillars.files import atomic_directory, atomic_path, write_json
+from asca_pillars.evaluation.report_page import ReportPage
+from asca_pillars.files import atomic_directory, write_json
 from asca_pillars.system import describe_environment
 
 PREDICTIONS = "detections.jsonl"
@@ -85,19 +76,12 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
         scores = dict.fromkeys(class_names, TEXT_SCORE if task.score is None else task.score)
         subject, about = f"{predictions} against {task.data}", about | {"predictions": str(predictions)}
     _require_common_class(frames, class_names, task.data)
-    about["environment"] = json.loads(describe_environment())
+    about["environment"] = describe_environment()
     at_score = fixed_scores(frames.frames, class_names, scores)
     report = box_report(subject, task.protocol, frames, class_names, at_score, about)
-    tables, notes = box_tables(report), box_notes(report)
-    print_tables(report.title, tables, notes, console)
-    content = box_json(report)
-    if predictions is not None:
-        remove_predictions_of_another(task.out, predictions)
-    write_json(task.out / f"{task.protocol}.json", content)
-    with atomic_path(task.out / f"{task.protocol}.md") as temporary:
-        temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
-    if task.json is not None:
-        write_json(task.json, content)
+    page = ReportPage(report.title, box_tables(report), box_notes(report))
+    scored = task.out / "predictions" if predictions is None else predictions
+    write_report(task.protocol, page, box_json(report), task.out, task.json, scored, console)
     console.print(f"Written to {task.out}/", highlight=False)
 
 

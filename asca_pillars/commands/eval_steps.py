@@ -1,15 +1,14 @@
 """The steps of `asca eval`: what goes together, running the model, reports and pictures."""
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from rich.console import Console
 
+from asca_pillars.commands.eval_files import COMMAND, MADE_BY, write_report
 from asca_pillars.commands.extras import missing_modules
-from asca_pillars.commands.json_file import require_writable_json
 from asca_pillars.commands.models import Model
 from asca_pillars.commands.options import MIN_SCORE, RuntimeOptions
 from asca_pillars.data.kitti import KittiSplit
@@ -18,29 +17,15 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
+from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
 from asca_pillars.evaluation.predictions import ScoredFrames, write_predictions
-from asca_pillars.evaluation.report import (
-    BANDS_M,
-    EvalReport,
-    markdown_page,
-    print_report,
-    print_tables,
-    to_json,
-    to_markdown,
-)
+from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.evaluation.waymo import waymo_detection
 from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
 from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
-from asca_pillars.files import (
-    atomic_directory,
-    atomic_path,
-    remove_directory,
-    require_own,
-    require_replaceable,
-    write_json,
-)
+from asca_pillars.files import atomic_directory, remove_directory, write_json
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.system import describe_environment
@@ -49,7 +34,6 @@ Protocol = Literal["kitti", "waymo"]
 
 TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
 GALLERY = 8
-COMMAND, MADE_BY = "asca eval", "made_by.json"  # the file marks a folder of predictions as ours to replace
 
 
 @dataclass(frozen=True)
@@ -63,30 +47,6 @@ class Task:
     ranges: Ranges
     scores: dict[str, float]
     about: dict[str, Any]
-
-
-def claim(out: Path, json_path: Path | None) -> None:
-    """Make sure that nothing but earlier evaluations is in `out`, and that `json_path` can be written.
-
-    Raises:
-        OutputError, OSError: not so; names what is there.
-    """
-    reports = "report.json", "waymo.json", "iou.json", "distance.json", "tracking.json"
-    require_own(out, COMMAND, *reports, f"predictions/{MADE_BY}", text='"')
-    for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
-        require_replaceable(out / folder, COMMAND, marker)
-    require_writable_json(json_path)
-
-
-def remove_predictions_of_another(out: Path, scored: Path) -> None:
-    """Remove the model's predictions that an earlier evaluation left in `out`, unless they are those that are scored.
-
-    Raises:
-        OutputError, OSError: they cannot be removed.
-    """
-    own = (out / "predictions").resolve()
-    if own not in (scored.resolve(), *scored.resolve().parents):
-        remove_directory(own, COMMAND, MADE_BY)
 
 
 def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: float | None) -> Task:
@@ -145,9 +105,7 @@ def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
 
 
 def check_protocol(protocol: str, data: Path | None, gallery_frames: int | None, score: float | None) -> None:
-    """Refuse an unknown protocol, or options of another one, with a ConfigError."""
-    if protocol not in get_args(Protocol):
-        raise ConfigError(f"--protocol {protocol}: choose {', '.join(get_args(Protocol))}, iou or distance")
+    """Refuse data without a camera, or options of the other protocol, with a ConfigError."""
     if data is not None and not isinstance(open_split(data), KittiSplit):
         raise ConfigError(f"--protocol {protocol}: {data} has no camera, which it needs; choose iou or distance")
     if protocol == "waymo" and (gallery_frames or score is not None):
@@ -232,17 +190,10 @@ def report_waymo(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
         raise DatasetError(f"{task.labels}: no label and no prediction is of a class to be evaluated")
     prepared = waymo_frames(frames, class_names, task.split, console=console)
     scores = waymo_detection(prepared.truth, prepared.detections, no_label=prepared.no_label, console=console)
-    about = task.about | {"environment": json.loads(describe_environment())}
+    about = task.about | {"environment": describe_environment()}
     report = WaymoReport(task.subject, frames, scores, task.split is not None, about)
-    tables, notes = [waymo_table(report)], waymo_notes(report)
-    print_tables(report.title, tables, notes, console)
-    content = waymo_json(report)
-    remove_predictions_of_another(out, task.predictions)
-    write_json(out / "waymo.json", content)
-    with atomic_path(out / "waymo.md") as temporary:
-        temporary.write_text(markdown_page(report.title, tables, notes), encoding="utf-8")
-    if json_path is not None:
-        write_json(json_path, content)
+    page = ReportPage(report.title, [waymo_table(report)], waymo_notes(report))
+    write_report("waymo", page, waymo_json(report), out, json_path, task.predictions, console)
 
 
 def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
@@ -250,22 +201,16 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     truth, found = frames.truth, frames.detections
     ap = evaluate(truth, found, CLASS_NAMES, bands_m=tuple(BANDS_M), progress=True)
     points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES)
-    about = task.about | {"environment": json.loads(describe_environment())}
-    report = EvalReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
-    print_report(report, console)
-    content = to_json(report)
-    remove_predictions_of_another(out, task.predictions)
+    about = task.about | {"environment": describe_environment()}
+    report = KittiReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
+    page = ReportPage(report.title, kitti_tables(report), kitti_notes(report))
+    write_report("report", page, kitti_json(report), out, json_path, task.predictions, console)
     remove_directory(out / "gallery", COMMAND, gallery.INDEX)
-    write_json(out / "report.json", content)
-    with atomic_path(out / "report.md") as temporary:
-        temporary.write_text(to_markdown(report), encoding="utf-8")
     if missing_modules("eval"):
         (out / "curves.png").unlink(missing_ok=True)
         console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
     else:
         write_curves(out / "curves.png", ap.overall, report.title)
-    if json_path is not None:
-        write_json(json_path, content)
 
 
 def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:

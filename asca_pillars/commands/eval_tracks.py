@@ -1,22 +1,20 @@
 """The steps of `asca eval --protocol tracking`: identities over time, from what `asca detect --track` wrote."""
 
-import json
 from pathlib import Path
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_steps import claim, remove_predictions_of_another
+from asca_pillars.commands.eval_files import claim, write_report
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError
-from asca_pillars.evaluation.report import markdown_page, print_tables
+from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.evaluation.tracking.tracking_report import (
     tracking_json,
     tracking_notes,
     tracking_report,
     tracking_tables,
 )
-from asca_pillars.files import atomic_path, write_json
 from asca_pillars.system import describe_environment
 
 
@@ -52,16 +50,8 @@ def evaluate_tracks(
     if not isinstance(labels, BoxSplit):
         raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")
     claim(out, json_path)
-    about = {"data": str(data), "split": split, "predictions": str(predictions)}
-    about |= {"environment": json.loads(describe_environment())}
+    about = {"data": str(data), "split": split, "predictions": str(predictions), "environment": describe_environment()}
     report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
-    tables, notes = tracking_tables(report), tracking_notes(report)
-    print_tables(report.subject, tables, notes, console)
-    content = tracking_json(report)
-    remove_predictions_of_another(out, predictions)
-    write_json(out / "tracking.json", content)
-    with atomic_path(out / "tracking.md") as temporary:
-        temporary.write_text(markdown_page(report.subject, tables, notes), encoding="utf-8")
-    if json_path is not None:
-        write_json(json_path, content)
+    page = ReportPage(report.subject, tracking_tables(report), tracking_notes(report))
+    write_report("tracking", page, tracking_json(report), out, json_path, predictions, console)
     console.print(f"Written to {out}/", highlight=False)

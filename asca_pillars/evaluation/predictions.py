@@ -45,6 +45,10 @@ class ScoredFrames:
         """One sentence that belongs beside every number if not all frames were evaluated; None if all were."""
         return shortage(len(self), self.without_predictions, "no prediction file", "needs an empty file")
 
+    def titled(self, subject: str) -> str:
+        """The subject, and how many frames stand behind its numbers, or which ones are missing."""
+        return f"{subject}: {self.shortage or f'{len(self)} frames'}"
+
     @property
     def foreign_types(self) -> dict[str, tuple[int, int]]:
         """Types that KITTI does not have, as first written: how many labels and how many detections name them."""

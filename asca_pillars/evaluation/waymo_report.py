@@ -6,7 +6,7 @@ from math import isfinite
 from typing import Any
 
 from asca_pillars.evaluation.predictions import ScoredFrames
-from asca_pillars.evaluation.report import TextTable, report_title
+from asca_pillars.evaluation.report_page import TextTable
 from asca_pillars.evaluation.waymo import LEVELS, RANGES_M, WaymoScore, mean_over_classes
 
 
@@ -26,7 +26,7 @@ class WaymoReport:
     @property
     def title(self) -> str:
         """The subject, and how many frames stand behind the numbers."""
-        return report_title(self.subject, self.frames)
+        return self.frames.titled(self.subject)
 
 
 def waymo_table(report: WaymoReport) -> TextTable:

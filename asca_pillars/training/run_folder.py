@@ -75,8 +75,7 @@ def claim(out: Path, config: Config, seen: Seen) -> None:
     if seen.initial_sha256 is None and found is not None:
         seen = seen._replace(initial_sha256=found.initial_sha256)
     if refusal or not path.exists():
-        with atomic_path(out / "environment.json") as temporary:
-            temporary.write_text(describe_environment(), encoding="utf-8")
+        write_json(out / "environment.json", describe_environment())
     with atomic_path(path) as temporary:
         temporary.write_text(yaml.safe_dump(to_dict(config), sort_keys=False), encoding="utf-8")
     write_json(frames_path, seen._asdict())

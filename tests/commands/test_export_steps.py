@@ -1,5 +1,6 @@
 """What `asca export` reads beside the checkpoint: what the run wrote of itself, or one line that says what is wrong."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ def checkpoint(tmp_path: Path) -> Path:
 def test_the_command_of_the_run_is_known(checkpoint: Path) -> None:
     assert run_environment(checkpoint) == {}, "the checkpoint lies elsewhere"
     checkpoint.parent.mkdir(parents=True)
-    (checkpoint.parents[1] / "environment.json").write_text(describe_environment())
+    (checkpoint.parents[1] / "environment.json").write_text(json.dumps(describe_environment()))
     assert isinstance(run_environment(checkpoint)["command"], str)
 
 

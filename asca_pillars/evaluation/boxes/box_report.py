@@ -14,7 +14,7 @@ from asca_pillars.evaluation.boxes.box_predictions import BoxFrames
 from asca_pillars.evaluation.boxes.fixed_scores import MATCH_M, FixedScore
 from asca_pillars.evaluation.boxes.iou_average_precision import IOUS, IouScore, iou_scores
 from asca_pillars.evaluation.boxes.nuscenes_metrics import DISTANCES_M, NuScenesScore, nuscenes_scores
-from asca_pillars.evaluation.report import TextTable
+from asca_pillars.evaluation.report_page import TextTable
 
 BoxProtocol = Literal["iou", "distance"]
 

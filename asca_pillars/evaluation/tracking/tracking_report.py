@@ -15,7 +15,7 @@ from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame
-from asca_pillars.evaluation.report import TextTable
+from asca_pillars.evaluation.report_page import TextTable
 from asca_pillars.evaluation.tracking.clear_mot import ClearMot, clear_mot
 from asca_pillars.evaluation.tracking.hota import Hota, hota
 from asca_pillars.evaluation.tracking.tracked_frames import Boxes, TrackedFrame, tracked_frame

@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.files import atomic_path
 from asca_pillars.sim.report.like_for_like import LikeForLike
 from asca_pillars.sim.report.look_alikes import ALL, MEASURES, NEIGHBORS, LikeRow

@@ -11,7 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.evaluation.report import markdown_table
+from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.files import atomic_path
 from asca_pillars.schema import to_dict
 from asca_pillars.sim.report.comparison import Comparison, Row

@@ -1,12 +1,9 @@
-"""The report of an evaluation: the same tables on the console, as Markdown and as JSON."""
+"""The report of KITTI's protocol: AP, AP by distance, recall and precision, as tables and as JSON."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from math import isnan
 from typing import Any
-
-from rich.console import Console
-from rich.table import Table
 
 from asca_pillars.evaluation.kitti.average_precision import (
     CLASS_NAMES,
@@ -18,6 +15,7 @@ from asca_pillars.evaluation.kitti.average_precision import (
 )
 from asca_pillars.evaluation.kitti.operating_point import OperatingPoint
 from asca_pillars.evaluation.predictions import ScoredFrames
+from asca_pillars.evaluation.report_page import TextTable
 
 BANDS_M = {
     (0.0, 40.0): "Table 4 of ASCA-PointPillars",
@@ -33,8 +31,8 @@ _NONE = "-"
 
 
 @dataclass(frozen=True)
-class EvalReport:
-    """What was evaluated, and every number about it."""
+class KittiReport:
+    """What was evaluated by KITTI's protocol, and every number about it."""
 
     subject: str
     """The model or folder and the data, in words."""
@@ -49,25 +47,10 @@ class EvalReport:
     @property
     def title(self) -> str:
         """The subject, and how many frames stand behind the numbers."""
-        return report_title(self.subject, self.frames)
+        return self.frames.titled(self.subject)
 
 
-def report_title(subject: str, frames: ScoredFrames) -> str:
-    """The subject, and how many frames stand behind the numbers, or which ones are missing."""
-    return f"{subject}: {frames.shortage or f'{len(frames)} frames'}"
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table of texts; the first `left` columns are names, the others numbers. Line breaks are for the console."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    left: int = 2
-
-
-def tables(report: EvalReport) -> list[TextTable]:
+def kitti_tables(report: KittiReport) -> list[TextTable]:
     """AP, AP by distance, recall and precision at the fixed scores."""
     recall = [(point, point.found, point.objects, point.recall, point.recall_interval) for point in report.points]
     precision = [
@@ -82,7 +65,7 @@ def tables(report: EvalReport) -> list[TextTable]:
     ]
 
 
-def notes(report: EvalReport) -> list[str]:
+def kitti_notes(report: KittiReport) -> list[str]:
     """What one must know to read the tables.
 
     Types left out, classes not evaluated, sets too small for their AP, detections ignored, scores to choose.
@@ -102,58 +85,7 @@ def notes(report: EvalReport) -> list[str]:
     return lines
 
 
-def print_report(report: EvalReport, console: Console) -> None:
-    """Tables and notes on the console."""
-    print_tables(report.title, tables(report), notes(report), console)
-
-
-def print_tables(title: str, tables: Sequence[TextTable], notes: Sequence[str], console: Console) -> None:
-    """A title, tables and notes on the console; a name that the row above has is not repeated.
-
-    A table is wider than the console rather than cut a figure or a word.
-    """
-    console.print(title, style="bold", highlight=False, soft_wrap=True)
-    for table in tables:
-        drawn = Table()
-        for index, column in enumerate(table.columns):
-            words = (*column.split(), *(row[index] for row in table.rows))
-            width = max(map(len, words))
-            drawn.add_column(column, justify="left" if index < table.left else "right", min_width=width)
-        last = None
-        for name, *cells in table.rows:
-            if table.left > 1 and last not in (None, name):
-                drawn.add_section()
-            drawn.add_row("" if name == last else name, *cells)
-            last = name
-        console.print(f"\n{table.title}", highlight=False, soft_wrap=True)
-        console.print(drawn, crop=False)
-    for line in notes:
-        console.print(line, highlight=False, soft_wrap=True)
-
-
-def to_markdown(report: EvalReport) -> str:
-    """The tables and notes as Markdown."""
-    return markdown_page(report.title, tables(report), notes(report))
-
-
-def markdown_page(title: str, tables: Sequence[TextTable], notes: Sequence[str]) -> str:
-    """A title, tables and notes as Markdown."""
-    parts = [f"# {title}\n"]
-    for table in tables:
-        columns = [column.replace("\n", " ") for column in table.columns]
-        parts.append(f"## {table.title}\n\n{markdown_table(columns, table.rows, table.left)}")
-    if notes:
-        parts.append("\n".join([*(f"- {line}" for line in notes), ""]))
-    return "\n".join(parts)
-
-
-def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    """A table as Markdown; the first `left` columns are names, the others numbers."""
-    ruler = ["---" if index < left else "---:" for index in range(len(columns))]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in (columns, ruler, *rows))
-
-
-def to_json(report: EvalReport) -> dict[str, Any]:
+def kitti_json(report: KittiReport) -> dict[str, Any]:
     """Everything in the report; `results` has the shape of KITTI's: class, metric, R11 / R40 / precision."""
     return {
         "subject": report.subject,
@@ -174,7 +106,7 @@ def to_json(report: EvalReport) -> dict[str, Any]:
         ],
         "operating_points": [_without_nan(asdict(point)) for point in report.points],
         "best_scores": report.best_scores,
-        "notes": notes(report),
+        "notes": kitti_notes(report),
         **report.about,
     }
 

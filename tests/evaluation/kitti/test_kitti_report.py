@@ -10,20 +10,11 @@ from rich.console import Console
 
 from asca_pillars.data.kitti import KittiObject
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, evaluate
+from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.objects import frame_objects
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames
-from asca_pillars.evaluation.report import (
-    BANDS_M,
-    EvalReport,
-    TextTable,
-    notes,
-    print_report,
-    print_tables,
-    tables,
-    to_json,
-    to_markdown,
-)
+from asca_pillars.evaluation.report_page import ReportPage
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 
@@ -34,12 +25,12 @@ def car(x_m: float, z_m: float, score: float | None = None) -> KittiObject:
     return KittiObject("Car", 0, 0, 0.1, (left, 150, left + 8, 200), 1.5, 1.6, 3.9, x_m, 1.7, z_m, 0.1, score)
 
 
-def report(cars: int = 12, missing: tuple[str, ...] = ()) -> EvalReport:
+def report(cars: int = 12, missing: tuple[str, ...] = ()) -> KittiReport:
     """Frames of one car each, every second one 45 m away, all found."""
     places = [(float(index), 45.0 if index % 2 else 20.0) for index in range(cars)]
     truth = [frame_objects(f"{number:06d}", [car(*place)]) for number, place in enumerate(places)]
     found = [frame_objects(f"{number:06d}", [car(*place, 1 - number / 100)]) for number, place in enumerate(places)]
-    return EvalReport(
+    return KittiReport(
         subject="made up",
         frames=ScoredFrames(tuple(truth), tuple(found), missing),
         ap=evaluate(truth, found, CLASSES, bands_m=tuple(BANDS_M)),
@@ -49,8 +40,12 @@ def report(cars: int = 12, missing: tuple[str, ...] = ()) -> EvalReport:
     )
 
 
-def cells(made: EvalReport, table: int) -> dict[tuple[str, str], tuple[str, ...]]:
-    return {(row[0], row[1]): row[2:] for row in tables(made)[table].rows}
+def page(made: KittiReport) -> ReportPage:
+    return ReportPage(made.title, kitti_tables(made), kitti_notes(made))
+
+
+def cells(made: KittiReport, table: int) -> dict[tuple[str, str], tuple[str, ...]]:
+    return {(row[0], row[1]): row[2:] for row in kitti_tables(made)[table].rows}
 
 
 def test_average_precision_with_counts_and_dashes() -> None:
@@ -65,7 +60,7 @@ def test_average_precision_with_counts_and_dashes() -> None:
 
 
 def test_bands_give_the_mean_and_the_counted_objects() -> None:
-    table = tables(report())[1]
+    table = kitti_tables(report())[1]
     assert "R40, moderate" in table.title and "Table 4 of ASCA" in table.title and "Deformable PV-RCNN" in table.title
     rows = {row[0]: row[1:] for row in table.rows}
     # Six cars on either side of 40 m: 5/40. None between 30 and 40 m.
@@ -78,15 +73,15 @@ def test_recall_and_precision_have_intervals() -> None:
     # Wilson for 12 of 12: 1 / (1 + 1.96^2 / 12) = 0.7575 at the lower end.
     assert recall["Car", "moderate"] == precision["Car", "moderate"] == ("12", "12", "100.00", "75.75 - 100.00")
     assert recall["Cyclist", "hard"] == ("0", "0", "-", "-")
-    assert "Car 0.5 (IoU 0.7)" in tables(report())[2].title
+    assert "Car 0.5 (IoU 0.7)" in kitti_tables(report())[2].title
 
 
 def test_small_sets_and_missing_classes_are_named() -> None:
-    lines = notes(report())
+    lines = kitti_notes(report())
     assert "Car moderate: only 12 counted objects; a perfect detector gets at most 27.5 R40, 27.3 R11" in lines
     assert "Cyclist: not evaluated, because nothing was detected as one; the means leave the class out" in lines
-    assert not any(line.startswith("Car") for line in notes(report(cars=41)))
-    assert any(line.startswith("Car easy: only 40 ") for line in notes(report(cars=40)))
+    assert not any(line.startswith("Car") for line in kitti_notes(report(cars=41)))
+    assert any(line.startswith("Car easy: only 40 ") for line in kitti_notes(report(cars=40)))
     assert lines[-1].endswith("in 3D: Car 0.89")  # the last of twelve found, with scores 1.00, 0.99 ...
 
 
@@ -95,11 +90,11 @@ def test_ignored_detections_are_named_where_they_are_most() -> None:
     made = report()
     flat = [dataclasses.replace(frame, bbox=np.full((1, 4), -1.0)) for frame in made.frames.detections]
     points = operating_points(made.frames.truth, flat, CLASSES, scores=0.5, difficulties=DIFFICULTIES)
-    hidden = [line for line in notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
-    assert not any("are ignored" in line for line in notes(made))
+    hidden = [line for line in kitti_notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
+    assert not any("are ignored" in line for line in kitti_notes(made))
     far = [dataclasses.replace(frame, locations=frame.locations + 50) for frame in flat]
     points = operating_points(made.frames.truth, far, CLASSES, scores=0.5, difficulties=DIFFICULTIES)
-    hidden += [line for line in notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
+    hidden += [line for line in kitti_notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
     assert len(hidden) == 1 and hidden[0].startswith("Car: 12 of 12 detections are ignored even at hard")
 
 
@@ -110,25 +105,17 @@ def test_missing_frames_stand_in_every_form_of_the_report() -> None:
         "a frame without detections needs an empty file"
     )
     console = Console(record=True, width=80, markup=False, file=io.StringIO())
-    print_report(made, console)
+    page(made).print(console)
     assert f"made up: {sentence}" in console.export_text().splitlines()
-    assert to_markdown(made).splitlines()[0] == f"# made up: {sentence}"
-    content = to_json(made)
+    assert page(made).markdown().splitlines()[0] == f"# made up: {sentence}"
+    content = kitti_json(made)
     assert content["frames"] == 12 and content["frames_asked"] == 14 and content["shortage"] == sentence
     assert content["frames_without_predictions"] == ["000012", "000013"]
-    assert to_json(report())["shortage"] is None and "12 frames" in to_markdown(report()).splitlines()[0]
-
-
-def test_a_narrow_console_cuts_no_figure() -> None:
-    table = TextTable("t", ("class", "a long name of a column", "share"), (("Pedestrian", "-226.3", "1.00 - 2.00"),))
-    console = Console(record=True, width=20, markup=False, file=io.StringIO())
-    print_tables("title", [table], [], console)
-    printed = console.export_text()
-    assert all(text in printed for text in ("Pedestrian", "-226.3", "1.00 - 2.00", "column")) and "…" not in printed
+    assert kitti_json(report())["shortage"] is None and "12 frames" in page(report()).markdown().splitlines()[0]
 
 
 def test_the_json_has_kittis_shape_and_no_nan() -> None:
-    content = json.loads(json.dumps(to_json(report()), allow_nan=False))
+    content = json.loads(json.dumps(kitti_json(report()), allow_nan=False))
     assert content["model"] == {"name": "nobody"}
     assert set(content["results"]) == set(CLASSES)
     for name in CLASSES:
@@ -146,7 +133,7 @@ def test_the_json_has_kittis_shape_and_no_nan() -> None:
 
 
 def test_the_markdown_tables_are_whole() -> None:
-    lines = to_markdown(report()).splitlines()
+    lines = page(report()).markdown().splitlines()
     assert "| class | metric | R40 easy | R40 moderate | R40 hard | R11 easy | R11 moderate | R11 hard |" in lines
     widths: list[int] = []
     for line in lines:
