@@ -15,10 +15,12 @@ from asca_pillars.errors import ExportError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.points.refined_detections import Scores, reported_detections
 from asca_pillars.tables.voxel_spec import VoxelSpec
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
@@ -113,11 +115,51 @@ def require_close(
     """The largest difference, which must not exceed what is allowed."""
     error = float(np.abs(expected - found).max(initial=0.0))
     if not error <= allowed:
-        raise ExportError(
-            f"scan {scan}: PyTorch and onnxruntime part at stage {stage}: "
-            f"largest difference {error:.3g}, allowed {allowed:.3g}"
+        raise _unlike(
+            scan,
+            f"PyTorch and onnxruntime part at stage {stage}: largest difference {error:.3g}, allowed {allowed:.3g}",
         )
     return error
+
+
+def _unlike(scan: int, difference: str) -> ExportError:
+    return ExportError(
+        f"scan {scan}: {difference}; nothing is written: try other versions of onnxruntime or torch, and if they say "
+        "the same, report it with the scan, the number of which counts from 0"
+    )
+
+
+def require_same_refined(
+    proposals: Detections,
+    expected: tuple[NDArray[np.float32], NDArray[np.float32]],
+    found: tuple[NDArray[np.float32], NDArray[np.float32]],
+    spec: DetectorSpec,
+    scores: Scores,
+    scan: int,
+) -> BoxDifference:
+    """Refine every proposal both ways, with no threshold and no suppression; every box needs a partner.
+
+    Args:
+        proposals: R of them.
+        expected, found: logits (R,) and residuals (R, 7), of PyTorch and of the graph.
+        spec: of both detectors.
+        scores: what a box is scored by.
+        scan: its number, for messages.
+
+    Raises:
+        ExportError: a box without a partner within the tolerances.
+    """
+    spec = spec.with_score_threshold(0.0)
+    spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=max(len(proposals), 1)))
+    boxes, partners = (reported_detections(proposals, *answer, spec, scores) for answer in (expected, found))
+    difference, lone = nearest_partners(boxes, partners)
+    if len(lone):
+        raise _unlike(
+            scan,
+            f"{len(lone)} refined boxes have no partner within {BOX_TOLERANCE_M} m and "
+            f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees",
+        )
+    return difference
 
 
 def compare_boxes(
@@ -197,9 +239,10 @@ def _require_ties(
         explained = grown
     for lone, known in zip((our_lone, their_lone), explained, strict=True):
         for name, box, score in zip(lone[~known].names, lone[~known].boxes, lone[~known].scores, strict=True):
-            raise ExportError(
-                f"scan {scan}: stage decode: the {name} at x = {box[0]:.2f}, y = {box[1]:.2f} m with score {score:.3f} "
-                f"has no partner within {BOX_TOLERANCE_M} m and {np.rad2deg(YAW_TOLERANCE_RAD)} degrees"
+            raise _unlike(
+                scan,
+                f"the {name} at x = {box[0]:.2f}, y = {box[1]:.2f} m with score {score:.3f} "
+                f"has no partner within {BOX_TOLERANCE_M} m and {np.rad2deg(YAW_TOLERANCE_RAD)} degrees",
             )
 
 

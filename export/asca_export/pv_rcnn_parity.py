@@ -1,7 +1,6 @@
 """The proof that a pv_rcnn bundle is the trained model: graph by graph on the same inputs, then the boxes."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,15 +10,13 @@ from asca_deploy.bundle import Parity
 from asca_deploy.pv_rcnn_graphs import OUT, balls_around
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_deploy.voxel_canvas import VoxelCanvas
-from asca_export.parity import YAW_TOLERANCE_RAD, nearest_partners, require_close, require_compared
-from asca_pillars.errors import ExportError
+from asca_export.parity import require_close, require_compared, require_same_refined
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn
 from asca_pillars.models.pv_rcnn.voxel_batch import VoxelBatch, batch_scans
 from asca_pillars.points.anchor_proposals import propose_anchors
 from asca_pillars.points.bilinear import read_map
 from asca_pillars.points.refine_geometry import grid_neighbors
-from asca_pillars.points.refined_detections import reported_detections
 from asca_pillars.points.voxel_scan import LEVEL_SOURCES, voxel_scan
 
 RELATIVE_TOLERANCE = 1e-4  # of what a graph gives, to its largest value where that is above 1
@@ -42,8 +39,6 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
     """
     worst = worst_box = worst_yaw = 0.0
     spec, builder, compared = network.spec, network.spec.table_builder(), 0
-    every_box = spec.with_score_threshold(0.0)
-    every_box = replace(every_box, post=replace(every_box.post, nms_iou=1.0, max_detections=10_000))
     for number, points in enumerate(scans):
         scan = voxel_scan(points[np.isfinite(points).all(axis=1)], spec, network.settings, builder)
         if not len(scan.features):
@@ -75,16 +70,11 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
         with torch.inference_mode():
             indices = [torch.from_numpy(part) for part in grid.indices]
             refined = network.refine(batch.keypoints, described, torch.from_numpy(grid.points), indices)
-        ours, theirs = tuple(part.numpy() for part in refined), runtime.refine(scan.keypoints, features, grid)
+        ours = refined[0].numpy(), refined[1].numpy()
+        theirs = runtime.refine(scan.keypoints, features, grid)
         for name, wanted, found in zip(("confidence", "residuals"), ours, theirs, strict=True):
             worst = max(worst, _require(f"refine `{name}`", wanted, found, number))
-        boxes, partners = (reported_detections(proposals, c, r, every_box, runtime.scores) for c, r in (ours, theirs))
-        difference, lone = nearest_partners(boxes, partners)
-        if len(lone):
-            raise ExportError(
-                f"scan {number}: stage decode: {len(lone)} refined boxes have no partner within "
-                f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees and a centimetre"
-            )
+        difference = require_same_refined(proposals, ours, theirs, spec, runtime.scores, number)
         worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
     return Parity(worst, worst_box, worst_yaw, require_compared(compared), RELATIVE_TOLERANCE)
 

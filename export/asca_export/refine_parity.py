@@ -1,7 +1,6 @@
 """The proof that a bundle of two stages is the trained model: graph by graph on the same inputs, then the boxes."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -9,14 +8,12 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
 from asca_deploy.refine_pipeline import RefinePipeline, refine_inputs
-from asca_export.parity import MAP_TOLERANCE, YAW_TOLERANCE_RAD, nearest_partners, require_close, require_compared
-from asca_pillars.errors import ExportError
+from asca_export.parity import MAP_TOLERANCE, require_close, require_compared, require_same_refined
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.second_stage.refine_sample import collate_scans
 from asca_pillars.points.first_stage import FirstStage, proposed_from
 from asca_pillars.points.refine_geometry import refine_scan
-from asca_pillars.points.refined_detections import reported_detections
 from asca_pillars.refine_config import RefineModel
 
 
@@ -43,8 +40,6 @@ def prove_refine_parity(
     """
     worst = worst_box = worst_yaw = 0.0
     compared = 0
-    spec = model.spec.with_score_threshold(0.0)
-    spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=10_000))  # every box, none suppressed
     for number, scan in enumerate(scans):
         points = scan[np.isfinite(scan).all(axis=1)]
         expected, found = stage(points), runtime.infer(runtime.prepare(points, []), []).found
@@ -63,14 +58,7 @@ def prove_refine_parity(
         theirs = runtime.refine(refine_inputs(asked))
         for name, one, other in zip(("confidence", "residuals"), ours, theirs, strict=True):
             worst = max(worst, require_close(f"refine `{name}`", one, other, MAP_TOLERANCE, number))
-        boxes, partners = (
-            reported_detections(proposed.proposals, c, r, spec, model.refine.scores) for c, r in (ours, theirs)
-        )
-        difference, lone = nearest_partners(boxes, partners)
-        if len(lone):
-            raise ExportError(
-                f"scan {number}: stage decode: {len(lone)} refined boxes have no partner within "
-                f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees and a centimetre"
-            )
+        scores = model.refine.scores
+        difference = require_same_refined(proposed.proposals, ours, theirs, model.spec, scores, number)
         worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
     return Parity(worst, worst_box, worst_yaw, require_compared(compared), MAP_TOLERANCE)
