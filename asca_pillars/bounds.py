@@ -11,7 +11,7 @@ _LARGEST = 2.0**53  # of settings: up to here a float counts every whole number
 
 
 def require_bounds(section: str, settings: Strict, names: Sequence[str], *, low: float, high: float = math.inf) -> None:
-    """Refuse numbers, alone or in a tuple, below `low`, above `high` or not finite.
+    """Refuse numbers, alone or in a tuple that has at least one, below `low`, above `high` or not finite.
 
     Args:
         section: where the settings stand in a configuration, for the message.
@@ -24,6 +24,8 @@ def require_bounds(section: str, settings: Strict, names: Sequence[str], *, low:
     """
     for name in names:
         value = getattr(settings, name)
+        if value == ():
+            raise ConfigError(f"{section}.{name} is empty: give at least one number")
         for number in value if isinstance(value, tuple) else (value,):
             # Compared, never converted: a whole number may be larger than any float.
             if abs(number) > _LARGEST and number != math.inf:

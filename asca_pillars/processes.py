@@ -49,7 +49,7 @@ def in_processes(
     workers = min(workers, math.ceil(len(todo) / at_once))
     with contextlib.ExitStack() as stack:
         if workers > 1:
-            stack.enter_context(_one_thread_per_process())
+            stack.enter_context(one_thread_per_process())
             others = {process.pid for process in multiprocessing.active_children()}
             # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
             pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(workers, _take_job, (job,)))
@@ -88,7 +88,7 @@ def _do_job(items: Sequence[Any]) -> list[Any]:
 
 
 @contextlib.contextmanager
-def _one_thread_per_process() -> Iterator[None]:
+def one_thread_per_process() -> Iterator[None]:
     """The processes started inside compute with one thread each: the processes are the parallelism."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))

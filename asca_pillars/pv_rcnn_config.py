@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+from asca_pillars.bounds import require_bounds
 from asca_pillars.errors import ConfigError
 from asca_pillars.points.anchor_proposals import AnchorProposals
 from asca_pillars.points.refined_detections import Scores
@@ -54,23 +55,15 @@ class PvRcnnNetwork(Strict):
     attention: Attention = "none"
 
     def __post_init__(self) -> None:
-        single = {name: (getattr(self, name),) for name in _CHANNELS}
-        several = {name: getattr(self, name) for name in _SEVERAL}
-        sources = {f"source_widths.{number}": widths for number, widths in enumerate(self.source_widths)}
-        for name, widths in (single | several | sources).items():
+        several = ("voxel_channels", "block_channels", "scale_widths", "grid_widths")
+        single = ("upsample_channels", "scale_channels", "keypoint_channels", "weighting_channels", "vector_channels")
+        require_bounds("model.network", self, (*several, *single, "hidden"), low=1)
+        require_bounds("model.network", self, ("block_convs",), low=0)
+        for number, widths in enumerate(self.source_widths):
             if min(widths, default=0) < 1:
-                raise ConfigError(f"model.network.{name} = {list(widths)}: must be at least 1")
-        if min(self.block_convs) < 0:
-            raise ConfigError(f"model.network.block_convs = {list(self.block_convs)}: must be at least 0")
+                raise ConfigError(f"model.network.source_widths.{number} = {list(widths)}: must be at least 1")
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"model.network.dropout = {self.dropout:g}: must be at least 0 and less than 1")
-
-
-_CHANNELS = (
-    *("upsample_channels", "keypoint_channels", "weighting_channels"),
-    *("vector_channels", "scale_channels", "hidden"),
-)
-_SEVERAL = ("voxel_channels", "block_channels", "scale_widths", "grid_widths")
 
 
 def _many_proposals() -> AnchorProposals:
@@ -110,8 +103,7 @@ class PvRcnnModel(Strict):
     train_first_stage: bool = True
 
     def __post_init__(self) -> None:
-        if self.rois < 2:
-            raise ConfigError(f"model.rois = {self.rois}: must be at least 2")
+        require_bounds("model", self, ("rois",), low=2)
         if len(self.network.source_widths) != len(self.settings.sources):
             raise ConfigError(
                 f"model.network.source_widths has {len(self.network.source_widths)} entries: give one for each of "

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from asca_pillars.bounds import require_bounds
 from asca_pillars.errors import ConfigError
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStageSettings
@@ -30,10 +31,8 @@ class RefineNetwork(Strict):
     dropout: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("ball_widths", "keypoint_channels", "grid_widths", "hidden"):
-            value = getattr(self, name)
-            if min(value if isinstance(value, tuple) else (value,), default=0) < 1:
-                raise ConfigError(f"model.refine.network.{name} = {value}: must be at least 1")
+        widths = ("ball_widths", "keypoint_channels", "grid_widths", "hidden")
+        require_bounds("model.refine.network", self, widths, low=1)
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"model.refine.network.dropout = {self.dropout:g}: must be at least 0 and less than 1")
 
@@ -58,8 +57,7 @@ class RefineConfig(Strict):
     scores: Scores = "second"
 
     def __post_init__(self) -> None:
-        if self.rois < 2:
-            raise ConfigError(f"model.refine.rois = {self.rois}: must be at least 2")
+        require_bounds("model.refine", self, ("rois",), low=2)
 
 
 @dataclass(frozen=True)
@@ -91,5 +89,4 @@ class RefineModel(Strict):
                 f"model.refine.seen.proposals.quotas = {list(quotas)}: give one for each of the classes "
                 f"{', '.join(self.spec.class_names)}"
             )
-        if self.bev_channels < 0:
-            raise ConfigError(f"model.bev_channels = {self.bev_channels}: must be at least 0")
+        require_bounds("model", self, ("bev_channels",), low=0)

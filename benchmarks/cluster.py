@@ -37,6 +37,7 @@ from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.files import write_json
 from tests.deploy.conftest import make_scan, write_bundle
 
 POINTS = 300
@@ -153,7 +154,7 @@ def main(
     finally:
         cluster.shutdown()
     if out is not None:
-        out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        write_json(out, figures)
     raise typer.Exit(int(not all(value for name, value in figures.items() if name.endswith("the same"))))
 
 

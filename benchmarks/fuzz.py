@@ -7,7 +7,6 @@ read as a command would. Reading has to succeed or to be refused with one AscaEr
 happened; what did is printed with the number of the input, and `--first NUMBER --inputs 1` reads that one again.
 """
 
-import json
 import math
 import re
 import signal
@@ -30,6 +29,7 @@ from rich.table import Table
 
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.errors import AscaError
+from asca_pillars.files import write_json
 from benchmarks.fuzz_inputs import Kind, kinds
 
 OUTCOMES = ("read", "refused", "traceback", "slow", "not finite", "too many points")
@@ -71,7 +71,7 @@ def main(
         console.print(text)
     if out is not None:
         rows = [{"kind": name, "outcome": outcome, "inputs": count} for (name, outcome), count in counts.items()]
-        out.write_text(json.dumps({"seed": seed, "inputs": total, "counts": rows}, indent=1) + "\n", encoding="utf-8")
+        write_json(out, {"seed": seed, "inputs": total, "counts": rows})
     raise typer.Exit(int(any(counts[name, outcome] for name, outcome in counts if outcome in BAD)))
 
 

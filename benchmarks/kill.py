@@ -10,7 +10,6 @@ Run it from a checkout that nobody edits meanwhile: an export writes the git rev
 """
 
 import hashlib
-import json
 import os
 import random
 import re
@@ -32,6 +31,7 @@ from rich.table import Table
 
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.files import write_json
 
 POLL_S = 0.002
 FRAMES = 10
@@ -103,7 +103,7 @@ def main(
     console.print(table)
     if out is not None:
         rows = {name: [vars(kill) for kill in done] for name, done in results.items()}
-        out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        write_json(out, rows)
     raise typer.Exit(int(any(not kill.identical or kill.left for done in results.values() for kill in done)))
 
 

@@ -6,7 +6,7 @@ As many frames as KITTI's validation split has, with about as many objects; most
 three times, as a detector reports them before suppression. The reference does a few of the frames and must agree.
 """
 
-import resource
+import math
 import time
 from dataclasses import fields
 from itertools import pairwise
@@ -17,12 +17,12 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
+from asca_deploy.benchmark.resident_memory import peak_memory_mib
 from asca_pillars.commands.run_command import run_command
-from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, KittiResults, evaluate
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, KittiResults, evaluate
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from tests.evaluation.kitti.brute_force import ReferenceCurve, brute_force
 
-CLASS_NAMES = ("Car", "Pedestrian", "Cyclist")
 TYPES = np.array([*CLASS_NAMES, "Van", "Person_sitting", "Truck"])
 SHARES = (0.70, 0.11, 0.04, 0.08, 0.01, 0.06)
 SIZES_HWL_M = np.array(
@@ -45,12 +45,13 @@ def main(
     objects = sum(map(len, truth))
     console.print(f"{frames} frames, {objects} objects and areas, {sum(map(len, found))} detections, seed {seed}")
 
-    before_mib = _peak_mib()
+    before_mib = peak_memory_mib() or math.nan
     start = time.perf_counter()
     edges = 20.0 * np.arange(bands + 1)
     results = evaluate(truth, found, CLASS_NAMES, bands_m=list(pairwise(edges)), progress=True)
     wall_s = time.perf_counter() - start
-    console.print(f"evaluation: {wall_s:.1f} s; peak memory {_peak_mib():.0f} MiB, {before_mib:.0f} MiB of it before")
+    peak_mib = peak_memory_mib() or math.nan
+    console.print(f"evaluation: {wall_s:.1f} s; peak memory {peak_mib:.0f} MiB, {before_mib:.0f} MiB of it before")
     for name in CLASS_NAMES:
         values = [f"{results.overall.curves[name, '3d', difficulty].r40:.2f}" for difficulty in DIFFICULTIES]
         console.print(f"  {name}: 3D AP R40 {' / '.join(values)}")
@@ -148,10 +149,6 @@ def _check(results: KittiResults, references: dict[tuple[str, str, str], Referen
         for field in (f.name for f in fields(ours) if f.name in ReferenceCurve._fields):
             if not np.allclose(getattr(ours, field), getattr(reference, field), rtol=0, atol=1e-9):
                 raise SystemExit(f"the reference has other {field} of {' '.join(key)}")
-
-
-def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 if __name__ == "__main__":

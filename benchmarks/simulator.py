@@ -26,13 +26,14 @@ from rich.table import Table
 
 from asca_pillars.commands.run_command import run_command
 from asca_pillars.data.kitti import in_image
+from asca_pillars.processes import one_thread_per_process
 from asca_pillars.sim.annotation import label_camera_view
 from asca_pillars.sim.casting.raycast import cast
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.image_border import outside_image
 from asca_pillars.sim.sensor.lidar import draw_firings
 from asca_pillars.sim.sensor.returns import measure
-from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
+from asca_pillars.sim.simulation import RAY_KEYS, SimulationConfig, built_half_angle_rad, simulate_frame
 from asca_pillars.sim.world.scene import build, draw_scene
 
 STAGES = ("scene", "bodies", "cast", "returns", "labels", "frame")
@@ -74,14 +75,13 @@ def _stages(config: SimulationConfig, frames: int, seed: int) -> dict[str, list[
         camera_only = config.field_of_view == "camera"
         scene = draw_scene(config.scene, draws_of(seed, index, 0))
         marks.append(time.process_time())
-        reach = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0) if camera_only else np.pi
-        bodies = build(scene, config.scene, (seed, index), reach)
+        bodies = build(scene, config.scene, (seed, index), built_half_angle_rad(config))
         marks.append(time.process_time())
         firings = draw_firings(config.lidar, draws_of(seed, index, 2), camera_only)
         if camera_only:
             firings = replace(firings, outside=outside_image(firings, scene.calibration))
         noise = draws_of(seed, index, 3)
-        hits = cast(bodies, len(scene.targets), scene.ground, firings, int(noise.integers(1 << 62)))
+        hits = cast(bodies, len(scene.targets), scene.ground, firings, int(noise.integers(RAY_KEYS)))
         marks.append(time.process_time())
         returns = measure(hits, firings, noise)
         marks.append(time.process_time())
@@ -111,24 +111,15 @@ def _spread(rates: npt.NDArray[np.float64]) -> str:
 def _rates(config: SimulationConfig, frames: int, seed: int, workers: int) -> list[tuple[float, float]]:
     """Frames per second of `workers` processes together, and per second of processor time, of each round."""
     job = partial(_draw, config, seed)
-    # As in `simulate`: forked threads could hang, and linear algebra must not spread over the cores by itself.
-    before = os.environ.get("OPENBLAS_NUM_THREADS")
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    try:
-        with multiprocessing.get_context("spawn").Pool(workers) as pool:
-            pool.map(job, range(4 * WARM_UP * workers), chunksize=WARM_UP)
-            rates = []
-            for turn in range(ROUNDS):
-                first, count = turn * frames, max(frames // ROUNDS, workers)
-                start = time.perf_counter()
-                busy = pool.map(job, range(first, first + count), chunksize=max(count // (4 * workers), 1))
-                rates.append((count / (time.perf_counter() - start), count / sum(busy)))
-            return rates
-    finally:
-        if before is None:
-            del os.environ["OPENBLAS_NUM_THREADS"]
-        else:
-            os.environ["OPENBLAS_NUM_THREADS"] = before
+    with one_thread_per_process(), multiprocessing.get_context("spawn").Pool(workers) as pool:
+        pool.map(job, range(4 * WARM_UP * workers), chunksize=WARM_UP)
+        rates = []
+        for turn in range(ROUNDS):
+            first, count = turn * frames, max(frames // ROUNDS, workers)
+            start = time.perf_counter()
+            busy = pool.map(job, range(first, first + count), chunksize=max(count // (4 * workers), 1))
+            rates.append((count / (time.perf_counter() - start), count / sum(busy)))
+        return rates
 
 
 def _draw(config: SimulationConfig, seed: int, index: int) -> float:

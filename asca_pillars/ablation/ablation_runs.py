@@ -14,13 +14,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.progress import track
 
 from asca_pillars.ablation.family import Row
 from asca_pillars.errors import TrainingError
-from asca_pillars.files import atomic_path
+from asca_pillars.files import write_json
 from asca_pillars.system import default_threads
 
 
@@ -84,7 +83,7 @@ def finish_runs(
             chosen = [part for text in settings for part in ("-s", text)]
             with _timed(run.folder / "training_seconds.json") as seconds:
                 _asca(run, ("train", config, *where, *chosen), threads)
-            _write(run.trained, {"seconds": round(sum(seconds)), "threads": threads})
+            write_json(run.trained, {"seconds": round(sum(seconds)), "threads": threads})
         report = run.evaluated.parent
         where = ("--data", str(data), "--split", split, "--out", str(report))
         _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
@@ -115,13 +114,7 @@ def _timed(path: Path) -> Iterator[list[float]]:
         yield attempts
     finally:
         attempts.append(time.monotonic() - start)
-        _write(path, attempts)
-
-
-def _write(path: Path, content: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content), encoding="utf-8")
+        write_json(path, attempts)
 
 
 def _asca(run: Run, arguments: Sequence[str], threads: int) -> None:

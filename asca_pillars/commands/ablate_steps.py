@@ -19,7 +19,7 @@ from asca_pillars.config import Config, DataConfig, load_config
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError, TrainingError
-from asca_pillars.files import atomic_path, require_own
+from asca_pillars.files import require_own, write_json
 from asca_pillars.system import command_line, cpu_model, package_versions
 
 TIMED_ROUNDS = 10
@@ -36,8 +36,7 @@ def claim(out: Path, base: dict[str, Any]) -> None:
         require_own(out, "asca ablate", "ablation.json", text='"config"')
     path = out / "ablation.json"
     if not path.exists():
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(base, indent=1) + "\n", encoding="utf-8")
+        write_json(path, base)
         return
     try:
         noted = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Target assignment: which anchors should find which labelled box (DESIGN of PointPillars, section 4.1 of the paper).
+"""Target assignment: which anchors should find which labelled box (PointPillars, arXiv 1812.05784, section 4.2).
 
 NumPy, because it runs in the loader's processes beside pillarize and shares the geometry with it.
 """

@@ -59,6 +59,18 @@ class Frame:
     calibration: Calibration
 
 
+RAY_KEYS = 1 << 62
+"""Rays of a scan draw by a key below it, which an int64 holds."""
+_BEYOND_THE_IMAGE_DEG = 1.0  # firings end at the image; what stands across its border is whole
+
+
+def built_half_angle_rad(config: SimulationConfig) -> float:
+    """How far to each side of straight ahead bodies are built."""
+    if config.field_of_view != "camera":
+        return np.pi
+    return float(np.deg2rad(config.lidar.camera_half_angle_deg + _BEYOND_THE_IMAGE_DEG))
+
+
 def simulate_frame(seed: int, index: int, config: SimulationConfig | None = None) -> Frame:
     """Frame `index` of the data set `seed`: the same for every call, whatever other frames are made."""
     config = config or SimulationConfig()
@@ -94,9 +106,8 @@ def take_scan(
     camera_only = config.field_of_view == "camera"
     if camera_only:
         firings = replace(firings, outside=outside_image(firings, scene.calibration))
-    half_angle = np.deg2rad(config.lidar.camera_half_angle_deg + 1.0)
-    bodies = build(scene, config.scene, seed, half_angle if camera_only else np.pi, numbers)
-    key = int(noise.integers(1 << 62))
+    bodies = build(scene, config.scene, seed, built_half_angle_rad(config), numbers)
+    key = int(noise.integers(RAY_KEYS))
     hits = cast(bodies, len(scene.targets), scene.ground, firings, key)
     return hits, measure(hits, firings, noise)
 

@@ -14,7 +14,7 @@ from asca_pillars.training.sampler import EpochSampler
 
 
 class DetectionData(L.LightningDataModule):
-    """Training and validation frames of one KITTI-layout folder."""
+    """Training and validation frames of one dataset."""
 
     def __init__(self, config: Config, root: str | Path) -> None:
         super().__init__()

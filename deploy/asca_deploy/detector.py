@@ -66,7 +66,7 @@ class _Frame(NamedTuple):
 
 
 class Detector:
-    """ASCA-PointPillars without PyTorch.
+    """A detector of any kind that ships or was exported, without PyTorch.
 
     One object may be called from several threads at once and gives each the boxes that it would get alone: nothing
     of a scan is kept in it. That costs a pseudo-image per thread (`PillarPipeline`) and no lock; the calls share the
@@ -90,7 +90,7 @@ class Detector:
     Raises:
         BundleError: the bundle is missing, damaged or made for another version.
         ProviderError: the provider is not installed, does not start or lacks the precision; onnxruntime is too old.
-        ConfigError: `threads`, `score_threshold` or `view` is out of range.
+        ConfigError: `threads`, `score_threshold` or `view` is out of range, or `mounting` is none.
     """
 
     def __init__(

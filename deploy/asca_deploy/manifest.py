@@ -23,7 +23,7 @@ from asca_deploy.bundle import (
 from asca_deploy.layout import difference, layout_of
 from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.errors import AscaError, BundleError
-from asca_pillars.files import atomic_path
+from asca_pillars.files import write_json
 from asca_pillars.schema import parse, to_dict
 
 ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
@@ -140,8 +140,7 @@ def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
     data = bundle_to_json(bundle)
     for graph in bundle.graphs.values():
         _verify_graph(Path(folder), graph, {key: data[key] for key in _stamped_keys(data)})
-    with atomic_path(Path(folder) / MANIFEST) as path:
-        path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write_json(Path(folder) / MANIFEST, data)
 
 
 def bundle_to_json(bundle: Bundle) -> dict[str, Any]:

@@ -74,7 +74,7 @@ class Tracker:
             confirmed waits for this scan, if the two are at most `MAX_SCAN_GAP_S` apart.
 
     Raises:
-        ConfigError: a score lies outside 0..1, or a time is not positive.
+        ConfigError: a score lies outside 0..1, `birth_score` names no class, or a time is not positive.
     """
 
     def __init__(
@@ -89,8 +89,10 @@ class Tracker:
         for name, value in {"report_score": report_score, "death_score": death_score, **births}.items():
             if not 0.0 <= value <= 1.0:
                 raise ConfigError(f"{name or 'birth_score'} {value}: a score lies between 0 and 1")
-        if not births or not max_unseen_s > 0:
-            raise ConfigError(f"max_unseen_s {max_unseen_s}: must be positive, and there must be a birth_score")
+        if not births:
+            raise ConfigError("birth_score {}: give one number, or one for at least one class")
+        if not max_unseen_s > 0:
+            raise ConfigError(f"max_unseen_s {max_unseen_s}: must be positive")
         self._births = births
         self._report_score, self._death_score, self._max_unseen_s = report_score, death_score, max_unseen_s
         self.reset()

@@ -1,6 +1,5 @@
 """The comparison of like with like as text and as a picture."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.files import atomic_path
+from asca_pillars.files import atomic_path, write_json
 from asca_pillars.sim.report.like_for_like import LikeForLike
 from asca_pillars.sim.report.look_alikes import ALL, MEASURES, NEIGHBORS, LikeRow
 from asca_pillars.sim.report.plots import new_figure, save_figure
@@ -63,8 +62,7 @@ def notes(result: LikeForLike) -> list[str]:
 
 def write_like(folder: Path, result: LikeForLike) -> None:
     """Write like_for_like.md, .json and .png."""
-    with atomic_path(folder / "like_for_like.json") as temporary:
-        temporary.write_text(json.dumps(result.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(folder / "like_for_like.json", result.to_json())
     _draw(folder / PICTURE, result)
     parts = [f"# {title(result)}\n", "\n".join([*(f"- {line}" for line in notes(result)), ""])]
     parts += [markdown_table(columns, rows, left) for columns, rows, left in _tables(result)]

@@ -1,6 +1,5 @@
 """The comparison as text: on the console, as Markdown and as JSON."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from math import isfinite
@@ -12,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.files import atomic_path
+from asca_pillars.files import atomic_path, write_json
 from asca_pillars.schema import to_dict
 from asca_pillars.sim.report.comparison import Comparison, Row
 from asca_pillars.sim.report.reference import CAR_FIT_RANGE_M, NEAR_CARS_M
@@ -73,8 +72,7 @@ def write_report(folder: Path, comparison: Comparison, plots: Sequence[str]) -> 
     """Write report.md, which shows the named `plots` in the same folder, and report.json."""
     with atomic_path(folder / "report.md") as temporary:
         temporary.write_text(to_markdown(comparison, plots), encoding="utf-8")
-    with atomic_path(folder / "report.json") as temporary:
-        temporary.write_text(json.dumps(to_json(comparison), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(folder / "report.json", to_json(comparison))
 
 
 def to_markdown(comparison: Comparison, plots: Sequence[str]) -> str:

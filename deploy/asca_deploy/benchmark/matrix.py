@@ -85,7 +85,7 @@ def _ways(bundle: str) -> list[Way]:
 
 
 def _same_but_threads(way: Way, failed: Way) -> bool:
-    """Would `way` fail for the same reason; with TensorRT float32 may fail where fewer digits run."""
+    """Whether `way` would fail for the same reason; another precision might not."""
     return way[:3] == failed[:3]
 
 
