@@ -199,8 +199,9 @@ def report_waymo(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
 def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, console: Console) -> None:
     """Evaluate; print and write the tables, the JSON (to `json_path` too) and the curves."""
     truth, found = frames.truth, frames.detections
-    ap = evaluate(truth, found, CLASS_NAMES, bands_m=tuple(BANDS_M), progress=True)
-    points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES)
+    bands_m = tuple(BANDS_M)
+    ap = evaluate(truth, found, CLASS_NAMES, bands_m=bands_m, progress=True)
+    points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES, bands_m=bands_m)
     about = task.about | {"environment": describe_environment()}
     report = KittiReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     page = ReportPage(report.title, kitti_tables(report), kitti_notes(report))

@@ -90,16 +90,9 @@ class WaymoScore:
     aph: float | None
 
 
-def difficulty_levels(points: NDArray[np.integer], hard: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
-    """Levels of objects from their number of LiDAR points: (N,) -> (N,) 0 without points, else 1 or 2.
-
-    Args:
-        hard: (N,) which ones the labelers called LEVEL_2, however many points they have.
-    """
-    level_2 = points <= LEVEL_2_POINTS
-    if hard is not None:
-        level_2 = level_2 | hard
-    return np.where(points > 0, np.where(level_2, 2, 1), 0)
+def difficulty_levels(points: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Levels of objects from their number of LiDAR points: (N,) -> (N,) 0 without points, else 1 or 2."""
+    return np.where(points > 0, np.where(points <= LEVEL_2_POINTS, 2, 1), 0)
 
 
 def min_iou(class_name: str) -> float:

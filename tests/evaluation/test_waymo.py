@@ -198,7 +198,6 @@ def test_a_level_2_object_need_not_be_found_at_level_1_but_may() -> None:
 def test_what_holds_no_point_is_no_object() -> None:
     levels = difficulty_levels(np.array([0, 1, 5, 6, 100]))
     assert levels.tolist() == [0, 2, 2, 1, 1]
-    assert difficulty_levels(np.array([0, 9, 9]), np.array([True, True, False])).tolist() == [0, 2, 1]
     truth = labelled(box(10, 0), box(20, 0), levels=[1, 0])
     assert score_of(truth, found((0.9, box(10, 0)))).ap == pytest.approx(100)
     # A detection of it is false: precision 1/2 when it comes first.

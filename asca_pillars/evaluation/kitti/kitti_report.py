@@ -51,17 +51,18 @@ class KittiReport:
 
 
 def kitti_tables(report: KittiReport) -> list[TextTable]:
-    """AP, AP by distance, recall and precision at the fixed scores."""
-    recall = [(point, point.found, point.objects, point.recall, point.recall_interval) for point in report.points]
+    """AP, AP by distance, recall and precision at the fixed scores, and both by distance."""
+    whole = [point for point in report.points if point.band_m is None]
+    recall = [(point, point.found, point.objects, point.recall, point.recall_interval) for point in whole]
     precision = [
-        (point, point.true_positives, point.detections, point.precision, point.precision_interval)
-        for point in report.points
+        (point, point.true_positives, point.detections, point.precision, point.precision_interval) for point in whole
     ]
     return [
         _ap_table(report.ap.overall),
         _band_table(report.ap),
         _share_table("Recall", ("objects", "found"), recall),
         _share_table("Precision", ("detections", "true positives"), precision),
+        _share_band_table(report.points),
     ]
 
 
@@ -78,7 +79,11 @@ def kitti_notes(report: KittiReport) -> list[str]:
         lines += [
             _cap_note(curve) for curve in _counts_of(results, name) if curve is not None and curve.counted <= SMALL_SET
         ]
-    lines += [_ignored_note(p) for p in report.points if p.difficulty == "hard" and p.ignored > p.detections]
+    lines += [
+        _ignored_note(point)
+        for point in report.points
+        if point.difficulty == "hard" and point.band_m is None and point.ignored > point.detections
+    ]
     if report.best_scores:
         scores = ", ".join(f"{name} {score:.2f}" for name, score in report.best_scores.items())
         lines.append(f"Scores with the best F1 on this data, moderate, in 3D: {scores}")
@@ -161,6 +166,28 @@ def _share_table(
     fixed = dict.fromkeys(f"{p.class_name} {p.score:g} (IoU {p.min_overlap:g})" for p, *_ in shares)
     title = f"{what} (%) in 3D of what reaches the score: {', '.join(fixed)}"
     return TextTable(title, ("class", "difficulty", *columns, what.lower(), "95 % interval"), rows)
+
+
+def _share_band_table(points: Sequence[OperatingPoint]) -> TextTable:
+    """A row for each band, of a class recall and precision."""
+    own = {(p.band_m, p.class_name): p for p in points if p.band_m is not None and p.difficulty == "moderate"}
+    bands, names = (tuple(dict.fromkeys(keys)) for keys in zip(*own, strict=True)) if own else ((), ())
+    rows = tuple(
+        (f"{low:g}-{high:g} m", *(_share_cell(own[(low, high), name]) for name in names)) for low, high in bands
+    )
+    title = "Recall / precision (%) in 3D at these scores by distance, moderate, in brackets the counted objects"
+    return TextTable(title, ("distance", *names), rows, left=1)
+
+
+def _share_cell(point: OperatingPoint) -> str:
+    recall, precision = (
+        _percents(share, interval)[0]
+        for share, interval in (
+            (point.recall, point.recall_interval),
+            (point.precision, point.precision_interval),
+        )
+    )
+    return f"{recall} / {precision} ({point.objects})"
 
 
 def _percents(share: float, interval: tuple[float, float]) -> tuple[str, str]:

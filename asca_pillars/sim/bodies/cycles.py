@@ -17,10 +17,9 @@ def parked_bicycle_body(rng: np.random.Generator) -> Primitives:
     return _leaning(Primitives.join(parts), float(rng.choice([-1.0, 1.0])) * rng.uniform(0.05, 0.3))
 
 
-def motorbike_body(rng: np.random.Generator, length: float | None = None) -> Primitives:
-    """A motorcycle or a scooter on its stand, of a drawn length in metres if none is given."""
-    length = float(rng.uniform(1.7, 2.2)) if length is None else length
-    return _leaning(_motorbike(rng, length), float(rng.uniform(-0.25, 0.25)))
+def motorbike_body(rng: np.random.Generator) -> Primitives:
+    """A motorcycle or a scooter on its stand."""
+    return _leaning(_motorbike(rng, float(rng.uniform(1.7, 2.2))), float(rng.uniform(-0.25, 0.25)))
 
 
 def motorcyclist_body(rng: np.random.Generator, height: float, length: float) -> Primitives:

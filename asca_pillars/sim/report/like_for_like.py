@@ -58,8 +58,8 @@ class LikeForLike:
         return {**sides, "detector": self.detector, "rows": _finite(rows), "firing": _finite(firing)}
 
 
-def measure_side(root: str | Path, detect: Detect | None, *, max_frames: int = MAX_FRAMES, title: str) -> Side:
-    """Measure the frames of `root`/training, at most `max_frames`, evenly spaced; of each what the camera sees.
+def measure_side(root: str | Path, detect: Detect | None, title: str) -> Side:
+    """Measure the frames of `root`/training, at most MAX_FRAMES, evenly spaced; of each what the camera sees.
 
     Raises:
         DatasetError: there is no scan, or a frame without labels or calibration.
@@ -67,7 +67,7 @@ def measure_side(root: str | Path, detect: Detect | None, *, max_frames: int = M
     """
     split = KittiSplit(root)
     ids = split.frame_ids
-    chosen = np.linspace(0, len(ids) - 1, min(max_frames, len(ids))).round().astype(int)
+    chosen = np.linspace(0, len(ids) - 1, min(MAX_FRAMES, len(ids))).round().astype(int)
     records: list[ObjectRecord] = []
     clusters: list[Cluster] = []
     for index in track(chosen, title):
@@ -99,8 +99,8 @@ def compare_like_for_like(
     Raises:
         DatasetError: a folder cannot be read, or no class has a real object and enough simulated ones.
     """
-    real = measure_side(real_root, detect, title="Real frames")
-    simulated = measure_side(simulated_root, detect, title="Simulated frames")
+    real = measure_side(real_root, detect, "Real frames")
+    simulated = measure_side(simulated_root, detect, "Simulated frames")
     rows = compare_objects(real.records, simulated.records)
     if not rows:
         raise DatasetError(

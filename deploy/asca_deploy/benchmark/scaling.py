@@ -49,7 +49,7 @@ def measure_scaling(
     )
 
 
-def resample(scan: NDArray[np.float32], count: int, seed: int = 0) -> NDArray[np.float32]:
+def resample(scan: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     """`count` points of a scan (N, 4) in random order; beyond N, points again with a sensor's noise on x, y, z.
 
     Raises:
@@ -57,7 +57,7 @@ def resample(scan: NDArray[np.float32], count: int, seed: int = 0) -> NDArray[np
     """
     if not len(scan):
         raise ValueError("a scan without points cannot be resampled")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     extra = scan[rng.integers(0, len(scan), max(0, count - len(scan)))]
     extra[:, :3] += rng.normal(0, JITTER_M, (len(extra), 3)).astype(np.float32)
     return np.ascontiguousarray(rng.permutation(np.concatenate([scan, extra]))[:count], np.float32)

@@ -34,7 +34,7 @@ def report(cars: int = 12, missing: tuple[str, ...] = ()) -> KittiReport:
         subject="made up",
         frames=ScoredFrames(tuple(truth), tuple(found), missing),
         ap=evaluate(truth, found, CLASSES, bands_m=tuple(BANDS_M)),
-        points=operating_points(truth, found, CLASSES, scores=0.5, difficulties=DIFFICULTIES),
+        points=operating_points(truth, found, CLASSES, scores=0.5, difficulties=DIFFICULTIES, bands_m=tuple(BANDS_M)),
         best_scores=best_scores(truth, found, CLASSES),
         about={"model": {"name": "nobody"}},
     )
@@ -114,6 +114,25 @@ def test_missing_frames_stand_in_every_form_of_the_report() -> None:
     assert kitti_json(report())["shortage"] is None and "12 frames" in page(report()).markdown().splitlines()[0]
 
 
+def test_recall_and_precision_by_distance() -> None:
+    """Of 12 cars every second one is found 45 m away, the others 20 m; detections of these are dropped."""
+    made = report()
+    near = [
+        dataclasses.replace(frame, scores=np.where(frame.distances_m < 30, 0.1, 0.9))
+        for frame in made.frames.detections
+    ]
+    points = operating_points(made.frames.truth, near, CLASSES, scores=0.5, bands_m=tuple(BANDS_M))
+    table = kitti_tables(dataclasses.replace(made, points=points))[4]
+    assert table.columns == ("distance", *CLASSES)
+    assert [row[:2] for row in table.rows] == [
+        ("0-40 m", "0.00 / - (6)"),
+        ("40-80 m", "100.00 / 100.00 (6)"),
+        ("0-30 m", "0.00 / - (6)"),
+        ("30-50 m", "100.00 / 100.00 (6)"),
+    ]
+    assert table.rows[0][2:] == ("- / - (0)",) * 2
+
+
 def test_the_json_has_kittis_shape_and_no_nan() -> None:
     content = json.loads(json.dumps(kitti_json(report()), allow_nan=False))
     assert content["model"] == {"name": "nobody"}
@@ -127,7 +146,11 @@ def test_the_json_has_kittis_shape_and_no_nan() -> None:
     assert [(band["low_m"], band["high_m"]) for band in content["bands"]] == list(BANDS_M)
     assert content["bands"][0]["mean_3d_moderate_R40"] == pytest.approx(12.5)
     assert content["bands"][0]["results"]["Car"]["bev"]["R40"] == pytest.approx([12.5] * 3)
-    by_class = {(point["class_name"], point["difficulty"]): point for point in content["operating_points"]}
+    by_class = {
+        (point["class_name"], point["difficulty"]): point
+        for point in content["operating_points"]
+        if point["band_m"] is None
+    }
     assert len(by_class) == 9 and by_class["Car", "easy"]["found"] == 12
     assert by_class["Cyclist", "easy"]["recall"] is None
 
