@@ -24,7 +24,7 @@ from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.geometry.assignment import greedy_matches
+from asca_pillars.geometry.assignment import match_by_overlap
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 
@@ -79,12 +79,8 @@ def scores_by_shift(
         boxes[:, :2] += np.array([dx, dy], np.float32)
         found = detector(points)
         found = found[[detection.class_name == name for detection in found]]
-        overlap = bev_iou(found.boxes, boxes)
-        overlap[overlap < least] = 0
-        detections, objects = np.nonzero(overlap)
-        order = np.lexsort((-overlap[detections, objects], detections))  # detections come best first
-        pairs = order[greedy_matches(detections[order], objects[order])]
-        scores[number, objects[pairs]] = found.scores[detections[pairs]]
+        detections, objects = match_by_overlap(bev_iou(found.boxes, boxes), least)
+        scores[number, objects] = found.scores[detections]
     return scores
 
 

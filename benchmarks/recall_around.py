@@ -30,7 +30,7 @@ from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.evaluation.kitti.operating_point import wilson_interval
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.geometry.assignment import greedy_matches
+from asca_pillars.geometry.assignment import match_by_overlap
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.overlap import bev_iou
@@ -109,11 +109,8 @@ def _match(
     distance = np.hypot(truth[:, 0], truth[:, 1])
     iou = bev_iou(boxes, truth)
     least = BEV_IOU.get(name, SMALL_BEV_IOU)
-    detections, objects = np.nonzero(iou >= least)
-    order = np.lexsort((-iou[detections, objects], detections))
-    detections, objects = detections[order], objects[order]
     found = np.zeros(len(own), dtype=bool)
-    found[objects[greedy_matches(detections, objects)]] = True
+    found[match_by_overlap(iou, least)[1]] = True
     kept = (inside >= FEWEST_POINTS) & (distance <= RANGE_M)
     columns = (
         np.full(len(own), number),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.assignment import greedy_matches
+from asca_pillars.geometry.assignment import match_by_overlap
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 
@@ -100,9 +100,5 @@ def _count(
     min_iou: float,
 ) -> tuple[int, int, int]:
     """Objects, found and false detections of one class in one frame; detections by descending score."""
-    iou = bev_iou(found_boxes, boxes)
-    rows, columns = np.nonzero(iou >= min_iou)
-    order = np.lexsort((-iou[rows, columns], rows))
-    rows, columns = rows[order], columns[order]
-    matched = greedy_matches(rows, columns)
-    return int(wanted.sum()), int(wanted[columns[matched]].sum()), len(found_boxes) - len(rows[matched])
+    matched, objects = match_by_overlap(bev_iou(found_boxes, boxes), min_iou)
+    return int(wanted.sum()), int(wanted[objects].sum()), len(found_boxes) - len(matched)

@@ -31,6 +31,19 @@ def greedy_matches(detections: _Indices, objects: _Indices) -> NDArray[np.bool_]
     return matched
 
 
+def match_by_overlap(overlap: _Doubles, least: float) -> tuple[_Indices, _Indices]:
+    """Each detection takes the free object that it overlaps most: (D, O) -> (M,) detections, (M,) objects.
+
+    Args:
+        overlap: intersection over union; detections stand by descending score.
+        least: smallest overlap of a match.
+    """
+    detections, objects = np.nonzero(overlap >= least)
+    order = np.lexsort((-overlap[detections, objects], detections))
+    pairs = order[greedy_matches(detections[order], objects[order])]
+    return detections[pairs], objects[pairs]
+
+
 def best_assignments(overlap: _Doubles) -> _Indices:
     """The one-to-one matching of greatest total overlap, of the first k detections, for every k.
 

@@ -160,11 +160,7 @@ def suppress(
     """
     boxes, logits, labels, non_finite = candidates
     limit = post.max_detections if most is None else min(most, post.max_detections)
-    kept = []
-    for label in range(len(classes)):
-        own = np.flatnonzero(labels == label)
-        kept.append(own[rotated_nms(boxes[own], logits[own], post.nms_iou, limit)])
-    survivors = np.concatenate(kept)
+    survivors = nms_by_class(boxes, logits, labels, post.nms_iou, limit)
     best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
     return Detections(
         boxes[best],
@@ -173,6 +169,21 @@ def suppress(
         tuple(spec.name for spec in classes),
         non_finite=non_finite,
     )
+
+
+def nms_by_class(
+    boxes: NDArray[np.floating[Any]],
+    scores: NDArray[np.floating[Any]],
+    labels: NDArray[np.int64],
+    iou_threshold: float,
+    limit: int | None = None,
+) -> NDArray[np.int64]:
+    """`rotated_nms` within each class: (N, 7), (N,), (N,) -> indices of the kept boxes, class after class."""
+    kept = [np.empty(0, np.int64)]
+    for label in np.unique(labels):
+        own = np.flatnonzero(labels == label)
+        kept.append(own[rotated_nms(boxes[own], scores[own], iou_threshold, limit)])
+    return np.concatenate(kept)
 
 
 def rotated_nms(

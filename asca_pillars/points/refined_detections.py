@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.decode import PostProcess, rotated_nms, sigmoid
+from asca_pillars.geometry.decode import PostProcess, nms_by_class, sigmoid
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.points.refinement import decode_refinement
@@ -73,11 +73,8 @@ def refined_detections(
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left out below
         boxes = decode_refinement(residuals, proposals.boxes)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
-    kept = []
-    for label in range(len(proposals.class_names)):
-        own = np.flatnonzero(usable & (proposals.labels == label))
-        kept.append(own[rotated_nms(boxes[own], scores[own], post.nms_iou, post.max_detections)])
-    survivors = np.concatenate(kept)
+    own = np.flatnonzero(usable)
+    survivors = own[nms_by_class(boxes[own], scores[own], proposals.labels[own], post.nms_iou, post.max_detections)]
     best = survivors[np.argsort(-scores[survivors], kind="stable")[: post.max_detections]]
     found = Detections(boxes[best], scores[best].astype(np.float32), proposals.labels[best], proposals.class_names)
     return replace(found, non_finite=int((~usable).sum()))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.ground_height import fit_ground_plane
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.decode import rotated_nms
+from asca_pillars.geometry.decode import nms_by_class
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
@@ -106,11 +106,7 @@ def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: f
         off_ahead.append(angles[own])
     all_boxes, all_scores, all_labels = np.concatenate(boxes), np.concatenate(scores), np.concatenate(labels)
     nearness = -np.concatenate(off_ahead)
-    kept = []
-    for label in np.unique(all_labels):
-        same = np.flatnonzero(all_labels == label)
-        kept.append(same[rotated_nms(all_boxes[same], nearness[same], nms_iou)])
-    survivors = np.concatenate([np.empty(0, np.int64), *kept])
+    survivors = nms_by_class(all_boxes, nearness, all_labels, nms_iou)
     best = survivors[np.argsort(-all_scores[survivors], kind="stable")]
     return Detections(
         all_boxes[best],

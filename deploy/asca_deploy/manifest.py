@@ -22,7 +22,7 @@ from asca_deploy.bundle import (
 )
 from asca_deploy.layout import difference, layout_of
 from asca_deploy.onnx_file import has_external_data, read_metadata
-from asca_pillars.errors import AscaError, BundleError
+from asca_pillars.errors import AscaError, BundleError, printable
 from asca_pillars.files import write_json
 from asca_pillars.schema import parse, to_dict
 
@@ -85,13 +85,15 @@ def load_bundle(folder: str | Path) -> Bundle:
         # The grid and the classes check themselves and do not know the file they were read from.
         raise BundleError(f"{_blamed(manifest, error)}; {_EXPORT_AGAIN}") from None
     except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
-        raise BundleError(f"{manifest}: a value makes no sense ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
+        raise BundleError(
+            f"{manifest}: a value makes no sense ({printable(str(error), _LONGEST_REASON)}); {_EXPORT_AGAIN}"
+        ) from None
     if isinstance(bundle, PillarBundle):
         _verify_refine(manifest, bundle)
     if set(bundle.graphs) != set(bundle.graph_names):
         raise BundleError(
             f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(bundle.graph_names)}, not "
-            f"{_cut(', '.join(bundle.graphs)) or 'none'}; {_EXPORT_AGAIN}"
+            f"{printable(', '.join(bundle.graphs), _LONGEST_REASON) or 'none'}; {_EXPORT_AGAIN}"
         )
     for graph in bundle.graphs.values():
         _verify_graph(folder, graph, stamped)
@@ -137,10 +139,10 @@ def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
 
 def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
     """Write bundle.json beside the graphs in `folder`, which must lie there already, stamped with `essentials`."""
-    data = bundle_to_json(bundle)
+    stamped = essentials(bundle)
     for graph in bundle.graphs.values():
-        _verify_graph(Path(folder), graph, {key: data[key] for key in _stamped_keys(data)})
-    write_json(Path(folder) / MANIFEST, data)
+        _verify_graph(Path(folder), graph, stamped)
+    write_json(Path(folder) / MANIFEST, bundle_to_json(bundle))
 
 
 def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
@@ -201,7 +203,9 @@ def _read_manifest(manifest: Path) -> dict[str, Any]:
     except RecursionError:
         raise BundleError(f"{manifest} is damaged (nested too deeply); {_EXPORT_AGAIN}") from None
     except ValueError as error:  # of the JSON, or of its UTF-8
-        raise BundleError(f"{manifest} is damaged ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
+        raise BundleError(
+            f"{manifest} is damaged ({printable(str(error), _LONGEST_REASON)}); {_EXPORT_AGAIN}"
+        ) from None
     version = data.get("schema_version") if isinstance(data, dict) else None
     if type(version) is not int:
         shown = reprlib.repr(version)
@@ -220,7 +224,7 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for number, (key, _) in enumerate(pairs) if key in dict(pairs[:number]))
-        raise ValueError(f"key `{_cut(twice)}` is there twice")
+        raise ValueError(f"key `{printable(twice, _LONGEST_REASON)}` is there twice")
     return found
 
 
@@ -230,13 +234,7 @@ def _no_number(word: str) -> Any:
 
 def _blamed(manifest: Path, error: AscaError) -> str:
     reason = str(error).removeprefix(f"{manifest}: ")
-    return f"{manifest}: {_cut(reason)}"
-
-
-def _cut(reason: str) -> str:
-    """Text that holds a file's content, on one line of bounded length."""
-    line = "".join(mark if mark.isprintable() else ascii(mark)[1:-1] for mark in reason[:_LONGEST_REASON])
-    return line if len(reason) <= _LONGEST_REASON else f"{line}..."
+    return f"{manifest}: {printable(reason, _LONGEST_REASON)}"
 
 
 def _first_difference(written: Any, understood: Any) -> str | None:
@@ -275,7 +273,7 @@ def _verify_graph(folder: Path, graph: GraphFile, stamped: dict[str, Any]) -> No
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise BundleError(f"{path}: {error.strerror}") from None
+        raise BundleError(f"{path}: {error.strerror}; make it readable, or copy the whole folder again") from None
     found = _sha256(content)
     if found != graph.sha256:
         raise BundleError(
@@ -293,7 +291,7 @@ def _verify_graph(folder: Path, graph: GraphFile, stamped: dict[str, Any]) -> No
                     f"copy the whole folder again, or {_EXPORT_AGAIN}"
                 )
     except (ValueError, RecursionError) as error:
-        raise BundleError(f"{path} is damaged ({_cut(str(error))}); {_EXPORT_AGAIN}") from None
+        raise BundleError(f"{path} is damaged ({printable(str(error), _LONGEST_REASON)}); {_EXPORT_AGAIN}") from None
 
 
 def _canonical(value: Any) -> str:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.assignment import UNMATCHED, best_assignments, greedy_matches
+from asca_pillars.geometry.assignment import UNMATCHED, best_assignments, greedy_matches, match_by_overlap
 
 
 def greatest_sum(overlap: NDArray[np.float64]) -> float:
@@ -69,3 +69,11 @@ def test_greedy_takes_pairs_in_turn() -> None:
     detections, objects = np.array([0, 0, 1, 1, 2]), np.array([4, 5, 4, 5, 4])
     assert greedy_matches(detections, objects).tolist() == [True, False, False, True, False]
     assert greedy_matches(detections[:0], objects[:0]).tolist() == []
+
+
+def test_a_detection_takes_the_free_object_that_it_overlaps_most() -> None:
+    """The first takes the second object, so the second one gets the first; 0.5 is enough, the fourth has too little."""
+    overlap = np.array([[0.6, 0.8, 0.0], [0.5, 0.9, 0.0], [0.7, 0.7, 0.0], [0.0, 0.0, 0.4]])
+    detections, objects = match_by_overlap(overlap, 0.5)
+    assert (detections.tolist(), objects.tolist()) == ([0, 1], [1, 0])
+    assert [part.tolist() for part in match_by_overlap(overlap[:0], 0.5)] == [[], []]
