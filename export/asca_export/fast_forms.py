@@ -141,10 +141,9 @@ class _Head(nn.Module):
 
     def __init__(self, head: SSDHead) -> None:
         super().__init__()
-        parts = (head.scores, head.boxes, head.directions)
-        self.weight = nn.Parameter(torch.cat([part.weight[:, :, 0, 0] for part in parts]).T.contiguous())
-        self.bias = nn.Parameter(torch.cat([part.bias for part in parts if part.bias is not None]))
-        self.channels = [part.out_channels for part in parts]
+        weight, bias = head.joined()
+        self.weight, self.bias = nn.Parameter(weight.T.contiguous()), nn.Parameter(bias)
+        self.channels = head.channels
 
     def forward(self, features: Tensor) -> tuple[Tensor, ...]:
         # Adding the biases behind the split keeps onnxruntime from joining product and sum into a float-only operator.

@@ -32,14 +32,14 @@ EMPTY_SIZE = 256  # cells to a side; the deepest convolution of the paper's neck
 PLACES = 8000  # of each scan and layer, whose inputs weights are rounded for
 _DAMPING = 0.001  # of the moments' mean diagonal, so that inputs that hardly ever move do not blow up
 _SHRINK = 0.95  # a range may lose this much of its end where that spares it coarser steps
-_TINY = 1e-6
+TINY = 1e-6  # a channel that is never above it is as good as empty; its step must not be 0
 
 
 def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
     """Steps of a canvas that holds the unitless features of all these scans, (P, C) each, and zero exactly."""
     lows, highs = zip(*((features.min(axis=0), features.max(axis=0)) for features in pillar_features), strict=True)
     low, high = np.minimum(np.min(lows, axis=0), 0.0), np.maximum(np.max(highs, axis=0), 0.0)
-    scale = np.maximum((high - low) / STEPS, _TINY).astype(np.float32)
+    scale = np.maximum((high - low) / STEPS, TINY).astype(np.float32)
     empty = np.clip(np.round(-low / scale), 0, STEPS).astype(np.float32)
     return CanvasSteps(torch.from_numpy(scale), torch.from_numpy(empty))
 
@@ -71,7 +71,7 @@ def scale_to_steps(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]]
             *(next(iter(stage.convolutions.values())) for stage in stages[i + 1 : i + 2]),
         ]
         for j, name in enumerate(names):
-            step = highest[name].clamp_min(_TINY) / STEPS
+            step = highest[name].clamp_min(TINY) / STEPS
             whole = torch.floor(empty[name] / step / _SHRINK)
             step = torch.where(whole > 0, empty[name] / whole.clamp_min(1), step)
             _count(convolutions[name], step)
@@ -79,7 +79,7 @@ def scale_to_steps(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]]
                 reader.weight.mul_(step[:, None, None] / STEP_VALUE)
         # The outputs for the places of one cell become neighbors in one channel.
         channels = upsample.channels
-        step = highest[upsample_name].reshape(-1, channels).amax(dim=0).clamp_min(_TINY) / STEPS
+        step = highest[upsample_name].reshape(-1, channels).amax(dim=0).clamp_min(TINY) / STEPS
         _count(upsample.convolution, step.repeat(upsample.stride**2))
         backbone.head.weight[i * channels : (i + 1) * channels].mul_(step[:, None] / STEP_VALUE)
 
@@ -142,8 +142,8 @@ def round_together(weight: Tensor, squares: Tensor) -> Tensor:
     The largest weight of an output stays at the end of its grid, from which the graph's writer takes the grid's unit.
     """
     largest, peak = weight.abs().max(dim=1)
-    unit = largest.clamp_min(_TINY) / WEIGHT_STEPS
-    damping = _DAMPING * squares.diagonal().mean().clamp_min(_TINY)
+    unit = largest.clamp_min(TINY) / WEIGHT_STEPS
+    damping = _DAMPING * squares.diagonal().mean().clamp_min(TINY)
     inverse = torch.linalg.inv(squares.double() + damping * torch.eye(len(squares)))
     factor = torch.linalg.cholesky(inverse, upper=True).float()
     left, rounded = weight.clone(), torch.empty_like(weight)

@@ -12,6 +12,7 @@ from asca_deploy.bundle import RefineSection
 from asca_deploy.refine_pipeline import grid_names, refine_interface
 from asca_export.graphs import export_graph
 from asca_export.point_forms import GatheredSetAbstraction, GroupedSetAbstraction
+from asca_export.sparse_forms import scale_and_shift
 from asca_pillars.models.refine.keypoint_encoder import SourceRows
 from asca_pillars.models.refine.pillar_refiner import PillarRefiner
 from asca_pillars.models.refine.set_abstraction import SetAbstraction
@@ -55,22 +56,16 @@ def fold_norms(network: M) -> M:
 
 
 def _fold(layer: nn.Linear, norm: nn.BatchNorm1d) -> Shift:
-    scale, shift = _scale_and_shift(norm)
+    scale, shift = scale_and_shift(norm)
     layer.weight *= scale[:, None]
     return Shift(shift)
 
 
 def _fold_vectors(pool: VectorPool) -> Shift:
-    scale, shift = _scale_and_shift(pool.norm)
+    scale, shift = scale_and_shift(pool.norm)
     pool.features.weight *= scale[:, None]
     pool.places.mul_(scale.view(len(pool.places), 1, -1))
     return Shift(shift)
-
-
-def _scale_and_shift(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
-    assert norm.running_var is not None and norm.running_mean is not None
-    scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
-    return scale, norm.bias - norm.running_mean * scale
 
 
 class _Flat(nn.Module):

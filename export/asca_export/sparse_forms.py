@@ -6,19 +6,18 @@ outputs are then picked at head cells; the head's three convolutions are one pro
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
+from asca_export.quantize import HEAD
 from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.pillar.neck import SparseRPNNeck
+from asca_pillars.models.pillar.neck import SparseRPNNeck, block_layers
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.tables.neck_tables import NeckTables, table_inputs
-
-HEAD = "head"
+from asca_pillars.tables.neck_tables import SAME, NeckTables, table_inputs
 
 
 class TableLayer(NamedTuple):
@@ -58,14 +57,14 @@ class SparseBackbone(nn.Module):
         for number, (block, deblock) in enumerate(zip(neck.blocks, neck.deblocks, strict=True)):
             grows = neck.rule == "fine" and number == 0
             convolutions = []
-            for index, (convolution, norm) in enumerate(_pairs(block)):
+            for index, (convolution, norm) in enumerate(block_layers(block)):
                 assert isinstance(convolution, nn.Conv2d)
                 fused = fuse_conv_bn_eval(convolution, norm)
                 kind = ("strided", "first" if grows else "same", "same")[min(index, 2)]
                 layer = TableLayer(f"block{number}_{index}", f"{kind}_{number}")
                 self.products[layer.name] = linear(fused.weight.flatten(2).transpose(1, 2).flatten(1), fused.bias)
                 convolutions.append(layer)
-            ((transposed, norm),) = _pairs(deblock)
+            ((transposed, norm),) = block_layers(deblock)
             assert isinstance(transposed, nn.ConvTranspose2d)
             fused_up = fuse_conv_bn_eval(transposed, norm, transpose=True)
             assert fused_up.bias is not None
@@ -73,18 +72,16 @@ class SparseBackbone(nn.Module):
             weight = fused_up.weight.permute(2, 3, 1, 0).flatten(0, 2)  # (row, column, channel), inputs
             self.products[upsample] = linear(weight, fused_up.bias.repeat(stride**2))
             self.levels.append(Level(tuple(convolutions), upsample, f"places_{number}", stride))
-        parts = (detector.head.scores, detector.head.boxes, detector.head.directions)
-        biases = [part.bias for part in parts if part.bias is not None]
-        self.products[HEAD] = linear(torch.cat([part.weight[:, :, 0, 0] for part in parts]), torch.cat(biases))
-        self.head_channels = [part.out_channels for part in parts]
+        self.products[HEAD] = linear(*detector.head.joined())
+        self.head_channels = detector.head.channels
         first = self.product(self.levels[0].convolutions[0].name)
-        self.channels = first.in_features // 9
+        self.channels = first.in_features // SAME.taps
         self.empty = torch.zeros(self.channels) if steps is None else steps.empty
         """(C,) what the first layer reads where there is no pillar; in steps if there are any."""
         if steps is not None:
             with torch.no_grad():
-                first.weight.view(-1, 9, self.channels).mul_(steps.scale / STEP_VALUE)
-                first.bias.sub_(first.weight @ (steps.empty * STEP_VALUE).repeat(9))
+                first.weight.view(-1, SAME.taps, self.channels).mul_(steps.scale / STEP_VALUE)
+                first.bias.sub_(first.weight @ (steps.empty * STEP_VALUE).repeat(SAME.taps))
 
     def product(self, name: str) -> nn.Linear:
         """The product of this name: weight (outputs, taps * C) with the channels of a tap side by side."""
@@ -118,10 +115,11 @@ class SparseBackbone(nn.Module):
         return HeadMaps(*last.split(self.head_channels, dim=1))
 
 
-def _pairs(block: nn.Module) -> list[tuple[Any, Any]]:
-    """Each convolution, and the normalization that follows it."""
-    children = list(block.children())
-    return list(zip(children[0::3], children[1::3], strict=True))
+def scale_and_shift(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
+    """What a normalization in evaluation mode multiplies with and adds, (C,) each."""
+    assert norm.running_var is not None and norm.running_mean is not None
+    scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+    return scale, norm.bias - norm.running_mean * scale
 
 
 def linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:

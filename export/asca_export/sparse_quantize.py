@@ -13,13 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
-from asca_export.quantize import PLACES, STEPS, round_together
-from asca_export.sparse_forms import HEAD, SparseBackbone
+from asca_export.quantize import HEAD, PLACES, STEPS, TINY, round_together
+from asca_export.sparse_forms import SparseBackbone
 from asca_pillars.tables.neck_tables import NeckTables
 
 BEST_CELLS = 32  # of each scan and anchor, that the head is rounded for
 OTHER_CELLS = 64  # of each scan beside them, so that background stays background
-TINY = 1e-6
 
 
 class SparseSample(NamedTuple):
@@ -65,11 +64,7 @@ def scale_rows_to_steps(backbone: SparseBackbone, samples: Iterable[SparseSample
         backbone: made with the steps of the samples; changed in place.
         samples: of the calibration scans, in steps.
     """
-    highest: dict[str, Tensor] = {}
-    for sample in samples:
-        for name, _, output in backbone.passes(*sample):
-            high = output.amax(dim=0) if len(output) else output.new_zeros(output.shape[1])
-            highest[name] = torch.maximum(highest[name], high) if name in highest else high
+    highest = highest_outputs(backbone, samples)
     head, first_channel = backbone.product(HEAD), 0
     names = [[layer.name for layer in level.convolutions] for level in backbone.levels]
     for number, level in enumerate(backbone.levels):
@@ -86,6 +81,16 @@ def scale_rows_to_steps(backbone: SparseBackbone, samples: Iterable[SparseSample
         count_steps(backbone.product(level.upsample), step.repeat(level.stride**2))
         head.weight[:, first_channel : first_channel + channels] *= step / STEP_VALUE
         first_channel += channels
+
+
+def highest_outputs(backbone: RowProducts, samples: Iterable[tuple[Any, ...]]) -> dict[str, Tensor]:
+    """The largest value (C,) of each channel of what every product gives, by name; at least 0."""
+    highest: dict[str, Tensor] = {}
+    for sample in samples:
+        for name, _, output in backbone.passes(*sample):
+            before = highest.get(name, output.new_zeros(output.shape[1]))
+            highest[name] = torch.cat([output, before[None]]).amax(dim=0)
+    return highest
 
 
 @torch.no_grad()

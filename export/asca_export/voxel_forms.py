@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from asca_deploy.pv_rcnn_graphs import OUT, VOXEL_VALUES
 from asca_export.fast_forms import STEP_VALUE
-from asca_export.quantize import STEPS
+from asca_export.quantize import STEPS, TINY
 from asca_export.row_graphs import RowGraph
-from asca_export.sparse_forms import linear
-from asca_export.sparse_quantize import TINY, count_steps, mixed_products, read_moments, round_products
+from asca_export.sparse_forms import linear, scale_and_shift
+from asca_export.sparse_quantize import count_steps, highest_outputs, mixed_products, read_moments, round_products
 from asca_pillars.models.pv_rcnn.voxel_backbone import TableLayer, VoxelBackbone
 from asca_pillars.points.voxel_scan import LEVEL_SOURCES
 
@@ -121,11 +121,7 @@ def scale_voxels_to_steps(backbone: VoxelProducts, samples: Sequence[VoxelSample
     Returns:
         (C,) of each product's outputs, unitless.
     """
-    highest: dict[str, Tensor] = {}
-    for sample in samples:
-        for name, _, output in backbone.passes(*sample):
-            high = output.amax(dim=0)
-            highest[name] = torch.maximum(highest[name], high) if name in highest else high
+    highest = highest_outputs(backbone, samples)
     steps = {name: high.clamp_min(TINY) / STEPS for name, high in highest.items()}
     names = [layer.name for layer in backbone.layers]
     for name, following in zip(names, [*names[1:], None], strict=True):
@@ -174,8 +170,6 @@ def export_voxels(
 
 
 def _folded(layer: TableLayer) -> nn.Linear:
-    norm, weight = layer.norm, layer.convolution.weight.detach()
-    assert norm.running_var is not None and norm.running_mean is not None
-    scale = (norm.weight / torch.sqrt(norm.running_var + norm.eps)).detach()
-    matrix = (weight * scale[:, None, None, None, None]).flatten(2).transpose(1, 2).flatten(1)
-    return linear(matrix, (norm.bias - norm.running_mean * scale).detach())
+    weight, (scale, shift) = layer.convolution.weight.detach(), scale_and_shift(layer.norm)
+    matrix = (weight * scale.detach()[:, None, None, None, None]).flatten(2).transpose(1, 2).flatten(1)
+    return linear(matrix, shift.detach())

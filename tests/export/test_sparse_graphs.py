@@ -13,8 +13,8 @@ from torch.utils._pytree import tree_map_only
 from asca_deploy.ort_session import OrtSession
 from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import CanvasSteps
-from asca_export.quantize import STEPS, canvas_steps
-from asca_export.sparse_forms import HEAD, SparseBackbone
+from asca_export.quantize import HEAD, STEPS, canvas_steps
+from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone
 from asca_export.sparse_quantize import (
     BEST_CELLS,

@@ -35,8 +35,16 @@ class SSDHead(nn.Module):
 
     def at_cells(self, features: Tensor) -> HeadMaps[Tensor]:
         """The same at single cells: (M, C) -> scores (M, A), boxes (M, 7A), directions (M, 2A)."""
+        joined = linear_rows(features, *self.joined())  # one product and one gradient of the features instead of three
+        return HeadMaps(*joined.split(self.channels, dim=1))
+
+    @property
+    def channels(self) -> list[int]:
+        """Of scores, boxes and directions."""
+        return [part.out_channels for part in (self.scores, self.boxes, self.directions)]
+
+    def joined(self) -> tuple[Tensor, Tensor]:
+        """The three convolutions as one product: weight (outputs, C) and bias (outputs,), split by `channels`."""
         parts = self.scores, self.boxes, self.directions
         weight = torch.cat([part.weight[:, :, 0, 0] for part in parts])
-        bias = torch.cat([part.bias for part in parts if part.bias is not None])
-        joined = linear_rows(features, weight, bias)  # one product and one gradient of the features instead of three
-        return HeadMaps(*joined.split([part.out_channels for part in parts], dim=1))
+        return weight, torch.cat([part.bias for part in parts if part.bias is not None])

@@ -74,7 +74,7 @@ class SparseRPNNeck(RPNLayers):
         """Unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
-            for number, (convolution, norm) in enumerate(_convolutions(block)):
+            for number, (convolution, norm) in enumerate(block_layers(block)):
                 table, back = (
                     (level.strided, level.strided_back),
                     (level.first, level.first_back),
@@ -88,7 +88,7 @@ class SparseRPNNeck(RPNLayers):
         """The same function by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
-            for number, (convolution, norm) in enumerate(_convolutions(block)):
+            for number, (convolution, norm) in enumerate(block_layers(block)):
                 everywhere = convolution(canvas).permute(0, 2, 3, 1)  # (B, h, w, outputs)
                 cells = (level.cells if number else level.strided_cells).long()
                 active = torch.relu(at_active_cells(norm, everywhere.flatten(0, 2)[cells]))
@@ -98,7 +98,7 @@ class SparseRPNNeck(RPNLayers):
         return torch.cat(maps, dim=1)
 
 
-def _convolutions(block: nn.Module) -> Iterator[tuple[Any, Any]]:
+def block_layers(block: nn.Module) -> Iterator[tuple[Any, Any]]:
     """Each convolution of a block, and the normalization that follows it."""
     children = list(block.children())
     return zip(children[0::3], children[1::3], strict=True)
