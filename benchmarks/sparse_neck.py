@@ -22,7 +22,7 @@ from rich.progress import track
 
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import Comparison, compare
-from asca_deploy.benchmark.box_comparison import Run
+from asca_deploy.benchmark.speed_comparison import Run
 from asca_deploy.benchmark.timing import Track, silently
 from asca_pillars.commands.bench_tables import comparison_table
 from asca_pillars.commands.run_command import run_command

@@ -134,7 +134,7 @@ def evaluate(
     else:
         assert frames_of is not None, "checked with the arguments"
         opened = open_model(options, min_score)
-        scores = steps.fixed_scores(opened, score, min_score) if protocol == "kitti" else {}
+        scores = steps.kitti_scores(opened, score, min_score) if protocol == "kitti" else {}
         task = steps.run_model(opened, frames_of, labels, scores, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)
     if protocol == "waymo":

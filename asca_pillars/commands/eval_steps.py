@@ -126,7 +126,7 @@ def check_classes(task: Task, frames: ScoredFrames) -> None:
         )
 
 
-def fixed_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
+def kitti_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
     """For each class the score from which on detections count for precision and recall."""
     known = {name.lower(): name for name in CLASS_NAMES}
     scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)

@@ -58,7 +58,7 @@ class PreparedVoxels(NamedTuple):
         return self.scan.counts
 
 
-class FirstAnswer(NamedTuple):
+class VoxelAnswer(NamedTuple):
     """What the first stage says of a scan."""
 
     scan: VoxelScan
@@ -136,19 +136,19 @@ class PvRcnnPipeline:
         laps.append(("scatter", perf_counter()))
         return PreparedVoxels(scan, levels, canvas)
 
-    def infer(self, prepared: PreparedVoxels, laps: Laps) -> FirstAnswer:
+    def infer(self, prepared: PreparedVoxels, laps: Laps) -> VoxelAnswer:
         """The map seen from above -> head maps, and what it says at the keypoints."""
         scan, levels, canvas = prepared
         if canvas is None:
-            return FirstAnswer(scan, levels, np.empty((0, self._map_channels), np.float32), None)
+            return VoxelAnswer(scan, levels, np.empty((0, self._map_channels), np.float32), None)
         maps = self.neck_and_head(canvas.image)
         laps.append(("neck+head", perf_counter()))
         bev = read_map(canvas.rows, scan.bev_cells, scan.bev_weights)
         self._canvases.append(canvas)
         laps.append(("keypoints", perf_counter()))
-        return FirstAnswer(scan, levels, bev, maps)
+        return VoxelAnswer(scan, levels, bev, maps)
 
-    def finish(self, raw: FirstAnswer, laps: Laps) -> Detections:
+    def finish(self, raw: VoxelAnswer, laps: Laps) -> Detections:
         """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
         if raw.maps is None:
             return Detections.empty(self.spec.class_names)
@@ -157,7 +157,7 @@ class PvRcnnPipeline:
         return detections
 
     def judge(
-        self, maps: HeadMaps[NDArray[np.float32]], raw: FirstAnswer, laps: Laps
+        self, maps: HeadMaps[NDArray[np.float32]], raw: VoxelAnswer, laps: Laps
     ) -> tuple[Detections, NDArray[np.float32], NDArray[np.float32]]:
         """The R proposals of head maps, and what the second stage says of them: logits (R,), residuals (R, 7)."""
         proposals = propose_anchors(maps, self.spec, self.settings.proposals)
@@ -235,4 +235,4 @@ class PvRcnnPipeline:
         return VoxelCanvas(self.spec.level_shapes[-1], self._map_channels, self._map_type)
 
 
-_: type[Pipeline[PreparedVoxels, FirstAnswer]] = PvRcnnPipeline  # mypy compares them
+_: type[Pipeline[PreparedVoxels, VoxelAnswer]] = PvRcnnPipeline  # mypy compares them

@@ -32,7 +32,7 @@ from asca_export.int8 import calibration_scans, quantize_bundle
 from asca_export.masked_forms import MarkedEncoder, MaskedBackbone
 from asca_export.parity import prove_parity
 from asca_export.sparse_forms import SparseBackbone
-from asca_export.sparse_graphs import export_sparse_backbone, multiply_accumulates
+from asca_export.sparse_graphs import export_sparse_backbone, sparse_multiply_accumulates
 from asca_pillars.config import ModelConfig, pillar_spec
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.errors import ExportError
@@ -221,4 +221,4 @@ def _export_graphs(
     backbone = SparseBackbone(detector)
     export_sparse_backbone(backbone, path)
     tables = [preparation.place(preparation.spec.pillarize(scan)).tables for scan in scans]
-    return float(np.mean([multiply_accumulates(backbone, each) for each in tables if each is not None])) / 1e9
+    return float(np.mean([sparse_multiply_accumulates(backbone, each) for each in tables if each is not None])) / 1e9

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
+from asca_deploy.pillar_backbone import Maps
 from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
 from asca_export.masked_forms import NEVER
 from asca_pillars.errors import ExportError
@@ -29,10 +30,8 @@ YAW_TOLERANCE_RAD = np.deg2rad(0.5)
 OVERLAP_TIE = 1e-4  # of an overlap with the largest that suppression allows
 COMPARED_ANCHORS = 100  # per class and scan: the best ones, whatever their score, so that there is always something
 
-Maps = HeadMaps[NDArray[np.float32]]
 
-
-class BoxDifference(NamedTuple):
+class LargestDifferences(NamedTuple):
     """Largest differences between the boxes of two detectors that belong together."""
 
     center_size_m: float
@@ -136,7 +135,7 @@ def require_same_refined(
     spec: DetectorSpec,
     scores: Scores,
     scan: int,
-) -> BoxDifference:
+) -> LargestDifferences:
     """Refine every proposal both ways, with no threshold and no suppression; every box needs a partner.
 
     Args:
@@ -164,7 +163,7 @@ def require_same_refined(
 
 def compare_boxes(
     expected: Maps, found: Maps, spec: PillarSpec, scan: int = 0, cells: NDArray[np.int32] | None = None
-) -> BoxDifference:
+) -> LargestDifferences:
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
     Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
@@ -185,14 +184,14 @@ def compare_boxes(
         for class_, logits in zip(spec.classes, by_class(expected.scores, spec), strict=True)
     )
     uncut = replace(spec.post, max_detections=spec.post.candidates * len(classes))
-    worst = BoxDifference(0.0, 0.0)
+    worst = LargestDifferences(0.0, 0.0)
     for post in (replace(uncut, nms_iou=1.0), uncut):
         lowered = replace(spec, classes=classes, post=post)
         ours, theirs = lowered.decode(expected, cells), lowered.decode(found, cells)
         forward, our_lone = nearest_partners(ours, theirs)
         backward, their_lone = nearest_partners(theirs, ours)
         _require_ties(ours[our_lone], theirs[their_lone], ours, theirs, lowered, scan)
-        worst = BoxDifference(*map(max, zip(worst, forward, backward, strict=True)))
+        worst = LargestDifferences(*map(max, zip(worst, forward, backward, strict=True)))
     return worst
 
 
@@ -204,7 +203,7 @@ def _score_of_rank(logits: NDArray[np.float32]) -> float:
     return float(1 / (1 + np.exp(-logit.astype(np.float64))))
 
 
-def nearest_partners(boxes: Detections, partners: Detections) -> tuple[BoxDifference, NDArray[np.int64]]:
+def nearest_partners(boxes: Detections, partners: Detections) -> tuple[LargestDifferences, NDArray[np.int64]]:
     """Largest difference between boxes and their nearest partners, and the boxes (n,) without one in tolerance."""
     worst_m = worst_rad = 0.0
     lone = []
@@ -218,7 +217,7 @@ def nearest_partners(boxes: Detections, partners: Detections) -> tuple[BoxDiffer
             continue
         best = close[lengths[close].argmin()]
         worst_m, worst_rad = max(worst_m, float(lengths[best])), max(worst_rad, float(yaws[best]))
-    return BoxDifference(worst_m, worst_rad), np.array(lone, dtype=np.int64)
+    return LargestDifferences(worst_m, worst_rad), np.array(lone, dtype=np.int64)
 
 
 def _require_ties(

@@ -20,7 +20,7 @@ from asca_pillars.models.pillar.pillar_detector import PillarDetector
 from asca_pillars.tables.neck_tables import SAME, NeckTables, table_inputs
 
 
-class TableLayer(NamedTuple):
+class NeckProduct(NamedTuple):
     """A convolution by table, followed by a ReLU."""
 
     name: str
@@ -32,7 +32,7 @@ class TableLayer(NamedTuple):
 class Level(NamedTuple):
     """One block of the neck, and what brings its rows to the head cells."""
 
-    convolutions: tuple[TableLayer, ...]
+    convolutions: tuple[NeckProduct, ...]
     upsample: str
     places: str
     """The input of the graph that picks the upsampling's rows."""
@@ -61,7 +61,7 @@ class SparseBackbone(nn.Module):
                 assert isinstance(convolution, nn.Conv2d)
                 fused = fuse_conv_bn_eval(convolution, norm)
                 kind = ("strided", "first" if grows else "same", "same")[min(index, 2)]
-                layer = TableLayer(f"block{number}_{index}", f"{kind}_{number}")
+                layer = NeckProduct(f"block{number}_{index}", f"{kind}_{number}")
                 self.products[layer.name] = linear(fused.weight.flatten(2).transpose(1, 2).flatten(1), fused.bias)
                 convolutions.append(layer)
             ((transposed, norm),) = block_layers(deblock)

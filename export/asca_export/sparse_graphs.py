@@ -51,7 +51,7 @@ def export_sparse_backbone(
     graph.save(path, "sparse_backbone")
 
 
-def multiply_accumulates(backbone: SparseBackbone, tables: NeckTables[NDArray[np.int32]]) -> int:
+def sparse_multiply_accumulates(backbone: SparseBackbone, tables: NeckTables[NDArray[np.int32]]) -> int:
     """Count of multiply-accumulates of the products on the scan that these tables, indices (M, 9), are of."""
     inputs, total = table_inputs(tables), 0
     for level in backbone.levels:

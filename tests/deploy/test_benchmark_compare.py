@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
 from asca_deploy.benchmark import alternate, compare, measure_matrix
-from asca_deploy.benchmark.box_comparison import FRAMES_PER_TURN
 from asca_deploy.benchmark.box_differences import box_difference
+from asca_deploy.benchmark.speed_comparison import FRAMES_PER_TURN
 from asca_deploy.providers import PROVIDERS
 from asca_pillars.system import default_threads
 
@@ -37,7 +37,7 @@ def test_the_speedup_is_a_ratio_within_a_round(monkeypatch: pytest.MonkeyPatch) 
     """The machine is ten times slower in the second of three rounds, and the ratio does not see it."""
     slow = np.array([[1.0], [10.0], [1.0]])
     times = {"first": 30 * slow * np.ones((3, FRAMES_PER_TURN)), "other": 10 * slow * np.ones((3, FRAMES_PER_TURN))}
-    monkeypatch.setattr("asca_deploy.benchmark.box_comparison.alternate", lambda *_: times)
+    monkeypatch.setattr("asca_deploy.benchmark.speed_comparison.alternate", lambda *_: times)
     first, other = compare({"first": len, "other": len}, SCANS, rounds=3).contestants
     assert (first.speedup.median, first.total_ms.p50, first.fps) == (1, 30, pytest.approx(1000 / 30))
     assert (other.speedup.low, other.speedup.median, other.speedup.high) == (3, 3, 3)

@@ -18,7 +18,7 @@ from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.targets import assign_targets
 from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, Placement, PreparedPillars
+from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, Placement, TargetedPillars
 from asca_pillars.pillar_config import LossConfig, NetworkConfig, PillarModel
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
@@ -194,7 +194,7 @@ def samples(root: Path) -> list[Sample]:
     nothing = assign_targets(SPEC.anchors, SPEC.classes, empty.boxes, empty.labels)
     return [
         frames.sample(0, 0),
-        Sample(empty, PreparedPillars(SPEC.pillarize(empty.points), Placement(None, None), nothing)),
+        Sample(empty, TargetedPillars(SPEC.pillarize(empty.points), Placement(None, None), nothing)),
         frames.sample(0, 1),
     ]
 

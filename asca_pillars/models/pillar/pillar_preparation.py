@@ -31,7 +31,7 @@ class Placement(NamedTuple):
     tables: NeckTables[NDArray[np.int32]] | None
 
 
-class PreparedPillars(NamedTuple):
+class TargetedPillars(NamedTuple):
     """One frame: its pillars, where they stand on the map, and the targets of its anchors."""
 
     pillars: Pillars
@@ -90,15 +90,15 @@ class PillarPreparation:
     active_cells: MaskRule | None = None
     assigner: Assigner = "overlap"
 
-    def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedPillars:
+    def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> TargetedPillars:
         """Pillars of a frame and the targets of its anchors; nothing is drawn."""
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points)
         targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels, self.assigner)
-        return PreparedPillars(pillars, self.place(pillars), targets)
+        return TargetedPillars(pillars, self.place(pillars), targets)
 
-    def collate(self, frames: Sequence[PreparedPillars]) -> LabeledPillars:
+    def collate(self, frames: Sequence[TargetedPillars]) -> LabeledPillars:
         """Frames as one batch."""
         return LabeledPillars(
             batch_pillars([frame.pillars for frame in frames], [frame.placement for frame in frames]),

@@ -17,7 +17,7 @@ from asca_pillars.points.voxel_scan import VoxelScan, VoxelSetSettings, voxel_sc
 from asca_pillars.tables.voxel_spec import VoxelSpec
 
 
-class PreparedVoxels(NamedTuple):
+class TargetedVoxels(NamedTuple):
     """One frame: its scan, the targets of its anchors and keypoints, and its labelled boxes."""
 
     scan: VoxelScan
@@ -39,13 +39,13 @@ class VoxelPreparation:
     spec: VoxelSpec
     settings: VoxelSetSettings
 
-    def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedVoxels:
+    def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> TargetedVoxels:
         """Voxels, tables, keypoints and targets of a frame; nothing is drawn."""
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
         scan = voxel_scan(points, spec, self.settings, spec.table_builder(training=True))
-        return PreparedVoxels(
+        return TargetedVoxels(
             scan,
             assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels),
             keypoint_states(scan.keypoints, frame.boxes, frame.labels),
@@ -53,7 +53,7 @@ class VoxelPreparation:
             frame.labels,
         )
 
-    def collate(self, frames: Sequence[PreparedVoxels]) -> LabeledVoxels:
+    def collate(self, frames: Sequence[TargetedVoxels]) -> LabeledVoxels:
         """Frames as one batch."""
         return LabeledVoxels(
             batch_scans([frame.scan for frame in frames], self.spec),

@@ -29,7 +29,7 @@ def ground_mask(points: _Floats) -> NDArray[np.bool_]:
     """Which points (N, >=3), LiDAR frame in metres, are ground: (N,) bool, all false where no plane is to be seen."""
     x, y, z = points[:, :3].astype(np.float32).T
     radius = np.hypot(x, y)
-    plane = fit_plane(points[radius < _PLANE_REACH_M])
+    plane = most_common_ground(points[radius < _PLANE_REACH_M])
     if plane is None:
         return np.zeros(len(points), bool)
     above = z - (plane[0] * x + plane[1] * y + plane[2])
@@ -48,7 +48,7 @@ def ground_mask(points: _Floats) -> NDArray[np.bool_]:
     return ground
 
 
-def fit_plane(points: _Floats) -> NDArray[np.float64] | None:
+def most_common_ground(points: _Floats) -> NDArray[np.float64] | None:
     """RANSAC plane (3,) a, b, c of z = a x + b y + c, metres, through points (N, >=3); None if no draw is level enough.
 
     The draws are seeded: the same points give the same plane.
