@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.schema import Strict
 
 ANCHOR_YAWS_RAD = (0.0, math.pi / 2)
 
@@ -17,7 +17,7 @@ IGNORED = -1  # label of a box that is neither to be found nor to be missed; oth
 
 
 @dataclass(frozen=True)
-class ClassSpec:
+class ClassSpec(Strict):
     """A class to detect: its anchor's size and height above the LiDAR, and how boxes are matched with it."""
 
     name: str
@@ -32,8 +32,6 @@ class ClassSpec:
     """An anchor that overlaps every box less than this is background; in between it is ignored."""
     score_threshold: float = 0.3
     """Detections below this score are not reported."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         if not self.name:

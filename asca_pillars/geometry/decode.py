@@ -3,7 +3,7 @@
 import math
 import reprlib
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.schema import Strict
 
 KERNELS = "asca_pillars.geometry.nms_kernels"
 
@@ -30,7 +31,7 @@ MOST = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class PostProcess:
+class PostProcess(Strict):
     """How head maps become detections."""
 
     nms_iou: float = 0.01
@@ -39,8 +40,6 @@ class PostProcess:
     """Best boxes of each class that enter the suppression."""
     max_detections: int = 100
     """Best boxes of a scan that are reported."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         if not 0 <= self.nms_iou <= 1:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,11 @@ from asca_pillars.geometry.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.schema import Strict
 
 
 @dataclass(frozen=True)
-class DetectorSpec(ABC):
+class DetectorSpec(Strict, ABC):
     """Classes and post-processing; each family adds the grid that its ranges and head cells come from.
 
     Raises:
@@ -26,8 +27,6 @@ class DetectorSpec(ABC):
 
     classes: tuple[ClassSpec, ...] = KITTI_CLASSES
     post: PostProcess = field(default_factory=PostProcess)
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         if not self.classes:

@@ -14,7 +14,7 @@ Columns run along x and rows along y; a pillar's flat index is row * nx + column
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.fitting import HEAD_STRIDE, MAX_ZONES, NECK_STRIDE, fits, x_advice, y_advice
+from asca_pillars.schema import Strict
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
 
@@ -47,7 +48,7 @@ class GridTables(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PillarGrid:
+class PillarGrid(Strict):
     """Ranges and pillar sizes in metres, LiDAR frame (paper section 3.2, eq. 1-5). Immutable and validated.
 
     With zones=1 and v_max_m=0.16 it is the uniform grid of PointPillars.
@@ -69,8 +70,6 @@ class PillarGrid:
     map: Literal["warped", "pooled"] = "warped"
     """What the neck reads. `warped`: a column for every pillar along x, as the paper prints it. `pooled`: columns as
     deep as the second zone's pillars everywhere, see `map_pooling`. With one zone both are the same."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):

@@ -6,7 +6,6 @@ is. Nothing is padded, so nothing needs to be masked later.
 
 import reprlib
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from asca_pillars.geometry.decode import MOST
 from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.schema import Strict
 
 KERNELS = "asca_pillars.pillars.pillar_kernels"
 
@@ -25,14 +25,12 @@ to the mean of the pillar's kept points and to the pillar's center."""
 
 
 @dataclass(frozen=True)
-class PillarLimits:
+class PillarLimits(Strict):
     """Upper bounds of one scan's input; beyond them an even subset is kept (P and N of the paper), see `evenly`."""
 
     max_pillars: int = 12000
     max_points: int = 64
     """Points of one pillar."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         for name in ("max_pillars", "max_points"):

@@ -1,7 +1,6 @@
 """Proposals of a head whose every anchor has a score for every class (PV-RCNN, section 3.1)."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +10,11 @@ from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.decode import HeadMaps, rotated_nms, sigmoid
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.schema import Strict
 
 
 @dataclass(frozen=True)
-class AnchorProposals:
+class AnchorProposals(Strict):
     """How head maps become proposals, whatever their class; the defaults are PV-RCNN's in use.
 
     Attributes:
@@ -26,8 +26,6 @@ class AnchorProposals:
     candidates: int = 1024
     nms_iou: float = 0.7
     count: int = 100
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         if not 0 <= self.nms_iou <= 1:

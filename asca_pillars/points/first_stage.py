@@ -1,7 +1,7 @@
 """What the second stage asks of the first: proposals, keypoints and what the first stage's map says there."""
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.points.bilinear import bilinear_cells, read_map
 from asca_pillars.points.farthest_points import farthest_points, points_near_boxes
 from asca_pillars.points.proposals import ProposalSettings, propose
+from asca_pillars.schema import Strict
 
 
 class FirstPass(NamedTuple):
@@ -43,14 +44,12 @@ class FirstStage(Protocol):
 
 
 @dataclass(frozen=True)
-class KeypointSettings:
+class KeypointSettings(Strict):
     """Which points of a scan become keypoints."""
 
     count: int = 768
     margin_m: float = 2.0
     """They stand within this distance of the circles around the proposals; others would say nothing about them."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         if self.count < 1 or not self.margin_m >= 0:
@@ -60,13 +59,11 @@ class KeypointSettings:
 
 
 @dataclass(frozen=True)
-class FirstStageSettings:
+class FirstStageSettings(Strict):
     """All that decides what the second stage sees of the first."""
 
     proposals: ProposalSettings = field(default_factory=ProposalSettings)
     keypoints: KeypointSettings = field(default_factory=KeypointSettings)
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,11 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode_candidates, suppress
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.schema import Strict
 
 
 @dataclass(frozen=True)
-class ProposalSettings:
+class ProposalSettings(Strict):
     """How a first stage's head maps become proposals."""
 
     score_threshold: float = 0.05
@@ -25,8 +26,6 @@ class ProposalSettings:
     """Best boxes of each class that enter the suppression."""
     quotas: tuple[int, ...] = (20, 20, 10)
     """Proposals of each class at most, so that classes with low scores are not crowded out."""
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         for name, value in (("score_threshold", self.score_threshold), ("nms_iou", self.nms_iou)):

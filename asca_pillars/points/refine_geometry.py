@@ -3,7 +3,7 @@
 import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,14 @@ from asca_pillars.points.cube_neighbors import nearest_in_cubes
 from asca_pillars.points.farthest_points import points_near_boxes
 from asca_pillars.points.first_stage import Proposed
 from asca_pillars.points.roi_grid import roi_grid_points
+from asca_pillars.schema import Strict
 
 ROI_FEATURES = 4
 """Columns of `roi_features` beside one for each class."""
 
 
 @dataclass(frozen=True)
-class RefineSettings:
+class RefineSettings(Strict):
     """Balls and grids of the second stage."""
 
     ball_radii_m: tuple[float, ...] = (0.4, 0.8)
@@ -32,8 +33,6 @@ class RefineSettings:
     grid_radii_m: tuple[float, ...] = (0.8, 1.6)
     """Around grid points, in which keypoints are aggregated."""
     grid_samples: int = 16
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         for field in fields(self):

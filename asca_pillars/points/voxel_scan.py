@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from asca_pillars.points.ball_query import ball_query, three_nearest
 from asca_pillars.points.bilinear import bilinear_cells
 from asca_pillars.points.farthest_points import farthest_points
 from asca_pillars.points.point_scales import PointScale, point_scales
+from asca_pillars.schema import Strict
 from asca_pillars.tables.voxel_spec import VoxelSpec
 from asca_pillars.tables.voxel_tables import VoxelLevel, VoxelTableBuilder
 from asca_pillars.tables.voxels import voxelize
@@ -31,7 +32,7 @@ def _are_radii(radii_m: Sequence[float]) -> bool:
 
 
 @dataclass(frozen=True)
-class SourceBalls:
+class SourceBalls(Strict):
     """What voxel set abstraction aggregates of one source around a keypoint.
 
     Attributes:
@@ -44,8 +45,6 @@ class SourceBalls:
     radii_m: tuple[float, ...]
     samples: tuple[int, ...]
 
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
-
     def __post_init__(self) -> None:
         if not self.radii_m or len(self.radii_m) != len(self.samples):
             raise ConfigError(f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must go in pairs")
@@ -56,7 +55,7 @@ class SourceBalls:
 
 
 @dataclass(frozen=True)
-class VoxelSetSettings:
+class VoxelSetSettings(Strict):
     """Keypoints, proposals and neighbors of PV-RCNN; the defaults are the published ones on KITTI.
 
     Attributes:
@@ -92,8 +91,6 @@ class VoxelSetSettings:
     grid_radii_m: tuple[float, ...] = (0.8, 1.6)
     grid_samples: int = 16
     vector_cells: int = 0
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -3,10 +3,11 @@
 from dataclasses import dataclass, fields
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.schema import Strict
 
 
 @dataclass(frozen=True)
-class SceneConfig:
+class SceneConfig(Strict):
     """Ranges of the random streets. Pairs are bounds of a uniform draw unless said otherwise; metres and radians.
 
     The class rates are mean numbers of objects placed ahead of the car, within `reach_m`; as many stand behind it.
@@ -107,8 +108,6 @@ class SceneConfig:
     # An object with fewer returns in the image is marked DontCare, one that is hardly visible too.
     min_points: int = 2
     min_visible_share: float = 0.05
-
-    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
     def __post_init__(self) -> None:
         normal = ("slope_x", "slope_y", "level_band_m")  # no bounds of a draw

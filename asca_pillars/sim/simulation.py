@@ -20,6 +20,7 @@ from asca_pillars.data.kitti import (
     write_labels,
 )
 from asca_pillars.files import atomic_path
+from asca_pillars.schema import Strict
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
 from asca_pillars.sim.parallel import ABOUT_FILE, check_wishes, claim_simulation, for_each, held_out
@@ -34,7 +35,7 @@ _SHARD_FRAMES = 20  # of a cluster's worker: a second or two
 
 
 @dataclass(frozen=True)
-class SimulationConfig:
+class SimulationConfig(Strict):
     """What to simulate.
 
     Attributes:
@@ -46,8 +47,6 @@ class SimulationConfig:
     scene: SceneConfig = field(default_factory=SceneConfig)
     lidar: Lidar = field(default_factory=Lidar)
     field_of_view: Literal["full", "camera", "around"] = "full"
-
-    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
 
 @dataclass(frozen=True)

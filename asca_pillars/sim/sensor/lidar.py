@@ -13,13 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.schema import Strict
 from asca_pillars.sim.sensor import hdl64
 
 MAX_COLUMNS = 4096  # the ray caster tells firings apart by ring * 4096 + column
 
 
 @dataclass(frozen=True)
-class Lidar:
+class Lidar(Strict):
     """A spinning LiDAR; the defaults are KITTI's HDL-64E. Angles in degrees, lengths in metres.
 
     Attributes:
@@ -71,8 +72,6 @@ class Lidar:
     faint_reflectance: tuple[float, float] = (0.2, 0.13)
     zero_share: float = 0.03  # of all returns, reported as 0 for no reason: so the best lasers do on near, bright road
     camera_half_angle_deg: float = 43.0
-
-    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012 - a class constant that pydantic reads
 
     def __post_init__(self) -> None:
         if list(self.elevation_deg) != sorted(self.elevation_deg, reverse=True) or not self.elevation_deg:
