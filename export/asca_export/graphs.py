@@ -5,7 +5,7 @@ import json
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +16,7 @@ from onnxscript import opset20 as op
 from torch import Tensor, nn
 
 from asca_deploy.bundle import Bundle
+from asca_deploy.graph import Tensor as Declared
 from asca_deploy.manifest import essentials, graph_files
 from asca_deploy.pillar_graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
@@ -27,6 +28,7 @@ from asca_pillars.pillars.pillarize import FEATURES
 B = TypeVar("B", bound=Bundle)
 
 OPSET = 20
+_EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
 
 
@@ -52,6 +54,36 @@ def export_encoder(encode: nn.Module, path: Path) -> None:
         output_names=[PILLAR_FEATURES],
         dynamic_shapes=({0: rows}, {0: rows}, {0: cells}),
     )
+
+
+def export_row_graph(
+    module: nn.Module,
+    path: Path,
+    inputs: Mapping[str, Declared],
+    rows: Mapping[str, str],
+    outputs: Iterable[str],
+    multiples: Mapping[str, int] | None = None,
+) -> None:
+    """Write a graph whose inputs and outputs have a row of each of something, such as a keypoint; all are dynamic.
+
+    Args:
+        module: takes the inputs in their order.
+        path: of the graph.
+        inputs: what it declares.
+        rows: what each input has rows of; one that is not named has a fixed number.
+        outputs: their names.
+        multiples: inputs that have several rows of each.
+    """
+    multiples = multiples or {}
+    sizes = {name: torch.export.Dim(name) for name in dict.fromkeys(rows.values())}
+    example, dynamic = [], []
+    for name, (kind, shape) in inputs.items():
+        multiple = multiples.get(name, 1)
+        size = [_EXAMPLE_ROWS * multiple if extent is None else extent for extent in shape]
+        example.append(torch.zeros(size, dtype=torch.int32) if kind == "int32" else torch.rand(size))
+        dynamic.append({0: multiple * sizes[rows[name]]} if name in rows else {})
+    names: dict[str, Any] = {"input_names": list(inputs), "output_names": list(outputs)}
+    export_graph(module, example, path, dynamic_shapes=(tuple(dynamic),), **names)
 
 
 def export_backbone(backbone: FastBackbone | MaskedBackbone, map_shape: tuple[int, int], path: Path) -> None:

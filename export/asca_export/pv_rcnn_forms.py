@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +11,7 @@ from asca_deploy import pv_rcnn_graphs as interfaces
 from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
 from asca_deploy.graph import Tensor as Declared
 from asca_export.fast_forms import FastBackbone
-from asca_export.graphs import export_backbone, export_graph, graph_path
+from asca_export.graphs import export_backbone, export_row_graph, graph_path
 from asca_export.refine_graph import fold_norms
 from asca_export.voxel_forms import VoxelProducts, export_voxels
 from asca_pillars.models.pv_rcnn.deformation import Surroundings
@@ -21,8 +20,6 @@ from asca_pillars.models.refine.keypoint_encoder import SourceRows
 from asca_pillars.models.refine.roi_head import RoiHead
 from asca_pillars.points.point_scales import PointScale
 from asca_pillars.points.voxel_scan import SourceBalls, VoxelSetSettings
-
-_EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
 
 
 def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -> None:
@@ -37,7 +34,7 @@ def export_pv_rcnn_graphs(network: PvRcnn, bundle: PvRcnnBundle, folder: Path) -
     sources = bundle.pv_rcnn.settings.sources
     rows = _source_rows(inputs, sources) | {"points": "points"}
     keypoints = _Keypoints(network, bundle.pv_rcnn.settings)
-    _export(keypoints, graph_path(folder, KEYPOINTS), inputs, rows, ["features"])
+    export_row_graph(keypoints, graph_path(folder, KEYPOINTS), inputs, rows, ["features"])
     if bundle.pv_rcnn.settings.deformed:
         export_deform(network, bundle, graph_path(folder, DEFORM))
 
@@ -47,13 +44,14 @@ def export_refine_head(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> Non
     head = fold_norms(network.refine)
     inputs, outputs = interfaces.refine_interface(bundle)
     rows = {name: "keypoints" if name in ("keypoints", "features") else "proposals" for name in inputs}
-    _export(_Refine(head), path, inputs, rows, list(outputs), {"proposals": head.cells})
+    of_cells = {name: head.cells for name, row in rows.items() if row == "proposals"}
+    export_row_graph(_Refine(head), path, inputs, rows, outputs, of_cells)
 
 
 def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
     """Write deform.onnx alone: the places that keypoints of a deformed source look around."""
     inputs, outputs = interfaces.deform_interface(bundle)
-    _export(_Deform(network), path, inputs, _source_rows(inputs, bundle.pv_rcnn.settings.sources), list(outputs))
+    export_row_graph(_Deform(network), path, inputs, _source_rows(inputs, bundle.pv_rcnn.settings.sources), outputs)
 
 
 def _source_rows(inputs: Mapping[str, Declared], sources: Sequence[SourceBalls]) -> dict[str, str]:
@@ -68,28 +66,6 @@ def _scale_row(name: str) -> str:
         return ""
     scale = int(found[1]) - found[2].startswith("nearest")
     return f"scale_{scale}" if scale else ""
-
-
-def _export(
-    module: nn.Module,
-    path: Path,
-    inputs: Mapping[str, Declared],
-    rows: Mapping[str, str],
-    outputs: Any,
-    multiples: Mapping[str, int] | None = None,
-) -> None:
-    """Write one graph; `rows` names what each input has a row of, `multiples` how many rows one of them has."""
-    multiples = multiples or {}
-    sizes = {name: torch.export.Dim(f"{name}_rows") for name in dict.fromkeys(rows.values())}
-    example, dynamic = [], []
-    for name, (kind, shape) in inputs.items():
-        own = rows.get(name, "")
-        count = _EXAMPLE_ROWS * multiples.get(own, 1)
-        size = [count if extent is None else extent for extent in shape]
-        example.append(torch.zeros(size, dtype=torch.int32) if kind == "int32" else torch.rand(size))
-        dynamic.append({0: multiples.get(own, 1) * sizes[own]} if own else {})
-    names: dict[str, Any] = {"input_names": list(inputs), "output_names": list(outputs)}
-    export_graph(module, example, path, dynamic_shapes=(tuple(dynamic),), **names)
 
 
 class _Keypoints(nn.Module):

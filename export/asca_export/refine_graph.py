@@ -10,7 +10,7 @@ from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from asca_deploy.bundle import RefineSection
 from asca_deploy.refine_pipeline import grid_names, refine_interface
-from asca_export.graphs import export_graph
+from asca_export.graphs import export_row_graph
 from asca_export.point_forms import GatheredSetAbstraction, GroupedSetAbstraction
 from asca_export.sparse_forms import scale_and_shift
 from asca_pillars.models.refine.keypoint_encoder import SourceRows
@@ -19,8 +19,6 @@ from asca_pillars.models.refine.set_abstraction import SetAbstraction
 from asca_pillars.models.refine.vector_pool import VectorPool
 from asca_pillars.points.ball_layouts import BallGroup, GroupedBalls
 from asca_pillars.points.refine_geometry import RefineSettings
-
-_EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -110,23 +108,10 @@ def _set_abstractions(modules: nn.ModuleList) -> list[SetAbstraction]:
 def export_refine(refiner: PillarRefiner, section: RefineSection, classes: int, path: Path) -> None:
     """Write refine.onnx: see `asca_deploy.refine_pipeline.refine_interface`; every number of rows is dynamic."""
     settings, (inputs, outputs) = section.neighbors, refine_interface(section, classes)
-    proposals, cells = torch.export.Dim("proposals"), settings.grid_size**3
-    sizes = dict.fromkeys(inputs, torch.export.Dim("keypoints")) | {"roi_features": proposals}
+    rows = dict.fromkeys(inputs, "keypoints") | {"roi_features": "proposals", "grid_points": "proposals"}
     for names in _grids(settings):
+        rows[names.rows] = "proposals"
         for group in names.groups:
-            sizes |= dict.fromkeys(group, torch.export.Dim(group.queries))
-    of_cells = {"grid_points", *(names.rows for names in _grids(settings))}
-    sizes |= dict.fromkeys(of_cells, cells * proposals)
-    example = []
-    for name, (kind, shape) in inputs.items():
-        rows = _EXAMPLE_ROWS * (cells if name in of_cells else 1)
-        size = [rows if extent is None else extent for extent in shape]
-        example.append(torch.zeros(size, dtype=torch.int32) if kind == "int32" else torch.rand(size))
-    export_graph(
-        _Flat(refiner, settings, list(inputs)),
-        example,
-        path,
-        input_names=list(inputs),
-        output_names=list(outputs),
-        dynamic_shapes=(tuple({0: sizes[name]} for name in inputs),),
-    )
+            rows |= dict.fromkeys(group, group.queries)
+    of_cells = dict.fromkeys(("grid_points", *(names.rows for names in _grids(settings))), settings.grid_size**3)
+    export_row_graph(_Flat(refiner, settings, list(inputs)), path, inputs, rows, outputs, of_cells)
