@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.points.first_stage import FirstStageSettings, KeypointSettings, propose_on
+from asca_pillars.points.first_stage import FirstPass, FirstStageSettings, KeypointSettings, propose_on
 from asca_pillars.points.proposals import ProposalSettings
 from tests.models.second_stage.random_stage import CHANNELS, SETTINGS, RandomStage
 from tests.scenes import SPEC, make_scene
@@ -43,6 +44,24 @@ def test_keypoints_are_points_near_proposals_with_the_map_below_them() -> None:
         ]
     )
     assert (found.bev <= near.max(axis=0) + 1e-5).all() and (found.bev >= near.min(axis=0) - 1e-5).all()
+
+
+class PlacesStage(RandomStage):
+    """Its neck says of each cell where it is."""
+
+    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+        x_m, y_m = SPEC.head_centers_m()
+        neck = np.stack(np.meshgrid(x_m, y_m), axis=-1).astype(np.float32)
+        return super().__call__(points)._replace(neck=neck)
+
+
+def test_a_keypoint_reads_the_neck_at_its_own_place() -> None:
+    found = propose_on(PlacesStage(), make_scene(0)[0], SETTINGS)
+    own = found.keypoints[:, :2]
+    lowest, highest = np.array([(centers[0], centers[-1]) for centers in SPEC.head_centers_m()]).T
+    between = ((own > lowest) & (own < highest)).all(axis=1)
+    assert between.sum() > 30, "beside the outermost cells the map's border counts"
+    np.testing.assert_allclose(found.bev[between], own[between], atol=1e-4)
 
 
 def test_an_empty_scan() -> None:

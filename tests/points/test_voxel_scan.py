@@ -1,5 +1,8 @@
 """What the host computes for PV-RCNN: neighbors that are there, and the same with and without compiled loops."""
 
+import dataclasses
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -30,6 +33,22 @@ def test_neighbors_lie_in_their_balls() -> None:
             assert (indices[within] < len(positions)).all()
     np.testing.assert_allclose(scan.bev_weights.sum(axis=1), 1, atol=1e-6)
     assert scan.bev_cells.max() < np.prod(SPEC.map_shape)
+
+
+@pytest.mark.parametrize(("last_stride", "stride"), [(1, 4), (2, 8)])
+def test_a_keypoint_reads_the_map_where_openpcdet_does(last_stride: Literal[1, 2], stride: int) -> None:
+    """Column (x - x_min) / voxel / stride, without half a cell: as the published weights have learnt to read it."""
+    spec = dataclasses.replace(SPEC, last_stride=last_stride)
+    scan = voxel_scan(make_scene(0)[0], spec, SETTINGS, spec.table_builder())
+    rows, columns = spec.map_shape
+    x, y = scan.keypoints[:, :2].astype(np.float64).T
+    column, row = (x - 4.8) / 0.2 / stride, (y + 6.4) / 0.2 / stride
+    # Beside the outermost cells the map's border counts.
+    between = (column > 0) & (column < columns - 1) & (row > 0) & (row < rows - 1)
+    assert between.sum() > 30
+    flat = np.arange(columns) + 1000.0 * np.arange(rows)[:, None]
+    found = (flat.ravel()[scan.bev_cells] * scan.bev_weights).sum(axis=1)
+    np.testing.assert_allclose(found[between], (column + 1000 * row)[between], atol=2e-3)
 
 
 @pytest.mark.parametrize("points", [np.empty((0, 4)), np.array([[500.0, 0, 0, 0]])])
