@@ -1,5 +1,6 @@
 """The second stage through the same training as a pillar detector: cached proposals, resume, average, evaluation."""
 
+import copy
 import dataclasses
 from pathlib import Path
 
@@ -8,9 +9,11 @@ import pytest
 import torch
 
 from asca_pillars.config import AugmentConfig, load_config
+from asca_pillars.data.augment import move_scene
 from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.refine.refine_detector import RefineDetector
@@ -99,11 +102,15 @@ def test_a_moved_scene_has_its_proposals_moved_with_it(tmp_path: Path, stage: Pa
 @pytest.mark.parametrize("motion", [Motion(flipped=True), Motion(False, 2.0), Motion(True, -0.7, 1.1, 0.3)])
 def test_motion_keeps_overlaps_and_headings(motion: Motion) -> None:
     frame, proposed = proposed_frame(0)
-    boxes = move_proposed(
-        dataclasses.replace(proposed, proposals=dataclasses.replace(proposed.proposals[:4], boxes=frame.boxes)), motion
-    ).proposals.boxes
+    of_labels = dataclasses.replace(proposed.proposals[:4], boxes=frame.boxes.copy())
+    boxes = move_proposed(dataclasses.replace(proposed, proposals=of_labels), motion).proposals.boxes
+    moved = copy.deepcopy(frame)
+    move_scene(moved, motion)
+    np.testing.assert_array_equal(of_labels.boxes, frame.boxes, "what is cached stays in its place")
+    np.testing.assert_allclose(boxes[:, :6], moved.boxes[:, :6], atol=1e-5)
+    np.testing.assert_allclose(wrap_angle(boxes[:, 6] - moved.boxes[:, 6]), 0, atol=1e-5)
     before = match_proposals(proposed.proposals, frame.boxes, frame.labels)
-    after = match_proposals(move_proposed(proposed, motion).proposals, boxes, frame.labels)
+    after = match_proposals(move_proposed(proposed, motion).proposals, moved.boxes, frame.labels)
     np.testing.assert_allclose(after.iou, before.iou, atol=1e-4)
     np.testing.assert_array_equal(after.matched, before.matched)
 
