@@ -105,6 +105,8 @@ def test_frames_of_a_batch_do_not_touch() -> None:
             (own,) = detector.detect(PillarOutputs(detector(alone), alone.neck), spec)
             assert len(found) == len(own) > 0
             np.testing.assert_allclose(found.scores, own.scores, atol=1e-5)
+            np.testing.assert_allclose(found.boxes, own.boxes, atol=1e-4)
+            np.testing.assert_array_equal(found.labels, own.labels)
 
 
 @pytest.mark.parametrize("score_target", ["one", "iou"])
