@@ -1,4 +1,4 @@
-"""What is evaluated, what is false, and the curves, each by a inputs of a few boxes."""
+"""What is evaluated, what is false, and the curves, each by inputs of a few boxes."""
 
 from dataclasses import replace
 from typing import Any
