@@ -30,6 +30,19 @@ def on_anchors() -> LabeledFrame:
     return dataclasses.replace(frame(0), boxes=boxes, labels=np.array([0, 1, 2]))
 
 
+def seeing_detector() -> PvRcnnDetector:
+    """In evaluation mode, with maps that differ from scan to scan: an untrained network's are the same everywhere."""
+    detector = tiny_detector().train()
+    for module in detector.modules():
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+            module.momentum = 1.0
+    with torch.no_grad():
+        for part in detector.network.head.parameters():
+            part.normal_(0, 0.02)
+        detector.predict(batch(detector, frame(2), frame(3)))
+    return detector.eval()
+
+
 def gradients(detector: PvRcnnDetector, inputs: LabeledVoxels) -> dict[str, torch.Tensor]:
     detector.train().zero_grad()
     torch.manual_seed(3)
@@ -57,7 +70,7 @@ def test_the_published_model_has_its_published_size() -> None:
 
 
 def test_voxels_are_convolved_as_densely() -> None:
-    detector = tiny_detector().eval()
+    detector = seeing_detector()
     scans = batch(detector, frame(0)).scans
     features, levels = scans.features.double(), scans.levels
     backbone = detector.network.voxels.double()
@@ -95,7 +108,7 @@ def test_shapes_and_the_canvas() -> None:
 
 
 def test_a_batch_of_two_is_two_batches_of_one() -> None:
-    detector = tiny_detector().eval()
+    detector = seeing_detector()
     frames = frame(0), frame(1)
     with torch.inference_mode():
         together = detector.predict(batch(detector, *frames))
@@ -163,10 +176,22 @@ def test_a_batch_without_voxels_is_learnt_from_and_changes_nothing(points: int) 
     assert (len(found[0]) == 0) == (points == 0)
 
 
-def test_an_empty_frame_beside_a_full_one() -> None:
-    detector = tiny_detector()
+def test_an_empty_frame_changes_nothing_of_a_full_one_beside_it() -> None:
+    detector = seeing_detector()
     empty = LabeledFrame("", np.empty((0, 4), np.float32), np.empty((0, 7), np.float32), np.empty(0, np.int64))
-    for order in ((empty, frame(0)), (frame(0), empty)):
+    with torch.inference_mode():
+        alone = detector.predict(batch(detector, frame(0)))
+        for number, order in enumerate(((frame(0), empty), (empty, frame(0)))):
+            together = detector.predict(batch(detector, *order))
+            for joined, own in zip(together.maps, alone.maps, strict=True):
+                torch.testing.assert_close(joined[number], own[0], atol=1e-5, rtol=1e-4)
+            found, wanted = together.proposals[number], alone.proposals[0]
+            assert len(found) == len(wanted) > 0
+            np.testing.assert_allclose(found.boxes, wanted.boxes, atol=1e-4)
+            np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-5)
+            np.testing.assert_array_equal(found.labels, wanted.labels)
+            torch.testing.assert_close(together.found.confidence, alone.found.confidence, atol=1e-4, rtol=1e-3)
+    for order in ((frame(0), empty), (empty, frame(0))):
         assert gradients(detector, batch(detector, *order))
 
 
