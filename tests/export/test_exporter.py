@@ -28,6 +28,7 @@ from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ExportError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.pillar_config import CpaReading
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import PillarLimits
@@ -39,13 +40,25 @@ READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point")
 
 
 @pytest.mark.parametrize("cpa", READINGS)
-def test_bundle_is_the_same_detector(exported: Exports, cpa: CpaReading) -> None:
+def test_a_bundle_tells_what_it_is_and_that_its_parity_was_kept(exported: Exports, cpa: CpaReading) -> None:
     bundle = load_pillar_bundle(exported(cpa))
     assert bundle.spec == SPEC and bundle.pillar.cpa == cpa and bundle.provenance.steps == 0
     parity = bundle.parity
     assert parity is not None and parity.scans == len(SCANS)
     assert 0 < parity.head_maps_max_abs_error <= MAP_TOLERANCE
     assert parity.box_max_error_m <= BOX_TOLERANCE_M and parity.yaw_max_error_rad <= YAW_TOLERANCE_RAD
+
+
+@pytest.mark.parametrize("cpa", READINGS)
+def test_a_bundle_finds_what_its_checkpoint_finds(exported: Exports, cpa: CpaReading) -> None:
+    """Not by the exporter's own report; one scan, for PyTorch takes seconds of attention among points."""
+    checkpoint, (points, *_) = tiny_checkpoint(cpa), SCANS
+    found = Detector(exported(cpa), score_threshold=0.0, threads=1)(points)
+    wanted = ScanDetector(checkpoint.detector, SPEC.with_score_threshold(0.0))(points)
+    assert len(found) == len(wanted) > 0
+    np.testing.assert_allclose(found.boxes, wanted.boxes, atol=1e-2)
+    np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-3)
+    np.testing.assert_array_equal(found.labels, wanted.labels)
 
 
 def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
