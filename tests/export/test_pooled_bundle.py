@@ -42,13 +42,16 @@ def test_runtime_and_pytorch_find_the_same(request: pytest.FixtureRequest, tmp_p
     assert bundle.spec.grid.map == "pooled" and bundle.pillar.neck == neck
     assert isinstance(checkpoint.detector, PillarDetector)
     runtime, torch_detector = Detector(folder), ScanDetector(checkpoint.detector, POOLED)
-    empty = np.empty((0, 4), np.float32)
-    for points in (*SCANS[:3], empty):
+    for points in SCANS[:3]:
         found, expected = runtime(points), torch_detector(points)
-        assert len(found) == len(expected)
-        assert len(found) or not len(points)
+        assert len(found) == len(expected) > 0
         np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-3)
         np.testing.assert_allclose(found.scores, expected.scores, atol=1e-4)
+    empty, every = np.empty((0, 4), np.float32), POOLED.with_score_threshold(0.0)
+    found, expected = Detector(folder, score_threshold=0.0)(empty), ScanDetector(checkpoint.detector, every)(empty)
+    assert len(found) == len(expected) and (len(found) > 0) == (neck == "dense"), "sparse: no cell is active"
+    np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-3)
+    np.testing.assert_allclose(found.scores, expected.scores, atol=1e-4)
     shutil.copytree(folder, tmp_path / "int8")
     quantized = quantize_bundle(tmp_path / "int8", bundle, checkpoint.detector, CALIBRATION, SCANS).quantization
     assert quantized is not None and quantized.boxes_matched > 0.9 * quantized.boxes > 5
