@@ -1,0 +1,100 @@
+"""Rates, decay of weights and their average over the steps of a run, by hand; nothing is trained."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import lightning as L  # noqa: N812  (Lightning's own convention)
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from asca_pillars.training.callbacks import weight_average
+from asca_pillars.training.module import DetectionModule
+from tests.training.test_loop import with_train
+
+EPOCHS, RANKS, FRAMES = 5, 3, 29
+STEPS = 4  # of an epoch: 29 frames are four whole batches of two on each of three ranks
+
+
+def optimization(**changes: Any) -> tuple[Optimizer, Any]:
+    """The optimizer and the schedule of a run that has begun."""
+    module = DetectionModule(with_train(epochs=EPOCHS, batch_size=2, learning_rate=1e-3, **changes))
+    datamodule = SimpleNamespace(training_set=range(FRAMES))
+    module._trainer = SimpleNamespace(datamodule=datamodule, world_size=RANKS)  # type: ignore[assignment]
+    module._fabric = None
+    configured = module.configure_optimizers()
+    assert configured["lr_scheduler"]["interval"] == "step"
+    return configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+
+
+def rates(**changes: Any) -> list[float]:
+    """The learning rate of each step of a run."""
+    optimizer, schedule = optimization(**changes)
+    used = []
+    for _ in range(EPOCHS * STEPS):
+        used.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    return used
+
+
+def test_the_step_schedule_decays_every_so_many_epochs() -> None:
+    expected = [1e-3 * 0.7 ** (step // (2 * STEPS)) for step in range(EPOCHS * STEPS)]
+    np.testing.assert_allclose(rates(schedule="step", decay=0.7, decay_epochs=2), expected, rtol=1e-9)
+
+
+def test_one_cycle_rises_for_three_tenths_of_the_run_and_ends_with_it() -> None:
+    used = rates(schedule="one_cycle")
+    peak, end = 6 - 1, 20 - 1  # the sixth and the last step
+    low, lowest = 1e-3 / 10, 1e-3 / 10 / 1e4  # torch's own last value: the first one by 10000
+    up = [low + (1e-3 - low) * (1 - np.cos(np.pi * step / peak)) / 2 for step in range(peak)]
+    down = [
+        lowest + (1e-3 - lowest) * (1 + np.cos(np.pi * (step - peak) / (end - peak))) / 2 for step in range(peak, 20)
+    ]
+    np.testing.assert_allclose(used, up + down, rtol=1e-6)
+
+
+def test_weights_decay_beside_the_gradient_and_not_through_it() -> None:
+    """Through it, Adam would make a whole step of the rate out of any decay."""
+    optimizer, _ = optimization(weight_decay=0.1)
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    before = [weight.detach().clone() for weight in weights]
+    for weight in weights:
+        weight.grad = torch.zeros_like(weight)
+    optimizer.step()
+    for found, old in zip(weights, before, strict=True):
+        torch.testing.assert_close(found.detach(), old * (1 - 1e-3 * 0.1), rtol=1e-6, atol=0)
+    assert any(old.abs().max() > 0.1 for old in before)
+
+
+class Normalized(L.LightningModule):
+    """Weights, statistics and an integer count of batches."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(3)
+
+
+@pytest.mark.parametrize(("taken", "kept"), [(0, 0), (1, 2 / 11), (8, 9 / 18), (80, 81 / 90), (82, 0.9), (10**6, 0.9)])
+def test_the_average_forgets_faster_at_first(taken: int, kept: float) -> None:
+    """It starts as the weights are after the first step; what a normalization has counted is always the newest."""
+    run, callback = Normalized(), weight_average(0.9)
+    callback.setup(cast(L.Trainer, None), run, "fit")
+    average = callback._average_model
+    assert average is not None
+    held = cast(Normalized, average.module).norm
+    old, new = torch.tensor([1.0, -2.0, 4.0]), torch.tensor([3.0, 0.5, 4.0])
+    for norm, values, count in ((held, old, 5), (run.norm, new, 7)):
+        norm.load_state_dict(
+            {"weight": values, "bias": -values, "running_mean": 2 * values, "running_var": values**2}
+            | {"num_batches_tracked": torch.tensor(count)}
+        )
+    average.n_averaged.fill_(taken)
+    callback.on_train_batch_end(cast(L.Trainer, SimpleNamespace(global_step=taken + 1)), run, None, None, 0)
+    np.testing.assert_allclose(held.weight.detach(), kept * old + (1 - kept) * new, rtol=1e-6)
+    np.testing.assert_allclose(held.bias.detach(), -kept * old - (1 - kept) * new, rtol=1e-6)
+    np.testing.assert_allclose(held.running_mean, 2 * kept * old + 2 * (1 - kept) * new, rtol=1e-6)
+    np.testing.assert_allclose(held.running_var, kept * old**2 + (1 - kept) * new**2, rtol=1e-6)
+    assert held.num_batches_tracked == 7
