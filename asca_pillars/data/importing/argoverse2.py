@@ -14,6 +14,7 @@ from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.scans.feather import feather_table
 from asca_pillars.data.scans.find_scans import files_below
 from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.rotations import of_quaternions
 
 AXLE_HEIGHT_M = 0.33
 """Of the vehicle's frame above the ground: a wheel's radius. The sweeps themselves show 0.35."""
@@ -46,8 +47,8 @@ def _frames(log: Path) -> list[ImportedFrame]:
     path = log / "annotations.feather"
     numbers = ("timestamp_ns", *_CENTER, *_SIZE, *_TURN)
     table = feather_table(path, numbers, ("track_uuid", "category"), DatasetError)
-    w, x, y, z = (table[name] for name in _TURN)
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    turns = of_quaternions(np.column_stack([table[name] for name in _TURN]))
+    yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
     boxes = np.column_stack([*(table[name] for name in (*_CENTER, *_SIZE)), yaw]).astype(np.float64)
     if not (np.isfinite(boxes).all() and (boxes[:, 3:6] > 0).all()):
         row = int(np.argmin(np.isfinite(boxes).all(axis=1) & (boxes[:, 3:6] > 0).all(axis=1)))

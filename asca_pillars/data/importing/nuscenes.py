@@ -18,6 +18,7 @@ from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.errors import DatasetError
+from asca_pillars.geometry.rotations import of_quaternions
 
 CHANNEL = "LIDAR_TOP"
 DETECTION_CLASSES = {
@@ -96,9 +97,9 @@ def _records(
 ) -> BoxRecords:
     boxes, types, tracks = [], [], []
     for label in labels:
-        center, turn = np.array(label["translation"], np.float64), rotation(label["rotation"])
+        center, turn = np.array(label["translation"], np.float64), _rotation(label["rotation"])
         for frame in (pose, sensor):
-            back = rotation(frame["rotation"]).T
+            back = _rotation(frame["rotation"]).T
             center, turn = back @ (center - frame["translation"]), back @ turn
         width, length, height = label["size"]
         boxes.append([*center, length, width, height, np.arctan2(turn[1, 0], turn[0, 0])])
@@ -108,19 +109,11 @@ def _records(
     return records_from(np.array(boxes).reshape(-1, 7), types, None, tracks)
 
 
-def rotation(quaternion: list[float]) -> _Doubles:
-    """Unitless rotation matrix (3, 3) of the quaternion w, x, y, z; ValueError if that is none."""
-    norm = np.linalg.norm(quaternion)
-    if not 0 < norm < np.inf:
+def _rotation(quaternion: list[float]) -> _Doubles:
+    turn = of_quaternions(np.array(quaternion))
+    if not np.isfinite(turn).all():
         raise ValueError(f"rotation {quaternion}")
-    w, x, y, z = np.array(quaternion, np.float64) / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return turn
 
 
 def _tables_folder(root: Path) -> Path:

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.rotations import of_roll_pitch_yaw
+
 Doubles = NDArray[np.float64]
 
 
@@ -54,21 +56,7 @@ def range_image_points(
     points = points @ extrinsic[:3, :3].T + extrinsic[:3, 3]
     if pixel_poses is not None and world_from_vehicle is not None:
         poses = pixel_poses[rows, columns].astype(np.float64)
-        world = np.einsum("nij,nj->ni", _rotations(*poses[:, :3].T), points) + poses[:, 3:]
+        world = np.einsum("nij,nj->ni", of_roll_pitch_yaw(poses[:, :3]), points) + poses[:, 3:]
         points = (world - world_from_vehicle[:3, 3]) @ world_from_vehicle[:3, :3]
     reflectance = np.tanh(np.maximum(image[rows, columns, 1], 0))
     return np.column_stack([points, reflectance]).astype(np.float32)
-
-
-def _rotations(roll: Doubles, pitch: Doubles, yaw: Doubles) -> Doubles:
-    """(N, 3, 3) about x by roll, then about y by pitch, then about z by yaw; radians (N,)."""
-    (sr, sp, sy), (cr, cp, cy) = (
-        (np.sin(roll), np.sin(pitch), np.sin(yaw)),
-        (np.cos(roll), np.cos(pitch), np.cos(yaw)),
-    )
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)

@@ -1,7 +1,6 @@
 """Where the car was at a time: the poses of a recording's nav_msgs/Odometry."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from asca_pillars.data.recordings.messages import decoded, reason
 from asca_pillars.data.recordings.recording import Recording
 from asca_pillars.errors import ScanError
+from asca_pillars.geometry.rotations import of_quaternions
 
 _Doubles = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class Poses:
     positions_m: _Doubles
     """(N, 3)."""
     quaternions: _Doubles
-    """(N, 4) x, y, z, w of length 1, each the nearer one of two to that before."""
+    """(N, 4) w, x, y, z of length 1, each the nearer one of two to that before."""
 
     def covers(self, time_ns: int) -> bool:
         """Whether a time lies between the first and the last pose, or hardly beyond."""
@@ -43,7 +43,7 @@ class Poses:
         matrix = np.eye(4)
         matrix[:3, 3] = (1 - share) * self.positions_m[before] + share * self.positions_m[after]
         turn = (1 - share) * self.quaternions[before] + share * self.quaternions[after]
-        matrix[:3, :3] = _rotation(turn / np.linalg.norm(turn))
+        matrix[:3, :3] = of_quaternions(turn)
         return matrix
 
 
@@ -67,7 +67,7 @@ def read_poses(recording: Recording, topic: str) -> Poses:
         stamp, pose = odometry.header.stamp, odometry.pose.pose
         time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
         place, turn = pose.position, pose.orientation
-        row = [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
+        row = [place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]
         if np.isfinite(row).all() and np.linalg.norm(row[3:]) > 0.5:
             rows.append((time_ns if time_ns > 0 else message.recorded_ns, row))
         else:
@@ -80,14 +80,3 @@ def read_poses(recording: Recording, topic: str) -> Poses:
     flips = np.cumprod(np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0, -1.0, 1.0))
     turns[1:] *= flips[:, None]
     return Poses(np.array([time for time, _ in rows]), values[:, :3], turns)
-
-
-def _rotation(quaternion: Any) -> _Doubles:
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from asca_pillars.cli import app
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.importing.nuscenes import read_nuscenes, rotation
+from asca_pillars.data.importing.nuscenes import read_nuscenes
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError, ConfigError, DatasetError, OutputError, ScanError
@@ -24,8 +25,14 @@ def run(*arguments: object) -> str:
     return result.output
 
 
-def quaternion(yaw: float, axis: tuple[float, float, float] = (0, 0, 1)) -> list[float]:
-    return [float(np.cos(yaw / 2)), *(float(np.sin(yaw / 2)) * value for value in axis)]
+def turned(roll: float, pitch: float, yaw: float) -> Rotation:
+    return Rotation.from_euler("xyz", [roll, pitch, yaw])
+
+
+def quaternion(turn: Rotation) -> list[float]:
+    """w, x, y, z."""
+    x, y, z, w = turn.as_quat().tolist()
+    return [w, x, y, z]
 
 
 def test_boxes_of_ones_own(tmp_path: Path) -> None:
@@ -108,7 +115,7 @@ def write_argoverse2(root: Path) -> Path:
         labels: dict[str, Any] = {"timestamp_ns": [315966265259836000, 315966265360032000], "track_uuid": ["u", "u"]}
         labels |= {"category": ["REGULAR_VEHICLE"] * 2, "num_interior_pts": [50, 50]}
         values = {"length_m": 4.0, "width_m": 2, "height_m": 1.6, "tx_m": 20, "ty_m": 5, "tz_m": 1}
-        values |= dict(zip(("qw", "qx", "qy", "qz"), quaternion(0.7), strict=True))
+        values |= dict(zip(("qw", "qx", "qy", "qz"), quaternion(turned(0.2, -0.3, 0.7)), strict=True))
         labels |= {name: [float(value)] * 2 for name, value in values.items()}
         feather.write_feather(pyarrow.table(labels), root / "val" / log / "annotations.feather")
     return root
@@ -160,15 +167,21 @@ def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:
         read_scan(tmp_path / "1.feather")
 
 
-POSE_YAW, SENSOR_YAW = 0.4, -np.pi / 2  # nuScenes' LiDAR: its y axis looks ahead
+# The car leans and drives uphill; nuScenes' LiDAR, a little askew, has its y axis ahead.
+POSE, SENSOR = turned(0.06, -0.09, 0.4), turned(0.03, 0.05, -np.pi / 2)
+WORLD_M, EGO_M, SENSOR_M = np.array([105.0, 52.0, 1.0]), np.array([100.0, 50.0, 0.0]), np.array([0.9, 0.0, 1.8])
+CAR = turned(0.02, -0.04, 0.7)
+
+
+def in_sensor() -> tuple[np.ndarray, Rotation]:
+    """Where the car stands in the sensor's frame, and how it is turned there."""
+    center = SENSOR.inv().apply(POSE.inv().apply(WORLD_M - EGO_M) - SENSOR_M)
+    return center, SENSOR.inv() * POSE.inv() * CAR
 
 
 def write_nuscenes(root: Path) -> Path:
     """One key frame with a car full of points, and an animal."""
-    world, ego = np.array([105.0, 52.0, 1.0]), np.array([100.0, 50.0, 0.0])
-    sensor = np.array([0.9, 0.0, 1.8])
-    in_sensor = rotation(quaternion(SENSOR_YAW)).T @ (rotation(quaternion(POSE_YAW)).T @ (world - ego) - sensor)
-    points = in_sensor + np.random.default_rng(0).uniform(-0.3, 0.3, (30, 3))
+    points = in_sensor()[0] + np.random.default_rng(0).uniform(-0.3, 0.3, (30, 3))
     path = root / "samples" / "LIDAR_TOP" / "n__LIDAR_TOP__1.pcd.bin"
     path.parent.mkdir(parents=True)
     np.column_stack([points, np.full(30, 51.0), np.arange(30) % 32]).astype("<f4").tofile(path)
@@ -177,10 +190,10 @@ def write_nuscenes(root: Path) -> Path:
         "sample": [{"token": "sa", "scene_token": "sc"}],
         "sensor": [{"token": "l", "channel": "LIDAR_TOP"}, {"token": "c", "channel": "CAM_FRONT"}],
         "calibrated_sensor": [
-            {"token": "cl", "sensor_token": "l", "translation": sensor.tolist(), "rotation": quaternion(SENSOR_YAW)},
-            {"token": "cc", "sensor_token": "c", "translation": [0, 0, 0], "rotation": quaternion(0)},
+            {"token": "cl", "sensor_token": "l", "translation": SENSOR_M.tolist(), "rotation": quaternion(SENSOR)},
+            {"token": "cc", "sensor_token": "c", "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]},
         ],
-        "ego_pose": [{"token": "e", "translation": ego.tolist(), "rotation": quaternion(POSE_YAW)}],
+        "ego_pose": [{"token": "e", "translation": EGO_M.tolist(), "rotation": quaternion(POSE)}],
         "category": [{"token": "k", "name": "vehicle.car"}, {"token": "a", "name": "animal"}],
         "instance": [{"token": "i", "category_token": "k"}, {"token": "j", "category_token": "a"}],
         "sample_annotation": [
@@ -188,9 +201,9 @@ def write_nuscenes(root: Path) -> Path:
                 "token": "1",
                 "sample_token": "sa",
                 "instance_token": "i",
-                "translation": world.tolist(),
+                "translation": WORLD_M.tolist(),
                 "size": [2.0, 4.5, 1.6],
-                "rotation": quaternion(POSE_YAW + 0.3),
+                "rotation": quaternion(CAR),
             },
             {
                 "token": "2",
@@ -198,7 +211,7 @@ def write_nuscenes(root: Path) -> Path:
                 "instance_token": "j",
                 "translation": [90, 40, 0],
                 "size": [0.4, 1.0, 0.5],
-                "rotation": quaternion(0),
+                "rotation": [1, 0, 0, 0],
             },
         ],
     }
@@ -221,9 +234,10 @@ def test_nuscenes(tmp_path: Path) -> None:
     (frame_id,) = split.frame_ids
     boxes, types = split.labeled_boxes(frame_id)
     assert types == ("car", "animal")
-    # In the vehicle's frame, turned back by 0.4, the car stands at (5.384, -0.105); the sensor 0.9 m ahead, 1.8 m up.
-    ahead, left = 5 * np.cos(0.4) + 2 * np.sin(0.4), -5 * np.sin(0.4) + 2 * np.cos(0.4)
-    assert boxes[0].tolist() == pytest.approx([ahead - 0.9, left, -0.8, 4.5, 2, 1.6, 0.3], abs=1e-4)
+    (right, ahead, up), turn = in_sensor()
+    nose_right, nose_ahead, _ = turn.apply([1, 0, 0])
+    yaw = np.arctan2(-nose_right, nose_ahead)
+    assert boxes[0].tolist() == pytest.approx([ahead, -right, up, 4.5, 2, 1.6, yaw], abs=1e-4)
     points = split.points(frame_id)
     assert points_in_boxes(points, boxes[:1]).all() and points[:, 3] == pytest.approx(51 / 255)
 
@@ -245,7 +259,7 @@ def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
             "[0, 4.5, 1.6]",
             "sample sa: a box with a number that is not finite or",
         ),
-        ("ego_pose", json.dumps(quaternion(POSE_YAW)), "[0, 0, 0, 0]", r"at rotation \[0, 0, 0, 0\]"),
+        ("ego_pose", json.dumps(quaternion(POSE)), "[0, 0, 0, 0]", r"at rotation \[0, 0, 0, 0\]"),
         ("calibrated_sensor", "[0.9, 0.0, 1.8]", "[0, 0]", "the tables do not fit together"),
     ):
         path = source / "v1.0-mini" / f"{name}.json"

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from benchmarks.made_recordings import point_cloud2
 
@@ -104,11 +105,15 @@ def write_mcap(
     return path
 
 
-def odometry_message(time_ns: int, x_m: float, yaw_rad: float = 0.0) -> Any:
+def odometry_message(
+    time_ns: int, x_m: float, yaw_rad: float = 0.0, *, roll_rad: float = 0.0, pitch_rad: float = 0.0
+) -> Any:
+    """At x_m on the x axis, turned about x by roll, then about y by pitch, then about z by yaw."""
     types = store().types
     stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
     vector, covariance = types["geometry_msgs/msg/Vector3"], np.zeros(36)
-    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(yaw_rad / 2), w=np.cos(yaw_rad / 2))
+    x, y, z, w = Rotation.from_euler("xyz", [roll_rad, pitch_rad, yaw_rad]).as_quat().tolist()
+    turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
     pose = types["geometry_msgs/msg/Pose"](
         position=types["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0), orientation=turn
     )

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
 pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
 
@@ -33,6 +34,19 @@ def test_poses_lie_between_their_neighbors_and_stop_at_the_ends(tmp_path: Path) 
         assert matrix[:3, 3] == pytest.approx([x_m, 0, 0], abs=1e-6)
         assert matrix[:2, 0] == pytest.approx([np.cos(yaw), np.sin(yaw)], abs=1e-4)
         assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3))
+
+
+def test_a_car_that_leans_is_turned_about_every_axis(tmp_path: Path) -> None:
+    turns = [(0.3, -0.2, 2.0), (-0.1, 0.4, 2.5)]
+    messages = [
+        (time_ns, odometry_message(time_ns, 0.0, yaw, roll_rad=roll, pitch_rad=pitch))
+        for time_ns, (roll, pitch, yaw) in zip((START_NS, START_NS + SECOND), turns, strict=True)
+    ]
+    poses = read_poses(open_recording(write_mcap(tmp_path / "a.mcap", {}, odometry=messages)), "/odom")
+    between = Slerp([0, 1], Rotation.from_euler("xyz", turns))
+    for share in (0.0, 0.5, 1.0):  # where a straight line between two quaternions is as far along as the arc
+        found = poses.at(START_NS + round(share * SECOND))[:3, :3]
+        np.testing.assert_allclose(found, between(share).as_matrix(), atol=1e-9)
 
 
 def test_one_pose_is_enough(tmp_path: Path) -> None:
