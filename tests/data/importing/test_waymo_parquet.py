@@ -1,5 +1,6 @@
 """Import of Waymo's parquet form: a small segment in the published columns, made here from known points."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,27 +41,34 @@ def range_image(aim_m: np.ndarray) -> np.ndarray:
     return image
 
 
-def write_segment(root: Path, *, moved_m: float = 0.0) -> Path:
-    """One segment with a vehicle at BOX; with `moved_m` every pixel was measured that much further back."""
+def write_segment(
+    root: Path, *, moved_m: float = 0.0, further: Mapping[tuple[int, int], np.ndarray] | None = None
+) -> Path:
+    """One segment with a vehicle at BOX.
+
+    Args:
+        root: the folder.
+        moved_m: every pixel was measured that much further back.
+        further: images besides that of the vehicle, by sensor and return.
+    """
     pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
 
     def write(name: str, columns: dict[str, Any]) -> None:
         (root / name).mkdir(parents=True, exist_ok=True)
         parquet.write_table(pyarrow.table(columns), root / name / "segment.parquet")
 
-    keys: dict[str, Any] = {"key.frame_timestamp_micros": [], "key.laser_name": []}
-    first = "[LiDARComponent].range_image_return1"
-    images: dict[str, Any] = {f"{first}.values": [], f"{first}.shape": []}
-    for time in TIMES:
-        for laser in (1, 2):
-            keys["key.frame_timestamp_micros"].append(time)
-            keys["key.laser_name"].append(laser)
-            image = range_image(np.array([10.0 + moved_m, 4.0, 1.0]))
-            images[f"{first}.values"].append(image.ravel().tolist() if laser == 1 else None)
-            images[f"{first}.shape"].append(list(image.shape) if laser == 1 else None)
-    for name in ("values", "shape"):
-        kind = pyarrow.list_(pyarrow.float32() if name == "values" else pyarrow.int32())
-        images[f"[LiDARComponent].range_image_return2.{name}"] = pyarrow.array([None] * 4, kind)
+    keys: dict[str, Any] = {}
+    seen = {(1, 1): range_image(np.array([10.0 + moved_m, 4.0, 1.0])), **(further or {})}
+    rows = [(time, laser) for time in TIMES for laser in (1, 2)]
+    keys["key.frame_timestamp_micros"], keys["key.laser_name"] = map(list, zip(*rows, strict=True))
+    images: dict[str, Any] = {}
+    for number in (1, 2):
+        own = [seen.get((laser, number)) for _, laser in rows]
+        name = f"[LiDARComponent].range_image_return{number}"
+        values = [None if image is None else image.ravel().tolist() for image in own]
+        images[f"{name}.values"] = pyarrow.array(values, pyarrow.list_(pyarrow.float32()))
+        shapes = [None if image is None else list(image.shape) for image in own]
+        images[f"{name}.shape"] = pyarrow.array(shapes, pyarrow.list_(pyarrow.int32()))
     write("lidar", keys | images)
     box = ("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading")
     write(
@@ -122,6 +130,21 @@ def test_points_lie_in_the_boxes(tmp_path: Path, moved_m: float) -> None:
     assert len(points) == 1 and points_in_boxes(points, boxes).all()
     np.testing.assert_allclose(points[0, :2], [10, 4], atol=0.15)  # a pixel is 1 degree wide
     assert points[0, 3] == pytest.approx(np.tanh(0.5))
+
+
+def test_all_sensors_and_both_returns_are_read(tmp_path: Path) -> None:
+    behind = range_image(np.array([14.0, 5.6, 1.0]))  # what the beam met beyond the edge of the vehicle
+    other = np.zeros((5, WIDTH, 4), np.float32)
+    other[1, 100, :2] = 7.0, 0.2
+    run(write_segment(tmp_path / "waymo", further={(1, 2): behind, (2, 1): other}), tmp_path / "out", "--from", "waymo")
+    points = BoxSplit(tmp_path / "out").points("segment/1000")
+    assert len(points) == 3
+    np.testing.assert_allclose(points[:2, :2], [[10, 4], [14, 5.6]], atol=0.15)
+    # The second sensor's five beams cut -0.2 to 0 into even parts, from the highest down: row 1 is the fourth of them.
+    inclination, azimuth = -0.2 + 3.5 / 5 * 0.2, np.pi - (100 + 0.5) / WIDTH * 2 * np.pi
+    ray = np.array([np.cos(inclination) * np.cos(azimuth), np.cos(inclination) * np.sin(azimuth), np.sin(inclination)])
+    np.testing.assert_allclose(points[2, :3], 7 * ray + SENSOR_M, atol=1e-5)
+    assert points[2, 3] == pytest.approx(np.tanh(0.2))
 
 
 def test_an_import_goes_on_where_it_stopped(tmp_path: Path) -> None:
