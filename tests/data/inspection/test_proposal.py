@@ -1,5 +1,6 @@
 """Classes, anchors, thresholds and ranges that are measured on labels."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from asca_pillars.errors import AscaError, DatasetError, OutputError
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.pillars.pillarize import PillarLimits, pillarize
 from asca_pillars.schema import parse
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import SPEC
@@ -106,9 +108,14 @@ def test_a_range_ahead_is_widened_to_legal_ones(tmp_path: Path) -> None:
 
 
 def test_pillars_get_room(tmp_path: Path) -> None:
+    split = BoxSplit(write_box_dataset(tmp_path, 12))
+    grass = np.random.default_rng(0).uniform([5, -6, -1.7, 0], [25, 7, -1.6, 1], (3300, 4))
+    write_scan(split.scan_path("000003"), np.concatenate([split.points("000003"), grass]))  # the fullest by far
     config = replace(CONFIG, model=PillarModel(spec=replace(SPEC, limits=replace(SPEC.limits, max_pillars=100))))
-    proposed = propose(BoxSplit(write_box_dataset(tmp_path, 12)), config).config
-    assert pillar_spec(proposed).limits.max_pillars >= 1000
+    unlimited = PillarLimits(max_pillars=10**5, max_points=1)
+    clouds = (split.points(frame_id) for frame_id in split.frame_ids)
+    pillars = [len(pillarize(points, SPEC.grid, unlimited).cells) for points in clouds]
+    assert pillar_spec(propose(split, config).config).limits.max_pillars == math.ceil(max(pillars) * 1.1 / 1000) * 1000
 
 
 def test_a_type_with_few_boxes_is_no_class(tmp_path: Path) -> None:
