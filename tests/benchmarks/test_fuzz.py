@@ -25,8 +25,6 @@ def test_every_kind_accepts_its_undamaged_files(tmp_path: Path) -> None:
 
 
 def test_bad_outcomes_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuzz, "SLOW_S", 0.05)
-
     def outcome(result: object) -> str:
         def reader(_: Path) -> object:
             if isinstance(result, Exception):
@@ -38,5 +36,6 @@ def test_bad_outcomes_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert outcome(ValueError()) == "traceback"
     assert outcome(np.array([[np.nan] * 4])) == "not finite"
     assert outcome(np.zeros((100, 4))) == "too many points"
-    assert outcome("sleep") == "slow"
     assert outcome(np.zeros((1, 4))) == "read"
+    monkeypatch.setattr(fuzz, "SLOW_S", 0.05)  # of the last one alone: a busy machine may make the others as slow
+    assert outcome("sleep") == "slow"

@@ -33,8 +33,15 @@ def cluster() -> Iterator[Any]:
         nodes.shutdown()
 
 
+def processes(folder: Path) -> set[str]:
+    return {path.name.split("-")[1] for path in folder.iterdir()}
+
+
 def sum_slowly(folder: Path, shard: Shard) -> int:
     (folder / f"{shard.first}-{os.getpid()}").touch()
+    deadline = time.monotonic() + 60
+    while len(processes(folder)) < 2 and time.monotonic() < deadline:  # one node may begin long after the other
+        time.sleep(0.01)
     time.sleep(0.2)
     if shard.items == (DEADLY,) or (DEADLY in shard.items and len(shard.items) < 3):
         os._exit(1)
@@ -62,8 +69,7 @@ def test_all_is_done_while_a_machine_and_workers_die(cluster: Any, tmp_path: Pat
     assert sorted(outcome.shard for outcome in outcomes) == sorted(shards)
     assert sum(outcome.result or 0 for outcome in outcomes) == sum(range(10, 40))
     assert [outcome.shard.items for outcome in outcomes if outcome.died] == [(DEADLY,)]
-    begun = [path.name.split("-") for path in work.iterdir()]
-    assert len({process for _, process in begun}) >= 3 + 1, "both nodes, and a new worker after each death"
+    assert len(processes(work)) >= 3 + 1, "both nodes, and a new worker after each death"
     assert sum(outcome.repeats for outcome in outcomes) >= 2 + 1, "the deadly one twice, and that of the machine"
 
 

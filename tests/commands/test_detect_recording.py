@@ -168,19 +168,32 @@ def test_a_killed_run_goes_on_and_ends_the_same(
     assert outputs(killed) == outputs(undisturbed)
 
 
+HELD_UP = """
+import time
+from asca_pillars.cli import main
+from asca_pillars.commands.recording_journal import Journal
+add = Journal.add
+def add_and_wait(self, result):
+    add(self, result)
+    time.sleep(600 if result.number == 2 else 0)
+Journal.add = add_and_wait
+main()
+"""
+
+
 def test_after_sigkill(drive: Path, undisturbed: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed"
-    command = [sys.executable, "-m", "asca_pillars.cli", "detect", str(drive), "--track", "-o", str(out)]
-    command += ["--foxglove", str(out / "boxes.mcap"), "--threads", "1"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    command = ["detect", drive, "--track", "-o", out, "--foxglove", out / "boxes.mcap", "--threads", 1]
+    # Held up after the third scan, so that it cannot end before it is killed.
+    process = subprocess.Popen([sys.executable, "-c", HELD_UP, *map(str, command)], stdout=subprocess.DEVNULL)
     while process.poll() is None:
-        if (out / JOURNAL_FILE).exists() and (out / JOURNAL_FILE).read_bytes().count(b"\n") > 2:
+        if (out / JOURNAL_FILE).exists() and (out / JOURNAL_FILE).read_bytes().count(b"\n") == 1 + 3:
             process.kill()
             break
-        time.sleep(0.001)
-    assert process.wait() == -signal.SIGKILL, "it was killed in time"
+        time.sleep(0.01)
+    assert process.wait() == -signal.SIGKILL
     assert not (out / "detections.jsonl").exists()
-    resumed = run_here(*command[3:])
+    resumed = run_here(*command)
     assert resumed.returncode == 0 and "going on after the" in resumed.stdout
     assert outputs(out) == outputs(undisturbed)
 
