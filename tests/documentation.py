@@ -19,11 +19,12 @@ from asca_pillars.cli import app
 from asca_pillars.data.boxes.box_records import json_line, read_frames
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.models.build import build_model
-from asca_pillars.schema import to_dict
+from asca_pillars.models.checkpoint import Checkpoint
 from benchmarks.made_recordings import point_cloud2
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.recordings.cloud_recordings import stamps, store, write_mcap
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
+from tests.saved_checkpoint import save_checkpoint
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
@@ -112,12 +113,11 @@ def write_files(root: Path) -> None:
             (root / folder / path.name).write_text("".join(f"{line} 0.9\n" for line in path.read_text().splitlines()))
 
     torch.manual_seed(0)
-    weights = {f"detector.{name}": value for name, value in build_model(CONFIG.model).state_dict().items()}
+    untrained = Checkpoint(CONFIG, build_model(CONFIG.model), 7)
     for name in ("own", "small"):
         checkpoint = root / "runs" / name / "checkpoints" / "last.ckpt"
         checkpoint.parent.mkdir(parents=True)
-        content = {"hyper_parameters": {"config": to_dict(CONFIG)}, "state_dict": weights, "global_step": 7}
-        torch.save(content, checkpoint)
+        save_checkpoint(checkpoint, untrained)
     write_foreign(root / "pointpillar.pth", PointPillars(64, (64, 128, 256), (3, 5, 5), 128, 3).state_dict())
 
 

@@ -7,8 +7,16 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from asca_pillars.cli import main
+from asca_pillars.cli import app, main
+
+
+def invoke(*arguments: object) -> str:
+    """What `asca ARGUMENTS` prints when it succeeds; its errors are raised as they are."""
+    result = CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 def run_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -1,4 +1,4 @@
-"""Made-up scenes and predictions for `asca eval`."""
+"""Made-up scenes and predictions for `asca eval`, and a recording for `asca detect`."""
 
 from pathlib import Path
 from typing import Any
@@ -6,12 +6,19 @@ from typing import Any
 import pytest
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
+from tests.commands.short_drive import write_drive
 from tests.scenes import write_dataset
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     return write_dataset(tmp_path / "kitti", 3, val_frames=2)
+
+
+@pytest.fixture(scope="session")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the tests that have rosbags."""
+    return write_drive(tmp_path_factory.mktemp("drive") / "drive.mcap")
 
 
 @pytest.fixture

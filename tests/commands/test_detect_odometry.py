@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
 
 from asca_pillars.errors import ConfigError, ScanError
-from tests.commands.test_detect_recording import POINTS, SCANS, run
+from tests.commands.short_drive import POINTS, SCANS
+from tests.commands.test_detect_recording import run
 from tests.data.recordings.cloud_recordings import laid_out, odometry_message, stamps, write_mcap
 
 

@@ -22,29 +22,12 @@ from asca_pillars.commands.detect import detect
 from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal
 from asca_pillars.data.boxes.box_records import read_frames
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError, ConfigError, OutputError, ScanError
 from benchmarks.made_recordings import write_recording
+from tests.commands.short_drive import POINTS, SCANS
 from tests.data.recordings.cloud_recordings import laid_out, stamps, write_mcap
 from tests.in_process import run_here
 from tests.scenes import write_dataset
-
-POINTS = read_scan(sample_scan_path()).points[::4].copy()
-SCANS = 5
-
-
-def write_drive(path: Path) -> Path:
-    """The sample scan, shifted by half a metre from scan to scan."""
-    messages: list[tuple[int, Any]] = []
-    for index, time_ns in enumerate(stamps(SCANS)):
-        points = POINTS - np.array([0.5 * index, 0, 0, 0], np.float32)
-        messages.append((time_ns, laid_out(points, time_ns=time_ns)))
-    return write_mcap(path, {"/lidar": messages})
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_drive(tmp_path_factory.mktemp("drive") / "drive.mcap")
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.models.build import build_model
-from asca_pillars.schema import to_dict
+from asca_pillars.models.checkpoint import Checkpoint
+from tests.saved_checkpoint import save_checkpoint
+from tests.scenes import SPEC
 from tests.training.test_loop import CONFIG
 
 BASE_INSTALL = """
@@ -158,10 +161,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
 
 def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
     torch.manual_seed(0)
-    network = build_model(CONFIG.model)
-    weights = {f"detector.{name}": value for name, value in network.state_dict().items()}
-    content = {"hyper_parameters": {"config": to_dict(CONFIG)}, "state_dict": weights, "global_step": 7}
-    torch.save(content, tmp_path / "last.ckpt")
+    save_checkpoint(tmp_path / "last.ckpt", Checkpoint(CONFIG, build_model(CONFIG.model), 7))
     report = evaluate(tmp_path / "last.ckpt", data=root, out=tmp_path / "out", min_score=0.001, threads=None)
     assert report["model"]["steps"] == 7 and report["model"]["provider"] == "torch cpu"
     assert sorted(path.name for path in (tmp_path / "out" / "predictions").glob("*.txt")) == [
@@ -182,17 +182,10 @@ def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
 
 
 def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path, root: Path) -> None:
-    torch.manual_seed(0)
-    content = to_dict(CONFIG)
-    names = [item["name"] for item in content["model"]["spec"]["classes"]]
-    for item, name in zip(
-        content["model"]["spec"]["classes"], ("Forklift", "Pallet", "Crane")[: len(names)], strict=True
-    ):
-        item["name"] = name
-    weights = {f"detector.{name}": value for name, value in build_model(CONFIG.model).state_dict().items()}
-    torch.save(
-        {"hyper_parameters": {"config": content}, "state_dict": weights, "global_step": 7}, tmp_path / "last.ckpt"
-    )
+    names = ("Forklift", "Pallet", "Crane")
+    classes = tuple(replace(item, name=name) for item, name in zip(SPEC.classes, names, strict=True))
+    config = replace(CONFIG, model=replace(CONFIG.model, spec=replace(SPEC, classes=classes)))  # type: ignore[arg-type]
+    save_checkpoint(tmp_path / "last.ckpt", Checkpoint(config, build_model(config.model), 7))
     message = refusal(tmp_path, model=tmp_path / "last.ckpt", data=root, threads=None)
     assert "detects Forklift" in message and "give --protocol waymo, which scores any class" in message
     assert not (tmp_path / "out").exists()

@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 from asca_deploy import Detections, Detector, sample_scan_path
-from asca_pillars.cli import app
 from asca_pillars.commands.models import Model
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.kitti import KittiSplit
@@ -18,6 +16,7 @@ from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.earlier_evaluation import earlier_predictions
+from tests.in_process import invoke
 from tests.scenes import write_dataset
 
 
@@ -39,20 +38,26 @@ def perfect(root: Path) -> Path:
     return path
 
 
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, ["eval", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0
-    return result.output
-
-
 def test_labels_as_predictions_are_perfect_by_iou_and_distance(root: Path, perfect: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    output = run("--data", root, "--predictions", perfect, "--out", out)  # iou: there is no camera
+    output = invoke("eval", "--data", root, "--predictions", perfect, "--out", out)  # iou: there is no camera
     assert "AP by 3D and BEV IoU" in output and "2 frames" in output
     report = json.loads((out / "iou.json").read_text())
     assert {score["class_name"] for score in report["iou"]} == {"Car", "Forklift"}
     assert {score["ap"] for score in report["iou"] if score["band"] == "all"} == {100.0}
-    run("--data", root, "--predictions", perfect, "--out", out, "--protocol", "distance", "--json", tmp_path / "d.json")
+    invoke(
+        "eval",
+        "--data",
+        root,
+        "--predictions",
+        perfect,
+        "--out",
+        out,
+        "--protocol",
+        "distance",
+        "--json",
+        tmp_path / "d.json",
+    )
     report = json.loads((tmp_path / "d.json").read_text())
     assert report == json.loads((out / "distance.json").read_text())
     assert [round(score["cds"]) for score in report["argoverse2"]] == [100, 100]
@@ -61,15 +66,15 @@ def test_labels_as_predictions_are_perfect_by_iou_and_distance(root: Path, perfe
 
 def test_a_model_is_run_and_scores_the_same_again(root: Path, tmp_path: Path) -> None:
     first = tmp_path / "first"
-    output = run("--data", root, "--out", first, "--min-score", 0.001)  # it knows no made-up scenes
+    output = invoke("eval", "--data", root, "--out", first, "--min-score", 0.001)  # it knows no made-up scenes
     assert "Labelled, but no class that is evaluated: Forklift (2)" in output
     report = json.loads((first / "iou.json").read_text())
     assert [score["objects"] for score in report["at_score"] if score["band"] == "all"] == [2, 0, 0]
-    run("--data", root, "--predictions", first / "predictions", "--out", tmp_path / "second")
+    invoke("eval", "--data", root, "--predictions", first / "predictions", "--out", tmp_path / "second")
     again = json.loads((tmp_path / "second" / "iou.json").read_text())
     of_car = [[score for score in one["iou"] if score["class_name"] == "Car"] for one in (report, again)]
     assert of_car[0] == of_car[1] and len(of_car[0]) > 0
-    run("--data", root, "--out", first)  # replaces its own
+    invoke("eval", "--data", root, "--out", first)  # replaces its own
 
 
 def test_scans_of_another_mounting_are_brought_to_the_models(tmp_path: Path) -> None:
@@ -88,7 +93,7 @@ def test_scans_of_another_mounting_are_brought_to_the_models(tmp_path: Path) -> 
         own = box if name == "plain" else mounting.level.inverse.boxes(box) + np.array([0, 0, 1.7, 0, 0, 0, 0])
         (root / "labels.jsonl").write_text(json_line("1.bin", records_from(own, ["Car"])))
         (root / "dataset.yaml").write_text(text)
-        run("--data", root, "--split", "training", "--out", tmp_path / f"{name}_out", "--around")
+        invoke("eval", "--data", root, "--split", "training", "--out", tmp_path / f"{name}_out", "--around")
         ((_, records, *_),) = read_frames(tmp_path / f"{name}_out" / "predictions" / "detections.jsonl")
         found.append(records)
     plain, other = found
@@ -100,7 +105,7 @@ def test_scans_of_another_mounting_are_brought_to_the_models(tmp_path: Path) -> 
 
 def test_kitti_data_is_scored_too(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "kitti", 2)
-    run("--data", root, "--out", tmp_path / "out", "--protocol", "distance")
+    invoke("eval", "--data", root, "--out", tmp_path / "out", "--protocol", "distance")
     report = json.loads((tmp_path / "out" / "distance.json").read_text())
     assert {score["class_name"]: score["objects"] for score in report["argoverse2"]} == {
         "Car": 2,
@@ -122,7 +127,7 @@ def test_a_model_gets_the_points_that_it_was_trained_on(
 
     model = Model("any", detect, sample.spec, camera_view, {})
     monkeypatch.setattr("asca_pillars.commands.eval_boxes.open_model", lambda *_, **__: model)
-    run("--data", root, "--out", tmp_path / "out", "--protocol", "distance")
+    invoke("eval", "--data", root, "--out", tmp_path / "out", "--protocol", "distance")
     split = KittiSplit(root, "val")
     assert given == [len(split.points(one, camera_view=camera_view)) for one in split.frame_ids]
     assert (given == [len(split.points(one, camera_view=False)) for one in split.frame_ids]) is not camera_view
@@ -139,11 +144,11 @@ def test_what_lies_where_nothing_is_labelled_is_neither_right_nor_wrong(
     (root / "dataset.yaml").write_text(f"{(root / 'dataset.yaml').read_text()}\nlabeled_view_deg: 40\n")
     boxes[2, 1] += 0.2  # its label stands at the edge
     perfect.write_text(json_line("scans/000001.bin", records_from(boxes, ("Car",) * 3, (0.9,) * 3)))
-    run("--data", root, "--split", "training", "--predictions", perfect, "--out", tmp_path / "out")
+    invoke("eval", "--data", root, "--split", "training", "--predictions", perfect, "--out", tmp_path / "out")
     report = json.loads((tmp_path / "out" / "iou.json").read_text())
     assert {score["ap"] for score in report["iou"] if score["band"] == "all" and score["min_iou"] < 0.7} == {100.0}
     with pytest.raises(AscaError, match="has labels within an angle ahead alone"):
-        run("--data", root, "--split", "training", "--around", "--out", tmp_path / "out")
+        invoke("eval", "--data", root, "--split", "training", "--around", "--out", tmp_path / "out")
 
 
 def test_predictions_of_an_earlier_model_do_not_stay_beside_the_report_of_others(
@@ -152,14 +157,14 @@ def test_predictions_of_an_earlier_model_do_not_stay_beside_the_report_of_others
     out = tmp_path / "out"
     earlier_predictions(out)
     (out / "notes.txt").write_text("my own")
-    run("--data", root, "--predictions", perfect, "--out", out)
+    invoke("eval", "--data", root, "--predictions", perfect, "--out", out)
     assert {path.name for path in out.iterdir()} == {"iou.json", "iou.md", "notes.txt"}
 
 
 def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_path: Path) -> None:
     perfect.write_text("".join(line for line in perfect.read_text().splitlines(keepends=True) if "000001" in line))
     assert "evaluated on 1 of 2 frames: no predictions for 000002" in " ".join(
-        run("--data", root, "--predictions", perfect, "--out", tmp_path / "out").split()
+        invoke("eval", "--data", root, "--predictions", perfect, "--out", tmp_path / "out").split()
     )
 
 
@@ -190,11 +195,11 @@ def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_pat
 def test_what_cannot_be_is_refused(root: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
     (root / "none.jsonl").unlink(missing_ok=True)
     with pytest.raises(AscaError) as caught:
-        run(*(text.format(root=root) for text in arguments), "--out", tmp_path / "out")
+        invoke("eval", *(text.format(root=root) for text in arguments), "--out", tmp_path / "out")
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_classes_must_have_something_in_common(root: Path, perfect: Path, tmp_path: Path) -> None:
     perfect.write_text(perfect.read_text().replace("Car", "auto").replace("Forklift", "truck"))
     with pytest.raises(AscaError, match="labels are of Car, Forklift, predictions of auto, truck: no class in common"):
-        run("--data", root, "--predictions", perfect, "--out", tmp_path / "out")
+        invoke("eval", "--data", root, "--predictions", perfect, "--out", tmp_path / "out")

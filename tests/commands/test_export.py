@@ -13,7 +13,7 @@ from asca_pillars.models.checkpoint import load_checkpoint, weights_sha256
 from tests.export.test_sparse_bundle import sparse_checkpoint
 from tests.export.tiny import SCANS
 from tests.in_process import run_here
-from tests.models.second_stage.tiny_refine import save_checkpoint
+from tests.saved_checkpoint import save_checkpoint
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from asca_pillars.cli import app
 from asca_pillars.config import Config, DataConfig
 from asca_pillars.data.training_frames import open_frames
 from asca_pillars.errors import OutputError
@@ -19,16 +17,11 @@ from asca_pillars.pictures.visualize import class_color, read_image
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
 from tests.data.boxes.box_scenes import write_box_dataset
+from tests.in_process import invoke
 from tests.scenes import SPEC
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))
-
-
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def has_color(image: np.ndarray, color: tuple[int, int, int]) -> bool:
@@ -39,7 +32,7 @@ def has_color(image: np.ndarray, color: tuple[int, int, int]) -> bool:
 def test_training_frames_are_drawn_as_training_sees_them(tmp_path: Path) -> None:
     root, out = write_box_dataset(tmp_path / "own", 5), tmp_path / "pictures"
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
-    output = run("inspect", root, "-c", tmp_path / "config.yaml", "--draw", 2, "--out", out)
+    output = invoke("inspect", root, "-c", tmp_path / "config.yaml", "--draw", 2, "--out", out)
     assert sorted(path.name for path in out.iterdir()) == ["00_000000.png", "01_000002.png", "inspection.json"]
     assert f"{out}/00_000000.png: " in output and "turned by" in output
     frames = open_frames(root, CONFIG, training=True)
@@ -49,19 +42,19 @@ def test_training_frames_are_drawn_as_training_sees_them(tmp_path: Path) -> None
     assert has_color(picture, class_color("Car")) and has_color(picture, class_color("Forklift"))
     plain = replace(frames, augmentation=None)
     assert not np.array_equal(picture, draw_training_frame(plain.draw(0, 2)[0], plain))
-    run("inspect", root, "-c", tmp_path / "config.yaml", "--draw", 1, "--out", out)
+    invoke("inspect", root, "-c", tmp_path / "config.yaml", "--draw", 1, "--out", out)
     assert json.loads((out / "inspection.json").read_text())["files"] == ["00_000000.png"]
     (out / "mine.txt").write_text("kept")
     with pytest.raises(OutputError, match=r"mine\.txt"):
-        run("inspect", root, "-c", tmp_path / "config.yaml", "--draw", 1, "--out", out)
+        invoke("inspect", root, "-c", tmp_path / "config.yaml", "--draw", 1, "--out", out)
 
 
 def test_detections_are_drawn_beside_labels(tmp_path: Path) -> None:
     root = write_box_dataset(tmp_path / "own", 2)
     scan = root / "scans" / "000000.bin"
-    run("detect", scan, "--out", tmp_path / "with")
+    invoke("detect", scan, "--out", tmp_path / "with")
     (root / "dataset.yaml").unlink()
-    run("detect", scan, "--out", tmp_path / "without")
+    invoke("detect", scan, "--out", tmp_path / "without")
     labelled, plain = (read_image(tmp_path / name / "000000_bev.png") for name in ("with", "without"))
     assert labelled is not None and plain is not None
     assert labelled.shape != plain.shape or not np.array_equal(labelled, plain)
@@ -70,5 +63,5 @@ def test_detections_are_drawn_beside_labels(tmp_path: Path) -> None:
 def test_damaged_labels_are_said_and_do_not_stop_a_detection(tmp_path: Path) -> None:
     root = write_box_dataset(tmp_path / "own", 2)
     (root / "labels.jsonl").write_text("{")
-    output = run("detect", root / "scans" / "000000.bin", "--out", tmp_path / "out")
+    output = invoke("detect", root / "scans" / "000000.bin", "--out", tmp_path / "out")
     assert "labels are not drawn" in output and (tmp_path / "out" / "000000.json").exists()

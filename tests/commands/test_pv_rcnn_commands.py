@@ -13,7 +13,7 @@ from tests.commands.test_detect_archive import Here
 from tests.export.test_pv_rcnn_int8 import CALIBRATION, random_checkpoint
 from tests.export.tiny import SCANS
 from tests.in_process import run_here
-from tests.models.second_stage.tiny_refine import save_checkpoint
+from tests.saved_checkpoint import save_checkpoint
 from tests.scenes import write_dataset
 
 

@@ -14,12 +14,8 @@ from asca_pillars.commands import detect_recording as steps
 from asca_pillars.commands.recording_journal import JOURNAL_FILE
 from asca_pillars.commands.rerun_file import require_own_rrd
 from asca_pillars.errors import ConfigError, OutputError
-from tests.commands.test_detect_recording import SCANS, run, write_drive
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_drive(tmp_path_factory.mktemp("drive") / "drive.mcap")
+from tests.commands.short_drive import SCANS
+from tests.commands.test_detect_recording import run
 
 
 def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:

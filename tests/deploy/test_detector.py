@@ -14,12 +14,9 @@ from asca_pillars.errors import BundleError, ConfigError, ScanError
 from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.pillars.pillarize import PillarCounts
 from tests.deploy.conftest import STAGES, make_scan
+from tests.same_detections import same
 
 Points = NDArray[np.float32]
-
-
-def same(a: Detections, b: Detections) -> bool:
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("boxes", "scores", "labels"))
 
 
 def detect_by_hand(bundle: Path, points: Points) -> Detections:

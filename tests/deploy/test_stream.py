@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_deploy import Detections, Detector
+from asca_deploy import Detector
 from asca_deploy.pillar_pipeline import CanvasBackbone, PillarPipeline
 from asca_deploy.stream import overlapped
 from asca_pillars.errors import ScanError
 from tests.deploy.conftest import make_scan
+from tests.same_detections import same
 
 Points = NDArray[np.float32]
 PATIENCE_S = 20  # only a test that fails waits so long
@@ -23,10 +24,6 @@ def _no_thread_is_left() -> Iterator[None]:
     before = threading.active_count()
     yield
     assert threading.active_count() == before
-
-
-def same(a: Detections, b: Detections) -> bool:
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("boxes", "scores", "labels"))
 
 
 def test_the_same_boxes_and_counters_as_one_by_one(tiny_bundle: Path) -> None:

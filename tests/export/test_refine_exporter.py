@@ -31,7 +31,8 @@ from tests.export.deployed import assert_same_detector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 from tests.made_once import made_once
 from tests.models.refine.test_pillar_refiner import batch, small_refiner
-from tests.models.second_stage.tiny_refine import opened_config, save_checkpoint, tiny_refine_config, write_first_stage
+from tests.models.second_stage.tiny_refine import opened_config, tiny_refine_config, write_first_stage
+from tests.saved_checkpoint import save_checkpoint
 from tests.scenes import SPEC, write_dataset
 
 

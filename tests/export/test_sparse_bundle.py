@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from asca_deploy import Detections, Detector
+from asca_deploy import Detector
 from asca_deploy.benchmark import benchmark
 from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.golden import golden_stages
@@ -20,6 +20,7 @@ from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.pillar_config import PillarModel
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
+from tests.same_detections import same
 from tests.scenes import SPEC
 
 STAGES = ("pillarize", "encode", "tables", "neck+head", "decode")
@@ -44,10 +45,6 @@ def int8_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bundles") / "int8"
     export_bundle(sparse_checkpoint("fine"), folder, SCANS, calibration=CALIBRATION)
     return folder
-
-
-def same(ours: Detections, theirs: Detections) -> bool:
-    return all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in ("boxes", "scores", "labels"))
 
 
 def test_the_bundle_finds_what_pytorch_finds(float_bundle: tuple[Path, Checkpoint]) -> None:

@@ -9,47 +9,46 @@ import torch
 from asca_pillars.config import Config
 from asca_pillars.errors import TrainingError
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import load_checkpoint, save_weights, weights_sha256
+from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint, save_weights, weights_sha256
 from asca_pillars.models.openpcdet.import_checkpoint import read_foreign
 from asca_pillars.pillar_config import NetworkConfig, PillarModel
-from asca_pillars.schema import to_dict
 from asca_pillars.training.checkpoints import LAST, checkpoint_to_resume
+from tests.saved_checkpoint import checkpoint_content
+
+NARROW = Config(model=PillarModel(network=NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)))
 
 
 def test_weights_at_the_paper_s_width_are_small_and_are_the_same_to_three_digits(tmp_path: Path) -> None:
     config = Config(model=PillarModel())
     torch.manual_seed(0)
-    network = build_model(config.model)
-    state = {f"detector.{name}": value for name, value in network.state_dict().items()}
-    content = {"hyper_parameters": {"config": to_dict(config)}, "global_step": 7, "state_dict": state, "optimizer": 1}
-    torch.save(content, tmp_path / "last.ckpt")
+    untrained = Checkpoint(config, build_model(config.model), 7)
+    state = untrained.detector.state_dict()
+    torch.save(checkpoint_content(untrained) | {"optimizer": 1}, tmp_path / "last.ckpt")
     path = tmp_path / "weights.ckpt"
     save_weights(tmp_path / "last.ckpt", path)
     assert path.stat().st_size < 8 * 2**20
     loaded = load_checkpoint(path)
     assert loaded.steps == 7 and loaded.config == config and loaded.expected_input is None
     for name, value in loaded.detector.state_dict().items():
-        assert value.dtype == state[f"detector.{name}"].dtype
-        torch.testing.assert_close(value, state[f"detector.{name}"], rtol=1e-3, atol=1e-7, msg=name)
-    assert weights_sha256(loaded.detector.state_dict()) != weights_sha256(network.state_dict())
+        assert value.dtype == state[name].dtype
+        torch.testing.assert_close(value, state[name], rtol=1e-3, atol=1e-7, msg=name)
+    assert weights_sha256(loaded.detector.state_dict()) != weights_sha256(state)
 
 
 def test_a_checkpoint_without_younger_settings_has_their_defaults(tmp_path: Path) -> None:
-    config = Config(model=PillarModel(network=NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)))
-    state = {f"detector.{name}": value for name, value in build_model(config.model).state_dict().items()}
-    older = to_dict(config)
-    del older["model"]["loss"]["score_target"], older["model"]["loss"]["assigner"]
-    content = {"hyper_parameters": {"config": older}, "global_step": 7, "state_dict": state}
+    content = checkpoint_content(Checkpoint(NARROW, build_model(NARROW.model), 7))
+    loss = content["hyper_parameters"]["config"]["model"]["loss"]
+    del loss["score_target"], loss["assigner"]
     torch.save(content, tmp_path / "last.ckpt")
-    assert load_checkpoint(tmp_path / "last.ckpt").config == config
+    assert load_checkpoint(tmp_path / "last.ckpt").config == NARROW
 
 
 @pytest.mark.parametrize(("steps", "said"), [({}, "no 'global_step'"), ({"global_step": None}, "int")])
 def test_a_checkpoint_without_its_steps_is_one_line(tmp_path: Path, steps: dict[str, None], said: str) -> None:
-    config = Config(model=PillarModel(network=NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)))
-    state = {f"detector.{name}": value for name, value in build_model(config.model).state_dict().items()}
+    content = checkpoint_content(Checkpoint(NARROW, build_model(NARROW.model), 7))
+    del content["global_step"]
     path = tmp_path / "last.ckpt"
-    torch.save({"hyper_parameters": {"config": to_dict(config)}, "state_dict": state, **steps}, path)
+    torch.save(content | steps, path)
     with pytest.raises(TrainingError, match=f"last.ckpt: not a checkpoint of `asca train`, or damaged .*{said}"):
         load_checkpoint(path)
 

@@ -1,15 +1,14 @@
 """Imports of small datasets in their published formats, made here."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
-from asca_pillars.cli import app
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.nuscenes import read_nuscenes
 from asca_pillars.data.scans.find_scans import find_scans
@@ -17,12 +16,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import AscaError, ConfigError, DatasetError, OutputError, ScanError
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.data.boxes.box_scenes import write_box_dataset
-
-
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, ["import", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+from tests.in_process import invoke
 
 
 def turned(roll: float, pitch: float, yaw: float) -> Rotation:
@@ -35,19 +29,22 @@ def quaternion(turn: Rotation) -> list[float]:
     return [w, x, y, z]
 
 
+TURN = quaternion(turned(0.2, -0.3, 0.7))
+
+
 def test_boxes_of_ones_own(tmp_path: Path) -> None:
     own = write_box_dataset(tmp_path / "own", 4)
     rows = ["scan,class,x,y,z,length,width,height,yaw,track_id"]
     rows += [f"{number:06d}.bin,Forklift,{10 + number},1,-1,2.5,1.2,2,0.5,t{number}" for number in range(3)]
     (tmp_path / "boxes.csv").write_text("\n".join(rows))
-    output = run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.5)
+    output = invoke("import", tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.5)
     assert "2 frames to train on, 2 to validate; boxes: Forklift 3" in output.replace("\n", " ")
     split = BoxSplit(tmp_path / "out", "val")
     assert split.frame_ids == ("000002", "000003")  # without a row: no objects
     assert split.labeled_boxes("000002").boxes[0].tolist() == pytest.approx([12, 1, -1, 2.5, 1.2, 2, 0.5])
     assert split.records("000002").track_ids == ("t2",)
     assert split.scan_path("000002").parent == own / "scans"  # referred to, not copied
-    run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")  # replaces its own
+    invoke("import", tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")  # replaces its own
 
 
 @pytest.mark.parametrize("settings", ["", "axes: y-forward\n"])
@@ -57,7 +54,7 @@ def test_a_dataset_that_was_written_by_hand_stays(tmp_path: Path, settings: str)
     (own / "dataset.yaml").write_text(settings)
     before = {path: path.read_bytes() for path in own.rglob("*") if path.is_file()}
     with pytest.raises(OutputError, match=r"own/dataset\.yaml: .* another OUT, such as /.*/own_imported$") as caught:
-        run(other / "labels.jsonl", own, "--scans", other / "scans")
+        invoke("import", other / "labels.jsonl", own, "--scans", other / "scans")
     assert "\n" not in str(caught.value)
     assert {path: path.read_bytes() for path in own.rglob("*") if path.is_file()} == before
 
@@ -65,11 +62,11 @@ def test_a_dataset_that_was_written_by_hand_stays(tmp_path: Path, settings: str)
 def test_classes_by_other_names(tmp_path: Path) -> None:
     own = write_box_dataset(tmp_path / "own", 4)
     source = (own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
-    output = run(*source, "--rename", "Forklift=Truck", "--rename", "Car=Truck")
+    output = invoke("import", *source, "--rename", "Forklift=Truck", "--rename", "Car=Truck")
     assert "boxes: Truck 8" in output
     for text, message in (("Bus=Truck", "no box has that class; there are Car, Forklift"), ("Car", "write OLD=NEW")):
         with pytest.raises(ConfigError, match=message):
-            run(*source, "--rename", text)
+            invoke("import", *source, "--rename", text)
 
 
 def test_the_end_of_a_recording_is_its_last_scans(tmp_path: Path) -> None:
@@ -78,14 +75,14 @@ def test_the_end_of_a_recording_is_its_last_scans(tmp_path: Path) -> None:
         (own / "scans" / f"{number:06d}.bin").rename(own / "scans" / f"{number}.bin")
     (tmp_path / "boxes.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n3.bin,Car,9,0,0,4,2,1,0\n")
     source = (tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")
-    run(*source, "--val-share", 0.25)
+    invoke("import", *source, "--val-share", 0.25)
     assert set(BoxSplit(tmp_path / "out", "val").frame_ids) == {"9", "10", "11"}
     assert not {"9", "10", "11"} & set(BoxSplit(tmp_path / "out", "train").frame_ids)
 
 
 def test_of_two_scans_one_is_for_validation(tmp_path: Path) -> None:
     own = write_box_dataset(tmp_path / "own", 2)
-    run(own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.6)
+    invoke("import", own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.6)
     assert BoxSplit(tmp_path / "out", "train").frame_ids == ("000000",)
     assert BoxSplit(tmp_path / "out", "val").frame_ids == ("000001",)
 
@@ -96,12 +93,12 @@ def test_recordings_are_not_torn_apart(tmp_path: Path) -> None:
         (own / "scans" / folder).mkdir(exist_ok=True)
         (own / "scans" / f"{number:06d}.bin").rename(own / "scans" / folder / f"{number:06d}.bin")
     (tmp_path / "boxes.csv").write_text("scan,class,x,y,z,length,width,height,yaw\na/000000.bin,Car,9,0,0,4,2,1,0")
-    run(tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.3)
+    invoke("import", tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans", "--val-share", 0.3)
     assert BoxSplit(tmp_path / "out", "train").frame_ids == ("a/000000", "a/000001")
     assert BoxSplit(tmp_path / "out", "val").frame_ids == ("b/000002", "b/000003")
 
 
-def write_argoverse2(root: Path) -> Path:
+def write_argoverse2(root: Path, turn: Sequence[float] = TURN) -> Path:
     pyarrow, feather = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.feather")
     rng = np.random.default_rng(0)
     for log in ("log_a", "log_b"):
@@ -115,7 +112,7 @@ def write_argoverse2(root: Path) -> Path:
         labels: dict[str, Any] = {"timestamp_ns": [315966265259836000, 315966265360032000], "track_uuid": ["u", "u"]}
         labels |= {"category": ["REGULAR_VEHICLE"] * 2, "num_interior_pts": [50, 50]}
         values = {"length_m": 4.0, "width_m": 2, "height_m": 1.6, "tx_m": 20, "ty_m": 5, "tz_m": 1}
-        values |= dict(zip(("qw", "qx", "qy", "qz"), quaternion(turned(0.2, -0.3, 0.7)), strict=True))
+        values |= dict(zip(("qw", "qx", "qy", "qz"), turn, strict=True))
         labels |= {name: [float(value)] * 2 for name, value in values.items()}
         feather.write_feather(pyarrow.table(labels), root / "val" / log / "annotations.feather")
     return root
@@ -123,7 +120,7 @@ def write_argoverse2(root: Path) -> Path:
 
 def test_argoverse2(tmp_path: Path) -> None:
     source = write_argoverse2(tmp_path / "av2")
-    assert "REGULAR_VEHICLE 2" in run(source, tmp_path / "out", "--from", "argoverse2")
+    assert "REGULAR_VEHICLE 2" in invoke("import", source, tmp_path / "out", "--from", "argoverse2")
     split = BoxSplit(tmp_path / "out", "train")
     assert split.frame_ids == ("val/log_a/sensors/lidar/315966265259836000",)  # the other sweep is not there
     boxes = split.labeled_boxes(split.frame_ids[0]).boxes
@@ -143,7 +140,7 @@ def test_argoverse2_of_links(tmp_path: Path) -> None:
     lidar.symlink_to(tmp_path / "elsewhere")
     (source / "val" / "log_b").rename(tmp_path / "log_b")
     (source / "val" / "log_b").symlink_to(tmp_path / "log_b")
-    run(source, tmp_path / "out", "--from", "argoverse2")
+    invoke("import", source, tmp_path / "out", "--from", "argoverse2")
     assert BoxSplit(tmp_path / "out").frame_ids == tuple(
         f"val/{log}/sensors/lidar/315966265259836000" for log in ("log_a", "log_b")
     )
@@ -151,8 +148,11 @@ def test_argoverse2_of_links(tmp_path: Path) -> None:
 
 def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
+    with pytest.raises(DatasetError, match=r"log_a/annotations\.feather: row 0 has a number that is not finite"):
+        invoke("import", write_argoverse2(tmp_path / "still", turn=[0] * 4), tmp_path / "out", "--from", "argoverse2")
+    (tmp_path / "none").mkdir()
     with pytest.raises(DatasetError, match=r"no annotations\.feather below"):
-        run(tmp_path, tmp_path / "out", "--from", "argoverse2")
+        invoke("import", tmp_path / "none", tmp_path / "out", "--from", "argoverse2")
     from pyarrow import feather, table
 
     columns = {name: ["?"] if name == "y" else [1.0] for name in ("x", "y", "z", "intensity")}
@@ -229,7 +229,7 @@ def write_nuscenes(root: Path) -> Path:
 
 def test_nuscenes(tmp_path: Path) -> None:
     source = write_nuscenes(tmp_path / "nuscenes")
-    run(source, tmp_path / "out", "--from", "nuscenes")
+    invoke("import", source, tmp_path / "out", "--from", "nuscenes")
     split = BoxSplit(tmp_path / "out", "train")
     (frame_id,) = split.frame_ids
     boxes, types = split.labeled_boxes(frame_id)
@@ -294,5 +294,5 @@ def test_what_cannot_be_is_refused(
     write_box_dataset(tmp_path / "own", 2)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(AscaError) as caught:
-        run(*arguments)
+        invoke("import", *arguments)
     assert message in str(caught.value) and "\n" not in str(caught.value)

@@ -4,15 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from asca_pillars.cli import app
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.importing.kitti_raw import read_kitti_raw
 from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
+from tests.in_process import invoke
 
 # The LiDAR's axes in the camera's: x right is -y, y down is -z, z ahead is x.
 CALIBRATION = """P2: 700 0 600 0 0 700 180 0 0 0 1 0
@@ -58,14 +57,10 @@ def write_tracking(root: Path) -> Path:
     return root
 
 
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, ["import", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 def test_tracking(tmp_path: Path) -> None:
-    assert "boxes: Van 2" in run(write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking")
+    assert "boxes: Van 2" in invoke(
+        "import", write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking"
+    )
     split = BoxSplit(tmp_path / "out", "train")
     assert split.frame_ids == ("0000/000000", "0000/000001")
     assert len(split.labeled_boxes("0000/000000").boxes) == 0
@@ -76,7 +71,7 @@ def test_tracking(tmp_path: Path) -> None:
 
 def test_only_what_is_labelled_is_learnt_from(tmp_path: Path) -> None:
     """Nothing is labelled behind the car, so that nothing there may be taken for background."""
-    run(write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking")
+    invoke("import", write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking")
     split = BoxSplit(tmp_path / "out", "train")
     assert split.has_camera
     assert len(split.points("0000/000001")) == 80
@@ -96,7 +91,7 @@ def test_raw(tmp_path: Path) -> None:
     assert records.types == ("Van",) and records.track_ids == ("0",)
     points = np.fromfile(imported.frames[1].scan, "<f4").reshape(-1, 4)
     assert points_in_boxes(points, records.boxes).sum() == 40
-    run(tmp_path, tmp_path / "out", "--from", "kitti-raw", "--val-share", 0.3)
+    invoke("import", tmp_path, tmp_path / "out", "--from", "kitti-raw", "--val-share", 0.3)
     assert BoxSplit(tmp_path / "out", "train").settings.labeled_view_deg == 81
 
 

@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from asca_pillars.cli import app
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.waymo_parquet import read_waymo
 from asca_pillars.errors import DatasetError, OutputError
 from asca_pillars.geometry.boxes import points_in_boxes
+from tests.in_process import invoke
 
 TIMES = (1000, 2000)
 HEIGHT, WIDTH = 4, 360
@@ -111,16 +110,10 @@ def write_segment(
     return root
 
 
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, ["import", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 @pytest.mark.parametrize("moved_m", [0.0, 1.5])
 def test_points_lie_in_the_boxes(tmp_path: Path, moved_m: float) -> None:
     source = write_segment(tmp_path / "waymo", moved_m=moved_m)
-    assert "boxes: Vehicle 1" in run(source, tmp_path / "out", "--from", "waymo", "--val-share", 0.5)
+    assert "boxes: Vehicle 1" in invoke("import", source, tmp_path / "out", "--from", "waymo", "--val-share", 0.5)
     split = BoxSplit(tmp_path / "out")
     assert split.frame_ids == ("segment/1000", "segment/2000") and split.mounting.sensor_height_m == 0
     np.testing.assert_allclose(split.to_sensor.points(SENSOR_M[None]), 0, atol=1e-6)
@@ -136,7 +129,13 @@ def test_all_sensors_and_both_returns_are_read(tmp_path: Path) -> None:
     behind = range_image(np.array([14.0, 5.6, 1.0]))  # what the beam met beyond the edge of the vehicle
     other = np.zeros((5, WIDTH, 4), np.float32)
     other[1, 100, :2] = 7.0, 0.2
-    run(write_segment(tmp_path / "waymo", further={(1, 2): behind, (2, 1): other}), tmp_path / "out", "--from", "waymo")
+    invoke(
+        "import",
+        write_segment(tmp_path / "waymo", further={(1, 2): behind, (2, 1): other}),
+        tmp_path / "out",
+        "--from",
+        "waymo",
+    )
     points = BoxSplit(tmp_path / "out").points("segment/1000")
     assert len(points) == 3
     np.testing.assert_allclose(points[:2, :2], [[10, 4], [14, 5.6]], atol=0.15)
@@ -150,10 +149,10 @@ def test_all_sensors_and_both_returns_are_read(tmp_path: Path) -> None:
 def test_an_import_goes_on_where_it_stopped(tmp_path: Path) -> None:
     source = write_segment(tmp_path / "waymo")
     scan = tmp_path / "out" / "scans" / "segment" / "1000.npy"
-    run(source, tmp_path / "out", "--from", "waymo")
+    invoke("import", source, tmp_path / "out", "--from", "waymo")
     first = scan.stat().st_mtime_ns
     (scan.parent / "2000.npy").unlink()
-    run(source, tmp_path / "out", "--from", "waymo")
+    invoke("import", source, tmp_path / "out", "--from", "waymo")
     assert scan.stat().st_mtime_ns == first and (scan.parent / "2000.npy").exists()
 
 

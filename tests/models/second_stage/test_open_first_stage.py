@@ -19,7 +19,8 @@ from asca_pillars.models.second_stage.open_first_stage import open_first_stage, 
 from asca_pillars.points.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
 from asca_pillars.points.proposals import ProposalSettings
 from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
-from tests.models.second_stage.tiny_refine import save_checkpoint, tiny_refine_model
+from tests.models.second_stage.tiny_refine import tiny_refine_model
+from tests.saved_checkpoint import save_checkpoint
 from tests.scenes import SPEC
 
 POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled"))

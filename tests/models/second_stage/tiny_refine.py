@@ -3,18 +3,15 @@
 import dataclasses
 from pathlib import Path
 
-import torch
-
 from asca_pillars.config import AugmentConfig, Config, DataConfig, TrainConfig
-from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.pillar_config import CpaReading
 from asca_pillars.points.first_stage import FirstStageSettings, KeypointSettings
 from asca_pillars.points.proposals import ProposalSettings
 from asca_pillars.points.refine_geometry import RefineSettings
 from asca_pillars.refine_config import RefineConfig, RefineModel, RefineNetwork
-from asca_pillars.schema import to_dict
 from tests.export.tiny import tiny_checkpoint
+from tests.saved_checkpoint import save_checkpoint
 
 REFINE = RefineConfig(
     seen=FirstStageSettings(ProposalSettings(quotas=(6, 6, 6), candidates=40), KeypointSettings(count=48)),
@@ -29,13 +26,6 @@ def write_first_stage(path: Path, cpa: CpaReading = "channel") -> Path:
     """The tiny pillar detector as a checkpoint of `asca train`."""
     save_checkpoint(path, tiny_checkpoint(cpa))
     return path
-
-
-def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    assert isinstance(checkpoint.detector, torch.nn.Module)
-    weights = {f"detector.{name}": value for name, value in checkpoint.detector.state_dict().items()}
-    about = {"config": to_dict(checkpoint.config)}
-    torch.save({"hyper_parameters": about, "state_dict": weights, "global_step": 0}, path)
 
 
 def tiny_refine_config(first_stage: Path, **recipe: object) -> Config:

@@ -1,0 +1,22 @@
+"""Checkpoints as `asca train` writes them, of detectors that no run has trained."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.schema import to_dict
+
+
+def checkpoint_content(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What the file holds."""
+    assert isinstance(checkpoint.detector, torch.nn.Module)
+    weights = {f"detector.{name}": value for name, value in checkpoint.detector.state_dict().items()}
+    about = {"config": to_dict(checkpoint.config)}
+    return {"hyper_parameters": about, "state_dict": weights, "global_step": checkpoint.steps}
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Without what its scans were like."""
+    torch.save(checkpoint_content(checkpoint), path)
