@@ -138,7 +138,7 @@ def test_all_sensors_and_both_returns_are_read(tmp_path: Path) -> None:
     )
     points = BoxSplit(tmp_path / "out").points("segment/1000")
     assert len(points) == 3
-    np.testing.assert_allclose(points[:2, :2], [[10, 4], [14, 5.6]], atol=0.15)
+    np.testing.assert_allclose(points[:2, :2], np.array([[10, 4], [14, 5.6]]), atol=0.15)
     # The second sensor's five beams cut -0.2 to 0 into even parts, from the highest down: row 1 is the fourth of them.
     inclination, azimuth = -0.2 + 3.5 / 5 * 0.2, np.pi - (100 + 0.5) / WIDTH * 2 * np.pi
     ray = np.array([np.cos(inclination) * np.cos(azimuth), np.cos(inclination) * np.sin(azimuth), np.sin(inclination)])
