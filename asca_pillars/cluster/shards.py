@@ -71,7 +71,7 @@ class ShardFolder:
             return shard_size
         try:
             begun = json.loads(path.read_text(encoding="utf-8"))
-            found, size = begun["settings"], int(begun["shard_size"])
+            found, size = {**begun["settings"]}, int(begun["shard_size"])
         except (ValueError, KeyError, TypeError):
             raise OutputError(f"{path}: is damaged; choose another folder, or delete {self.path}") from None
         for name in {**settings, **found}:

@@ -14,14 +14,23 @@ from asca_pillars.geometry.overlap import bev_intersection
 OBJECT_TRIES = 10  # draws of one object's new pose before it stays where it is
 
 
-def augment(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Generator) -> LabeledFrame:
+def augment(
+    frame: LabeledFrame,
+    config: AugmentConfig,
+    rng: np.random.Generator,
+    sensor_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> LabeledFrame:
     """Per-object noise, corruption, flip, rotation, scaling, height shift and point dropout, in this order.
 
-    The frame that is passed in stays as it was.
+    Args:
+        frame: it stays as it was.
+        config: which changes, and how strong.
+        rng: draws them.
+        sensor_m: where the sensor is in the frame of the points.
     """
     frame = replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
     move_objects(frame, config, rng)
-    frame = replace(frame, points=corrupt_objects(frame.points, frame.boxes, config, rng))
+    frame = replace(frame, points=corrupt_objects(frame.points, frame.boxes, config, rng, sensor_m))
     lose_reflectance(frame.points, config, rng)
     motion = Motion(
         flipped=rng.random() < config.flip_probability,
@@ -52,7 +61,7 @@ def flip_y(frame: LabeledFrame) -> None:
 
 
 def rotate(frame: LabeledFrame, angle_rad: float) -> None:
-    """Turn the frame, in place, counter-clockwise about the sensor's vertical axis."""
+    """Turn the frame, in place, counter-clockwise about the z axis."""
     rotation = _rotation(angle_rad)
     frame.points[:, :2] = frame.points[:, :2] @ rotation.T
     frame.boxes[:, :2] = frame.boxes[:, :2] @ rotation.T
@@ -60,7 +69,7 @@ def rotate(frame: LabeledFrame, angle_rad: float) -> None:
 
 
 def scale(frame: LabeledFrame, factor: float) -> None:
-    """Scale the frame, in place, about the sensor."""
+    """Scale the frame, in place, about the origin."""
     frame.points[:, :3] *= factor
     frame.boxes[:, :6] *= factor
 

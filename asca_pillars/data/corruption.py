@@ -15,7 +15,11 @@ WIDEST_CUT = 0.5  # of an object's extent in azimuth or elevation
 
 
 def corrupt_objects(
-    points: NDArray[np.float32], boxes: NDArray[np.float32], config: AugmentConfig, rng: np.random.Generator
+    points: NDArray[np.float32],
+    boxes: NDArray[np.float32],
+    config: AugmentConfig,
+    rng: np.random.Generator,
+    sensor_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> NDArray[np.float32]:
     """Brighten, shake and cut the points inside each box.
 
@@ -24,6 +28,7 @@ def corrupt_objects(
         boxes: (M, 7) labelled boxes, LiDAR frame.
         config: which changes, and how strong.
         rng: draws them.
+        sensor_m: where the sensor is in the points' frame: it is from there that a cut is seen.
 
     Returns:
         (K, 4), K <= N, without the points that were cut out.
@@ -43,7 +48,7 @@ def corrupt_objects(
             points[own, :3] += rng.normal(0, config.object_jitter_m, (len(own), 3))
         if config.object_cut_probability and rng.random() < config.object_cut_probability:
             rows = own[kept[own]]
-            cut = _cut(points[rows, :3], rng)
+            cut = _cut(points[rows, :3] - np.array(sensor_m, np.float32), rng)
             if len(rows) - np.count_nonzero(cut) >= FEWEST_POINTS:
                 kept[rows[cut]] = False
     return points[kept]
@@ -63,7 +68,7 @@ def lose_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np
 
 
 def _cut(xyz: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of an object's points (N, 3) lie in a random sector or in a random group of rings, as the sensor sees them.
+    """Which of an object's points (N, 3), seen from the origin, lie in a random sector or in a random group of rings.
 
     Something thin in front takes away a sector of azimuth, a hedge or a beam that fails a range of elevation.
     """

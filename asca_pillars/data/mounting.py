@@ -66,8 +66,7 @@ class Mounting(Strict):
         """From the scan to x forward, y left, z up about the same origin, or that of the pose."""
         if self.pose is None:
             return FrameChange(_signed_axes(self.axes), np.zeros(3))
-        if self.axes != "x-forward":
-            raise ConfigError(f"axes {self.axes} and a pose: the pose turns the axes already; give one of them")
+        refuse_axes_beside_pose(self.axes)
         pose = np.array(self.pose)
         if not is_rigid(pose):
             raise ConfigError("pose: must be a rotation and a shift, the last row 0 0 0 1")
@@ -85,6 +84,12 @@ class Mounting(Strict):
         return FrameChange(self.level.axes, self.level.shift_m + lift)
 
 
+def refuse_axes_beside_pose(axes: str) -> None:
+    """ConfigError where both are stated."""
+    if axes != "x-forward":
+        raise ConfigError(f"axes {axes} and a pose: the pose turns the axes already; give one of them")
+
+
 def read_pose(path: str | Path) -> tuple[Row, Row, Row, Row]:
     """A 4x4 matrix from a text file of 16 numbers, row by row.
 
@@ -98,7 +103,10 @@ def read_pose(path: str | Path) -> tuple[Row, Row, Row, Row]:
         raise ConfigError(f"{path}: cannot be read as a pose ({error}); write 16 numbers, row by row") from None
     if len(numbers) != 16:
         raise ConfigError(f"{path}: holds {len(numbers)} numbers; a pose has 16, row by row")
-    return _rows(np.reshape(numbers, (4, 4)))
+    pose = np.reshape(numbers, (4, 4))
+    if not is_rigid(pose):
+        raise ConfigError(f"{path}: must be a rotation and a shift, without a scale, the last row 0 0 0 1; correct it")
+    return _rows(pose)
 
 
 def _rows(pose: object) -> tuple[Row, Row, Row, Row]:

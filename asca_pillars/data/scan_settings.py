@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.ground_height import HeightEstimate, measured_mounting
-from asca_pillars.data.mounting import Mounting, read_pose
+from asca_pillars.data.mounting import Mounting, read_pose, refuse_axes_beside_pose
 from asca_pillars.data.scans.scan_reader import ReflectanceScale
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.schema import Strict
@@ -43,8 +43,8 @@ class ScanSettings(Strict):
 
     def __post_init__(self) -> None:
         Mounting(self._stated_height_m, self.axes)  # refuses what it cannot use
-        if self.pose is not None and self.axes != "x-forward":
-            raise ConfigError(f"axes {self.axes} and a pose: the pose turns the axes already; give one of them")
+        if self.pose is not None:
+            refuse_axes_beside_pose(self.axes)
         if self.columns is not None and self.columns < FEWEST_COLUMNS:
             raise ConfigError(f"columns {self.columns}: a .bin has at least x, y and z; give {FEWEST_COLUMNS} or more")
         if self.reflectance_scale != "auto" and not 0 < self.reflectance_scale < inf:

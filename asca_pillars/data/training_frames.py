@@ -62,7 +62,8 @@ class TrainingFrames:
             # A generator of its own: all other draws stay what they are without insertion.
             frame = insert_objects(frame, self.inserter, np.random.default_rng((self.seed, epoch, number, 1)))
         if self.augmentation is not None and rng is not None:
-            frame = augment(frame, self.augmentation, rng)
+            x_m, y_m, z_m = self.split.to_sensor.inverse.shift_m.tolist()
+            frame = augment(frame, self.augmentation, rng, (x_m, y_m, z_m))
         return frame, rng
 
 

@@ -19,7 +19,7 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
-from asca_pillars.files import atomic_path
+from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.schema import Strict
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
@@ -186,5 +186,4 @@ def _write_frame(root: Path, seed: int, config: SimulationConfig, index: int) ->
     frame = simulate_frame(seed, index, config)
     write_calibration(split.calib_path(name), frame.calibration)
     write_labels(split.label_path(name), frame.objects)
-    with atomic_path(split.scan_path(name)) as temporary:
-        frame.points.tofile(temporary)
+    write_scan(split.scan_path(name), frame.points)

@@ -114,8 +114,8 @@ def records_from(
     )
 
 
-def json_line(scan: str, records: BoxRecords) -> str:
-    """One line of a *.jsonl file, with its line break."""
+def json_line(scan: str, records: BoxRecords, time_s: float | None = None) -> str:
+    """One line of a *.jsonl file, with its line break, of a scan with this time stamp."""
     boxes = []
     for box, kind, score, track_id in zip(*records, strict=True):
         record: dict[str, Any] = {"class": kind}
@@ -125,7 +125,8 @@ def json_line(scan: str, records: BoxRecords) -> str:
         if track_id is not None:
             record["track_id"] = track_id
         boxes.append(record)
-    return json.dumps({"scan": scan, "boxes": boxes}) + "\n"
+    stamp = {} if time_s is None else {"time_s": time_s}
+    return json.dumps({"scan": scan, **stamp, "boxes": boxes}) + "\n"
 
 
 def _json_lines(path: Path) -> Iterator[NamedRecords]:
@@ -160,9 +161,11 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
         return
     reader = csv.reader(text.splitlines(), skipinitialspace=True)
     names = [name.strip() for name in next(reader)]
+    if len(names) == 1 and ";" in names[0]:
+        raise DatasetError(f"{path}:1: columns are separated by semicolons; separate them by commas")
     if twice := [name for name in names if names.count(name) > 1]:
         raise DatasetError(f"{path}:1: the column `{twice[0]}` is there twice; remove one")
-    for cells in reader:
+    for cells in _cells(reader, path):
         if not any(cell.strip() for cell in cells):
             continue
         if len(cells) != len(names):
@@ -171,6 +174,13 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
             )
         values = {name: cell.strip() for name, cell in zip(names, cells, strict=True)}
         yield f"{path}:{reader.line_num}", {name: value for name, value in values.items() if value}
+
+
+def _cells(reader: Any, path: Path) -> Iterator[list[str]]:
+    try:
+        yield from reader
+    except csv.Error as error:
+        raise DatasetError(f"{path}:{reader.line_num}: no CSV ({error}); close the quotes") from None
 
 
 def _records(placed: Iterable[tuple[str, Any]]) -> BoxRecords:
@@ -184,6 +194,9 @@ def _records(placed: Iterable[tuple[str, Any]]) -> BoxRecords:
         if not isinstance(kind, str) or not kind.strip():
             raise DatasetError(f"{place}: no `class`; name what is in the box")
         full = {_SHORT.get(name, name): value for name, value in record.items()}
+        if len(full) < len(record):
+            short = next(name for name in record if _SHORT.get(name, name) in record and name in _SHORT)
+            raise DatasetError(f"{place}: both `{short}` and `{_SHORT[short]}`; remove one")
         if missing := [name for name in FIELDS if name not in full]:
             raise DatasetError(f"{place}: no `{missing[0]}`; a box has `class`, {_listed()}")
         box = [_number(full[name], name, place) for name in FIELDS]

@@ -283,9 +283,13 @@ def _find_scan(scan: str, scans: Path, place: str) -> Path:
     raise DatasetError(f"{place}: no scan {scan[:200]} below {scans}; correct the name, or `scans` in {DATASET_FILE}")
 
 
+def _is_label(relative: Path) -> bool:
+    return relative.suffix.lower() in (".json", ".csv") and not any(part.startswith(".") for part in relative.parts)
+
+
 def _frames_of_folder(labels: Path, scans: Path) -> dict[str, BoxFrame]:
     frames: dict[str, BoxFrame] = {}
-    for path in sorted(entry for entry in files_below(labels) if entry.suffix.lower() in (".json", ".csv")):
+    for path in sorted(entry for entry in files_below(labels) if _is_label(entry.relative_to(labels))):
         frame_id = frame_id_of(path, labels)
         there = [scan for suffix in SCAN_SUFFIXES if (scan := scans / f"{frame_id}{suffix}").is_file()]
         if len(there) != 1:

@@ -52,7 +52,11 @@ def _frames(log: Path) -> list[ImportedFrame]:
     boxes = np.column_stack([*(table[name] for name in (*_CENTER, *_SIZE)), yaw]).astype(np.float64)
     if not (np.isfinite(boxes).all() and (boxes[:, 3:6] > 0).all()):
         row = int(np.argmin(np.isfinite(boxes).all(axis=1) & (boxes[:, 3:6] > 0).all(axis=1)))
-        raise DatasetError(f"{path}: row {row} has a number that is not finite or a size that is not positive")
+        values = ", ".join(f"{name} {table[name][row]:g}" for name in (*_CENTER, *_SIZE, *_TURN))
+        raise DatasetError(
+            f"{path}: row {row} is no box with finite numbers, positive sizes and a rotation ({values}); "
+            "download it again"
+        )
     frames = []
     for stamp in np.unique(table["timestamp_ns"]).tolist():
         folders = (log / "sensors" / "lidar", log / "lidar")

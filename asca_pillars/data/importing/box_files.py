@@ -25,7 +25,7 @@ def read_box_files(labels: Path, scans: Path, settings: ScanSettings) -> Importe
     settings.stated_mounting()
     scans = scans.resolve()
     frames = [
-        ImportedFrame(frame.scan, frame.records, frame.scan.parent.relative_to(scans).as_posix())
+        ImportedFrame(frame.scan, frame.records, frame.scan.parent.relative_to(scans).as_posix(), frame.time_s)
         for frame in find_frames(labels, scans).values()
     ]
     stated = to_dict(settings) | {"pose": None if settings.pose is None else str(Path(settings.pose).resolve())}

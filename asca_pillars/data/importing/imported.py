@@ -25,11 +25,12 @@ MARKER = "# Written by `asca import`, which may replace lists and labels beside 
 
 
 class ImportedFrame(NamedTuple):
-    """A scan, its boxes in the LiDAR frame (x forward), and the recording that it is of."""
+    """A scan, its boxes in the LiDAR frame (x forward), its recording, and its time stamp if it has one."""
 
     scan: Path
     records: BoxRecords
     recording: str
+    time_s: float | None = None
 
 
 class Imported(NamedTuple):
@@ -102,7 +103,7 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
     require_own_dataset(out)
     with atomic_path(out / "labels.jsonl") as temporary, temporary.open("w", encoding="utf-8") as file:
         for frame in frames:
-            file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records))
+            file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records, frame.time_s))
     train, val = _lists(frames, val_share)
     for name, own in (("train", train), ("val", val)):
         write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))

@@ -16,7 +16,7 @@ from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG, TYPES
-from asca_pillars.data.scans.find_scans import files_below
+from asca_pillars.data.scans.find_scans import files_below, visible_files
 from asca_pillars.errors import DatasetError
 
 LABELS = "tracklet_labels.xml"
@@ -46,7 +46,7 @@ def read_kitti_raw(root: Path) -> Imported:
 def _frames(drive: Path) -> list[ImportedFrame]:
     labels = _read_tracklets(drive / LABELS)
     frames = []
-    for scan in sorted((drive / "velodyne_points" / "data").glob("*.bin")):
+    for scan in visible_files(drive / "velodyne_points" / "data", "*.bin"):
         own = labels.get(int(scan.stem) if scan.stem.isdecimal() else -1, _Labels([], [], []))
         boxes = np.array(own.boxes, np.float64).reshape(-1, 7)
         frames.append(ImportedFrame(scan, records_from(boxes, own.types, None, own.tracks), drive.name))

@@ -12,6 +12,7 @@ from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects, parse_object, read_calibration
+from asca_pillars.data.scans.find_scans import visible_files
 from asca_pillars.errors import DatasetError
 
 LABELED_VIEW_DEG = 81.0
@@ -31,7 +32,7 @@ def read_kitti_tracking(root: Path) -> Imported:
         DatasetError: no sequence, or a file that is not of this format.
     """
     folder = root / "training" if (root / "training").is_dir() else root
-    labels = sorted((folder / "label_02").glob("*.txt"))
+    labels = visible_files(folder / "label_02", "*.txt")
     if not labels:
         raise DatasetError(f"{folder}: no label_02/*.txt there; give the folder of KITTI's tracking benchmark")
     frames = [frame for path in labels for frame in _frames(folder.resolve(), path)]
@@ -43,7 +44,7 @@ def _frames(folder: Path, labels: Path) -> list[ImportedFrame]:
     calibration = read_calibration(folder / "calib" / f"{sequence}.txt")
     tracked = _read_tracked(labels)
     frames = []
-    for scan in sorted((folder / "velodyne" / sequence).glob("*.bin")):
+    for scan in visible_files(folder / "velodyne" / sequence, "*.bin"):
         number = int(scan.stem) if scan.stem.isdecimal() else -1
         own = [(item, track) for item, track in tracked.get(number, []) if item.has_box_3d]
         frames.append(ImportedFrame(scan, _records(own, calibration), sequence))
@@ -59,7 +60,7 @@ def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
 def _read_tracked(path: Path) -> dict[int, list[_Tracked]]:
     """The objects of each frame with their track's number."""
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None
     tracked = defaultdict(list)

@@ -52,7 +52,7 @@ def read_nuscenes(root: Path) -> Imported:
         DatasetError: a table is missing or not of this format.
     """
     tables = _tables_folder(root)
-    data = tables.parent.resolve()
+    data = tables.absolute().parent.resolve()
     try:
         height_m = _sensor_height_m(tables)
         frames = _frames(tables, data)

@@ -19,13 +19,14 @@ from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
 from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
 from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
+from asca_pillars.data.scans.find_scans import visible_files
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 
 TOP = 1
 """The roof's sensor."""
 TYPES = {1: "Vehicle", 2: "Pedestrian", 3: "Sign", 4: "Cyclist"}
-_SEGMENT, _TIME, _LASER = "key.segment_context_name", "key.frame_timestamp_micros", "key.laser_name"
+_TIME, _LASER = "key.frame_timestamp_micros", "key.laser_name"
 _OBJECT = "key.laser_object_id"
 _BOX = "[LiDARBoxComponent]"
 _BOX_COLUMNS = tuple(
@@ -50,7 +51,7 @@ def read_waymo(root: Path, out: Path) -> Imported:
         OutputError: `out` holds something else.
         AscaError: pyarrow is not installed.
     """
-    segments = sorted((root / "lidar").glob("*.parquet"))
+    segments = visible_files(root / "lidar", "*.parquet")
     if not segments:
         raise DatasetError(f"{root}: no lidar/*.parquet there; give a folder of Waymo's parquet form")
     require_own_dataset(out)

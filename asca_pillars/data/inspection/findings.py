@@ -168,7 +168,10 @@ def _of_axes(inspection: Inspection) -> Iterator[str]:
     (_, axes), _ = Counter((doubt.about, doubt.axes) for doubt in inspection.doubts).most_common(1)[0]
     first = next(doubt for doubt in inspection.doubts if doubt.axes == axes)
     key, what = ("pose: FILE", "how the sensor is tilted") if axes is None else (f"axes: {axes}", "the axes")
-    remedy = f"if so, state {what}, `{key}` in dataset.yaml"
+    if inspection.states_mounting:
+        remedy = f"if so, state {what}, `{key}` in dataset.yaml"
+    else:
+        remedy = "if so, turn the points of all scans to x forward, y left, z up, and calib with them"
     yield f"{len(inspection.doubts)} of {inspection.frames} scans are odd, the first: {first.text}: {remedy}"
 
 

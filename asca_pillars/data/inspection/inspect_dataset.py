@@ -16,6 +16,7 @@ from asca_pillars.config import DataConfig
 from asca_pillars.data.input_check import FrameDoubt
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
+from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError, ScanError
 from asca_pillars.geometry.anchors import ClassSpec
@@ -115,7 +116,8 @@ class Inspection:
     """What was found in `frames` of a split's frames.
 
     `types` counts the labels by type, those of no class included; `damaged` holds a line for each frame that was
-    wanted and cannot be read, `doubts` what is odd about the axes of a scan, for each scan where something is.
+    wanted and cannot be read, `doubts` what is odd about the axes of a scan, for each scan where something is. A
+    dataset of KITTI's layout cannot state how its sensor stands (`states_mounting`).
     """
 
     data: str
@@ -128,6 +130,7 @@ class Inspection:
     scans: ScanFacts
     damaged: tuple[str, ...]
     doubts: tuple[FrameDoubt, ...]
+    states_mounting: bool
 
     @property
     def sampled(self) -> bool:
@@ -183,6 +186,7 @@ def inspect_dataset(
         scans=_scan_facts([frame.scan for frame in measured], spec),
         damaged=tuple(map(str, damaged)),
         doubts=tuple(frame.doubt for frame in measured if frame.doubt is not None),
+        states_mounting=not isinstance(split, KittiSplit),
     )
 
 

@@ -147,7 +147,7 @@ def read_calibration(path: str | Path) -> Calibration:
         DatasetError: the file is missing, lacks a matrix, or holds one that cannot be a calibration.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8", errors="replace")
+        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise DatasetError(
             f"{path}: cannot read the calibration ({error.strerror}); every scan needs calib/<frame id>.txt"

@@ -63,7 +63,7 @@ def read_labels(path: str | Path) -> list[KittiObject]:
         DatasetError: the file is missing, or a line is not one of KITTI's.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8", errors="replace")
+        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise DatasetError(
             f"{path}: cannot read the labels ({error.strerror}); a frame without objects needs an empty file"

@@ -20,6 +20,7 @@ from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibrati
 from asca_pillars.data.kitti.kitti_labels import KittiObject, boxes_from_objects, objects_3d, read_labels
 from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.data.mounting import Mounting
+from asca_pillars.data.scans.find_scans import visible_files
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.data.scans.stored_scans import stored_points
 from asca_pillars.errors import DatasetError
@@ -61,7 +62,7 @@ class KittiSplit:
         Raises:
             DatasetError: the folder or list is missing or empty, or a listed scan does not exist.
         """
-        scans = {path.stem for path in (self.folder / "velodyne").glob("*.bin")}
+        scans = {path.stem for path in visible_files(self.folder / "velodyne", "*.bin")}
         if not scans:
             raise DatasetError(
                 f"{self.folder / 'velodyne'}: no *.bin scans there; KITTI's layout is "
@@ -195,11 +196,11 @@ def read_image_set(root: Path, name: str) -> set[str]:
     """
     path = root / "ImageSets" / f"{name}.txt"
     try:
-        frame_ids = {line.strip() for line in path.read_text(encoding="utf-8").splitlines()} - {""}
+        frame_ids = {line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()} - {""}
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not UTF-8 text; write one frame id per line") from None
     except OSError as error:
-        there = ", ".join(sorted(p.stem for p in path.parent.glob("*.txt"))) or "none"
+        there = ", ".join(p.stem for p in visible_files(path.parent, "*.txt")) or "none"
         raise DatasetError(
             f"{path}: no such split (lists there: {there}); write the list, one frame id per line, or take every "
             "frame: --split training; in a configuration data.train_set and data.val_set = training"

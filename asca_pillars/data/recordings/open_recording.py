@@ -6,7 +6,7 @@ from pathlib import Path
 from asca_pillars.data.recordings.mcap_files import McapRecording
 from asca_pillars.data.recordings.recording import Recording
 from asca_pillars.data.recordings.ros_bags import RosBag
-from asca_pillars.data.scans.find_scans import is_scan, natural_order
+from asca_pillars.data.scans.find_scans import is_scan, natural_order, visible_files
 from asca_pillars.errors import ScanError
 
 RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -25,7 +25,7 @@ def recording_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     names = METADATA_FILE, *(f"*{suffix}*" for suffix in (".mcap", ".db3"))  # compressed ones have two suffixes
-    return sorted(file for name in names for file in path.glob(name) if file.is_file())
+    return sorted(file for name in names for file in visible_files(path, name) if file.is_file())
 
 
 def open_recording(path: Path) -> Recording:
@@ -67,5 +67,5 @@ def _is_compressed(metadata: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    found = [file for suffix in (".mcap", ".db3") for file in folder.glob(f"*{suffix}")]
+    found = [file for suffix in (".mcap", ".db3") for file in visible_files(folder, f"*{suffix}")]
     return sorted(found, key=lambda file: natural_order(Path(file.name)))

@@ -58,6 +58,11 @@ def files_below(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[
                 yield from files_below(entry, here)
 
 
+def visible_files(folder: Path, pattern: str) -> list[Path]:
+    """The files in a folder whose names match, sorted; hidden ones are other programs', or left by a killed writer."""
+    return sorted(path for path in folder.glob(pattern) if not path.name.startswith("."))
+
+
 def _is_prepared(folder: Path) -> bool:
     path = folder / PREPARED_FILE
     return path.is_file() and path.read_text(encoding="utf-8", errors="replace") == PREPARED_NOTE

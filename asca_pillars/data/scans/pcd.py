@@ -17,6 +17,7 @@ from asca_pillars.data.scans.records import (
 from asca_pillars.errors import ScanError
 
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+_OLD_KEYS = {"COLUMNS": "FIELDS"}  # as PCD's first version has it
 _TYPES = {
     f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IUF" for size in (1, 2, 4, 8) if kind + str(size) != "F1"
 }
@@ -119,6 +120,7 @@ def _split_header(path: Path, data: bytes) -> tuple[dict[str, list[str]], bytes]
         position = end + 1
         if not words or words[0].startswith("#"):
             continue
+        words[0] = _OLD_KEYS.get(words[0], words[0])
         if words[0] not in _KEYS:
             raise ScanError(f"{path}: {words[0][:20]!r} is not a line of a PCD header; {AGAIN}")
         if words[0] in header:

@@ -75,17 +75,25 @@ class Lidar(Strict):
 
     def __post_init__(self) -> None:
         if list(self.elevation_deg) != sorted(self.elevation_deg, reverse=True) or not self.elevation_deg:
-            raise ConfigError("elevation_deg must list the lasers from the top downwards")
+            raise ConfigError(
+                f"elevation_deg is {list(self.elevation_deg)[:4]}, ...: must list the lasers from the top downwards"
+            )
         if not self.origin_z_m or self.rings % len(self.origin_z_m):
             raise ConfigError(f"origin_z_m has {len(self.origin_z_m)} blocks, which do not share {self.rings} lasers")
         if min(self.azimuth_steps, default=0) < 1 or self.azimuth_counts < 8 * len(self.azimuth_steps):
-            raise ConfigError("azimuth_steps must be counts of 1 and more, few against azimuth_counts")
+            raise ConfigError(
+                f"azimuth_steps is {list(self.azimuth_steps)[:4]}, ... of azimuth_counts {self.azimuth_counts}: must "
+                "be counts of 1 and more, at most an eighth as many as azimuth_counts"
+            )
         if self.azimuth_counts / self.mean_step >= MAX_COLUMNS:
             raise ConfigError(f"azimuth_steps make {MAX_COLUMNS} firings per revolution or more; make them longer")
         if self.ring_gain and len(self.ring_gain) != self.rings:
             raise ConfigError(f"ring_gain has {len(self.ring_gain)} values for {self.rings} lasers")
         if len(self.ego_first_ring) != len(self.ego_beyond_ring):
-            raise ConfigError("ego_first_ring and ego_beyond_ring must have one value per sector each")
+            raise ConfigError(
+                f"ego_first_ring has {len(self.ego_first_ring)} values, ego_beyond_ring {len(self.ego_beyond_ring)}: "
+                "must have one for each sector"
+            )
         for name in ("range_m", "range_sigma_m", "loss_share", "zero_power"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:

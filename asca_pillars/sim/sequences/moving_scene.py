@@ -9,7 +9,7 @@ import numpy.typing as npt
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sequences.ways import Going, Way, draw_ways, held_footprints
 from asca_pillars.sim.world.placement import Placer, Target
-from asca_pillars.sim.world.scene import EGO_LENGTH_M, EGO_WIDTH_M, Scene, draw_scene
+from asca_pillars.sim.world.scene import KEPT_CLEAR_M, Scene, draw_scene
 
 Floats = npt.NDArray[np.float64]
 
@@ -94,7 +94,7 @@ def draw_moving_scene(
         kept = [item.target for item in going]
         placer.targets[:] = kept
         placer.half_hidden[:] = [target for target in placer.half_hidden if any(target is one for one in kept)]
-        for way, size in [(ego, (EGO_LENGTH_M, EGO_WIDTH_M)), *((way, _size(target)) for target, way in going)]:
+        for way, size in [(ego, KEPT_CLEAR_M), *((way, _size(target)) for target, way in going)]:
             for footprint in held_footprints(way, size, duration_s):
                 placer.occupied.hold(*footprint)
 

@@ -22,7 +22,7 @@ from asca_pillars.sim.world.screens import fill_gaps, hide_partly
 from asca_pillars.sim.world.streets import draw_ground, draw_kind
 
 # Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
-EGO_LENGTH_M, EGO_WIDTH_M = 6.0, 4.0
+KEPT_CLEAR_M = 6.0, 4.0
 BEAM_M_PER_M = 0.004  # width of a laser's beam per metre of distance
 # Of cars, of people on foot and of cyclists.
 RATE_FACTORS = {
@@ -56,7 +56,7 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator, arrange: Callable[
     habits = HABITS_OF.get(kind, kind)
     ground = draw_ground(config, rng, kind)
     occupied = Occupied()
-    occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
+    occupied.take(0.0, 0.0, *KEPT_CLEAR_M, 0.0)
     placer = Placer(rng, config, ground, occupied, habits)
     place_objects(placer)
     if arrange is not None:

@@ -53,6 +53,11 @@ def test_scores_and_tracks_are_kept(tmp_path: Path) -> None:
     assert frame.scan == "b/c.pcd" and frame.records.track_ids == ("7",) and frame.records.scores.tolist() == [0.25]
 
 
+def test_time_stamps_are_written_and_read(tmp_path: Path) -> None:
+    lines = json_line("a.bin", records_from(ARRAY, ["Car"]), 12.25) + json_line("b.bin", records_from(ARRAY, ["Car"]))
+    assert [frame.time_s for frame in read_frames(write(tmp_path / "l.jsonl", lines))] == [12.25, None]
+
+
 @given(st.lists(st.floats(-500, 500), min_size=7, max_size=7))
 def test_what_is_written_is_read_again(tmp_path_factory: pytest.TempPathFactory, numbers: list[float]) -> None:
     box = np.array([[*numbers[:3], *(abs(number) + 0.1 for number in numbers[3:6]), numbers[6] % 3]], np.float32)
@@ -85,6 +90,9 @@ def test_csv_rows_are_gathered_by_scan(tmp_path: Path) -> None:
         ("l.csv", "class,x\nCar,1\n", r"l\.csv:2: no `scan`"),
         ("l.csv", "scan,class\na,Car,1\n", r"l\.csv:2: 3 values for 2 columns"),
         ("l.csv", "scan,class,class\na,Car,1\n", r"l\.csv:1: the column `class` is there twice"),
+        ("l.csv", "scan;class;x\na;Car;1\n", r"l\.csv:1: columns are separated by semicolons"),
+        ("l.csv", 'scan,class\n"' + 200_000 * "a", r"l\.csv:2: no CSV \(.*\); close the quotes"),
+        ("l.csv", "scan,class,x,x_m\na,Car,1,9\n", r"l\.csv:2: both `x` and `x_m`; remove one"),
         ("l.txt", "", r"l\.txt: labels of several frames are \.jsonl or \.csv"),
     ],
 )

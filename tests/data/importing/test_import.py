@@ -148,7 +148,7 @@ def test_argoverse2_of_links(tmp_path: Path) -> None:
 
 def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    with pytest.raises(DatasetError, match=r"log_a/annotations\.feather: row 0 has a number that is not finite"):
+    with pytest.raises(DatasetError, match=r"log_a/annotations\.feather: row 0 is no box with finite numbers"):
         invoke("import", write_argoverse2(tmp_path / "still", turn=[0] * 4), tmp_path / "out", "--from", "argoverse2")
     (tmp_path / "none").mkdir()
     with pytest.raises(DatasetError, match=r"no annotations\.feather below"):
@@ -227,7 +227,7 @@ def write_nuscenes(root: Path) -> Path:
     return root
 
 
-def test_nuscenes(tmp_path: Path) -> None:
+def test_nuscenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = write_nuscenes(tmp_path / "nuscenes")
     invoke("import", source, tmp_path / "out", "--from", "nuscenes")
     split = BoxSplit(tmp_path / "out", "train")
@@ -240,6 +240,8 @@ def test_nuscenes(tmp_path: Path) -> None:
     assert boxes[0].tolist() == pytest.approx([ahead, -right, up, 4.5, 2, 1.6, yaw], abs=1e-4)
     points = split.points(frame_id)
     assert points_in_boxes(points, boxes[:1]).all() and points[:, 3] == pytest.approx(51 / 255)
+    monkeypatch.chdir(source / "v1.0-mini")
+    assert len(read_nuscenes(Path()).frames) == 1, "the tables' own folder"
 
 
 def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:

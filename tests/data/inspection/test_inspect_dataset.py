@@ -279,3 +279,14 @@ def test_runs_without_torch(clean: Path, tmp_path: Path) -> None:
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "2 of 12 frames, evenly spaced" in " ".join(result.stdout.split())
+
+
+def test_axes_of_a_layout_that_cannot_state_them(data: Path) -> None:
+    """A dataset.yaml would make another layout of it."""
+
+    def turn_upside_down(points: Points) -> None:
+        points[:, 1:3] *= -1
+
+    change_scans(data, turn_upside_down)
+    texts = [item.text for item in found(data) if "scans are odd" in item.text]
+    assert texts and texts[0].endswith("turn the points of all scans to x forward, y left, z up, and calib with them")

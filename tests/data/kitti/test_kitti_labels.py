@@ -124,6 +124,11 @@ def test_empty_label_file_is_a_frame_without_objects(tmp_path):
     assert read_labels(tmp_path / "a.txt") == []
 
 
+def test_a_byte_order_mark_is_no_part_of_the_first_type(tmp_path):
+    (tmp_path / "a.txt").write_text(f"{CAR}\n{CAR}\n", encoding="utf-8-sig")
+    assert [item.type for item in read_labels(tmp_path / "a.txt")] == ["Car", "Car"]
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [

@@ -42,6 +42,16 @@ def test_splits(root):
     assert KittiSplit(root, "test").calib_path("000007") == root / "testing/calib/000007.txt"
 
 
+def test_hidden_files_are_no_frames_and_a_byte_order_mark_no_part_of_a_name(root):
+    """Left by a killed writer, or by macOS; Notepad begins a list with the mark."""
+    for name in (".000001.asca-12345678.bin", "._000002.bin"):
+        (root / "training/velodyne" / name).write_bytes(bytes(16))
+    assert KittiSplit(root).frame_ids == ("000001", "000002", "000010")
+    write_image_set(root, "val", ["000001"])
+    (root / "ImageSets/val.txt").write_text("000001\n", encoding="utf-8-sig")
+    assert KittiSplit(root, "val").frame_ids == ("000001",)
+
+
 def test_missing_parts_of_a_dataset_are_named(root, tmp_path):
     split = KittiSplit(root)
     assert_one_line(root / "training/label_2/000001.txt", ["empty file"], lambda: split.objects("000001"))

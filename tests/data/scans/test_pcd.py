@@ -55,3 +55,8 @@ def test_compressed_pcd_with_references(tmp_path):
     header = "FIELDS z y x\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary_compressed\n"
     scan = read(tmp_path, "a.pcd", header.encode() + struct.pack("<2I", len(stream), 24) + stream)
     np.testing.assert_array_equal(scan.points, [[1, 1, 1, 0]] * 2)
+
+
+def test_columns_is_the_old_name_of_fields(tmp_path):
+    header = "COLUMNS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
+    np.testing.assert_array_equal(read(tmp_path, "a.pcd", header.encode() + b"1 2 3\n").points, [[1, 2, 3, 0]])

@@ -7,7 +7,7 @@ from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.habits import Habits, Neighbor
 from asca_pillars.sim.world.occupied import Occupied
 from asca_pillars.sim.world.placement import Placer, Target
-from asca_pillars.sim.world.scene import EGO_LENGTH_M, EGO_WIDTH_M, draw_scene, place_objects
+from asca_pillars.sim.world.scene import KEPT_CLEAR_M, draw_scene, place_objects
 from asca_pillars.sim.world.sizes import draw_size
 from asca_pillars.sim.world.streets import draw_ground
 
@@ -19,7 +19,7 @@ def targets(config: SceneConfig, scenes: int) -> list[list[Target]]:
         rng = np.random.default_rng(index)
         kind = ("residential", "urban", "rural", "campus")[index % 4]
         placer = Placer(rng, config, draw_ground(config, rng, kind), Occupied(), kind)
-        assert placer.occupied.take(0.0, 0.0, EGO_LENGTH_M, EGO_WIDTH_M, 0.0)
+        assert placer.occupied.take(0.0, 0.0, *KEPT_CLEAR_M, 0.0)
         place_objects(placer)
         found.append(placer.targets)
     return found
