@@ -81,9 +81,9 @@ def bench(
     from asca_deploy import sample_scan_path
     from asca_deploy.manifest import load_bundle
     from asca_pillars.commands.bench_parts import Parts, measure_parts, named_bundles
-    from asca_pillars.commands.json_file import require_writable_json
     from asca_pillars.commands.models import open_detector
     from asca_pillars.commands.scan_input import ScanInput, scan_settings
+    from asca_pillars.commands.writable_file import require_writable
     from asca_pillars.data.scans.find_scans import name_scans
     from asca_pillars.errors import ConfigError, ScanError
     from asca_pillars.files import write_json
@@ -107,7 +107,7 @@ def bench(
     bundles = named_bundles([bundle, *(compare or ())])
     for folder in bundles.values():
         load_bundle(folder)  # a damaged one is named now and not after minutes
-    require_writable_json(json)
+    require_writable(json)
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     detector = open_detector(options, mounting=scan_input.mounting, around=around)
     parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold)

@@ -84,7 +84,7 @@ def measure_parts(
         result["compare"] = asdict(compared) | {"boxes": {name: asdict(one) for name, one in boxes.items()}}
         console.print(show.comparison_table(compared, boxes))
     if parts.matrix:
-        ways = measure_matrix(bundles, scans, rounds, bar, mounting=detector.mounting)
+        ways = measure_matrix(bundles, scans, rounds, bar, mounting=detector.mounting, threads=detector.threads)
         result["matrix"] = [asdict(row) | {"way": row.way._asdict()} for row in ways]
         console.print(show.matrix_table(ways))
         for line in show.matrix_reasons(ways):

@@ -102,6 +102,10 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     with Journal(task.out, about, detector.spec.class_names) as journal:
         if journal.done:
             console.print(f"going on after the {journal.done} scans that {journal.path} holds", soft_wrap=True)
+        if journal.differs:
+            console.print(
+                f"beginning anew: another run was killed here, with another {journal.differs}", soft_wrap=True
+            )
         start = process_time()
         run = _Run(detector, scans, journal)
         for _ in track(run.results(), "Detecting", topic.messages - journal.done, console=console):

@@ -18,7 +18,9 @@ from asca_pillars.commands.options import (
 def evaluate(
     model: Annotated[
         Path | None,
-        typer.Argument(help="Bundle (folder) or checkpoint (.ckpt). Default: the bundle that comes with asca."),
+        typer.Argument(
+            help="Bundle (folder, or name of one that ships) or checkpoint (.ckpt). Default: the one that ships first."
+        ),
     ] = None,
     *,
     data: Annotated[

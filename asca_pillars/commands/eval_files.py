@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from asca_pillars.commands.json_file import require_writable_json
+from asca_pillars.commands.writable_file import require_writable
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.files import atomic_path, remove_directory, require_own, require_replaceable, write_json
@@ -23,7 +23,7 @@ def claim(out: Path, json_path: Path | None) -> None:
     require_own(out, COMMAND, *reports, f"predictions/{MADE_BY}", text='"')
     for folder, marker in (("predictions", MADE_BY), ("gallery", gallery.INDEX)):
         require_replaceable(out / folder, COMMAND, marker)
-    require_writable_json(json_path)
+    require_writable(json_path)
 
 
 def write_report(

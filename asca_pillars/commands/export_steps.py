@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from asca_deploy.bundle import Quantization
+from asca_deploy.bundle import MANIFEST, Quantization
 from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_checkpoint
 from asca_pillars.commands.extras import require
@@ -46,6 +46,8 @@ def open_source(source: Path) -> Source:
     """
     path = find_checkpoint(source)
     checkpoint = load_checkpoint(path)
+    if not (path.parent / MANIFEST).exists():  # the folder of a run's checkpoints holds weights, too
+        source = path
     if path == source:
         command = run_environment(source).get("command", "not recorded")
         return Source(path, checkpoint, {}, "not stated", command)

@@ -12,6 +12,7 @@ from typing import IO, Any
 import numpy as np
 
 from asca_pillars.commands.recording_results import Found
+from asca_pillars.commands.writable_file import require_writable
 from asca_pillars.errors import ConfigError, OutputError
 
 TOPIC = "/asca/boxes"
@@ -80,6 +81,7 @@ def require_own_file(path: Path) -> None:
             start = file.read(100)  # magic, then a header with the name of what wrote the file
         if LIBRARY.encode() not in start:
             raise OutputError(f"{path}: `asca detect` did not write it and would replace it; choose another name")
+    require_writable(path)
 
 
 class FoxgloveFile:

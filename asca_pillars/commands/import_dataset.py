@@ -60,7 +60,7 @@ def import_dataset(
     from asca_pillars.commands.scan_input import scan_settings
     from asca_pillars.data.importing.argoverse2 import read_argoverse2
     from asca_pillars.data.importing.box_files import read_box_files
-    from asca_pillars.data.importing.imported import Importer, renamed, write_imported
+    from asca_pillars.data.importing.imported import Importer, renamed, require_own_dataset, write_imported
     from asca_pillars.data.importing.kitti_raw import read_kitti_raw
     from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
     from asca_pillars.data.importing.nuscenes import read_nuscenes
@@ -72,6 +72,9 @@ def import_dataset(
         raise ConfigError("--scans FOLDER goes with --from boxes, and only with it: other formats say where scans are")
     if not source.exists():
         raise ConfigError(f"{source}: no such file or folder; check the path")
+    if wrong := [text for text in rename or () if not all(text.partition("="))]:
+        raise ConfigError(f"--rename {wrong[0]}: write OLD=NEW, such as --rename REGULAR_VEHICLE=Car")
+    require_own_dataset(out)
     if source_format == "argoverse2":
         require("import")
     importers: dict[str, Importer] = {
@@ -92,8 +95,6 @@ def import_dataset(
         imported = read_waymo(source, out)
     else:
         imported = importers[source_format](source)
-    if wrong := [text for text in rename or () if not all(text.partition("="))]:
-        raise ConfigError(f"--rename {wrong[0]}: write OLD=NEW, such as --rename REGULAR_VEHICLE=Car")
     names = dict(text.split("=", 1) for text in rename or ())
     counts = write_imported(out, renamed(imported, names), val_share)
     boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"

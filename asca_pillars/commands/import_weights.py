@@ -43,6 +43,8 @@ def import_weights(
 
     if out.suffix != ".ckpt":
         raise OutputError(f"{out}: give a name that ends in .ckpt, by which the other commands know a checkpoint")
+    if out.exists():
+        raise OutputError(f"{out}: is there already, and a training may need it; choose another name, or remove it")
     weights = read_foreign(file)
     name = str(config or published_config(weights))
     count = write_imported(weights, load_config(name, override or []), out)

@@ -37,7 +37,9 @@ def inspect(
             "inserted, augmented.",
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures of --draw.")] = Path("inspection"),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the pictures of --draw. Default: inspection.")
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Look at a dataset before training: objects, points, sizes and positives per class, ranges, scans.
@@ -55,9 +57,9 @@ def inspect(
     from rich.console import Console
 
     from asca_pillars.commands import inspect_tables as show
-    from asca_pillars.commands.inspect_pictures import draw_frames
-    from asca_pillars.commands.json_file import require_writable_json
+    from asca_pillars.commands.inspect_pictures import draw_frames, require_replaceable_pictures
     from asca_pillars.commands.propose_config import propose_config
+    from asca_pillars.commands.writable_file import require_writable
     from asca_pillars.config import load_config
     from asca_pillars.data.inspection.findings import findings
     from asca_pillars.data.inspection.input_cells import input_cells
@@ -66,7 +68,12 @@ def inspect(
     from asca_pillars.errors import ConfigError, DatasetError
     from asca_pillars.files import write_json
 
-    require_writable_json(json)
+    require_writable(json)
+    if draw is None and out is not None:
+        raise ConfigError(f"--out {out} is for the pictures of --draw; give --draw COUNT, too")
+    pictures = Path("inspection") if out is None else out
+    if draw is not None:
+        require_replaceable_pictures(pictures)
     settings = load_config(config)
     console = Console(markup=False, highlight=False)
     frames_of = open_split(data, settings.data.train_set if split is None else split)
@@ -98,7 +105,7 @@ def inspect(
     )
     console.print(show.matching(inspection), show.scans(inspection, input_cells(spec), view), sep="\n")
     if draw is not None:
-        draw_frames(data, frames_of.name, settings, draw, out, console)
+        draw_frames(data, frames_of.name, settings, draw, pictures, console)
     errors = [finding for finding in found if finding.level == "error"]
     for finding in found:
         if finding not in errors[:1]:  # the first one is what the command fails with, below all of them

@@ -14,6 +14,11 @@ COMMAND = "asca inspect --draw"
 MADE_BY = "inspection.json"
 
 
+def require_replaceable_pictures(out: Path) -> None:
+    """OutputError where `out` holds something else than pictures of an earlier run."""
+    require_replaceable(out, COMMAND, MADE_BY)
+
+
 def draw_frames(data: Path, split: str, config: Config, count: int, out: Path, console: Console) -> None:
     """Write pictures of `count` frames of the list `split` to `out` and name them; an earlier run's are replaced.
 
@@ -21,7 +26,6 @@ def draw_frames(data: Path, split: str, config: Config, count: int, out: Path, c
         OutputError: `out` holds something else.
         DatasetError, ScanError: a frame cannot be read.
     """
-    require_replaceable(out, COMMAND, MADE_BY)
     config = replace(config, data=replace(config.data, train_set=split))
     frames = open_frames(data, config, training=True)
     with atomic_directory(out, COMMAND, MADE_BY) as folder:

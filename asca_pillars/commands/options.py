@@ -9,8 +9,8 @@ import typer
 ScansArgument = Annotated[
     list[Path] | None,
     typer.Argument(
-        help="Scans (.bin .npy .pcd .ply) and folders of them, searched to any depth. Default: the sample that comes "
-        "with asca."
+        help="Scans (.bin .npy .pcd .ply .feather) and folders of them, searched to any depth. Default: the sample "
+        "that comes with asca."
     ),
 ]
 BundleOption = Annotated[

@@ -37,6 +37,7 @@ class Journal:
 
     Attributes:
         done: how many messages it held when it was opened.
+        differs: what another run that left one here had otherwise, the first key; None if there was none.
 
     Raises:
         OutputError: when the block is entered, if another process writes it.
@@ -46,6 +47,7 @@ class Journal:
         self.path, self._about, self._class_names = folder / JOURNAL_FILE, about, class_names
         self._file: IO[bytes]
         self.done = 0
+        self.differs: str | None = None
 
     def __enter__(self) -> "Journal":
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -98,7 +100,10 @@ class Journal:
             content = None
             with suppress(ValueError):
                 content = json.loads(line) if line.endswith(b"\n") else None
-            if number == 0 and content != json.loads(json.dumps(self._about)):
+            about = json.loads(json.dumps(self._about))
+            if number == 0 and content != about:
+                before = content if isinstance(content, dict) else {}
+                self.differs = next((key for key in about if before.get(key) != about[key]), "its content")
                 return 0
             if number > 0 and (not isinstance(content, dict) or content.get("number") != number - 1):
                 break

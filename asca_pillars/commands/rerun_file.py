@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.commands.recording_results import Found
+from asca_pillars.commands.writable_file import require_writable
 from asca_pillars.data.recordings.recorded_scans import RecordedScan
 from asca_pillars.errors import ConfigError, OutputError
 
@@ -28,6 +29,7 @@ def require_own_rrd(path: Path) -> None:
             head = file.read(_HEAD_BYTES)
         if APPLICATION.encode() not in head:
             raise OutputError(f"{path}: `asca detect` did not write it and would replace it; choose another name")
+    require_writable(path)
 
 
 class RerunFile:

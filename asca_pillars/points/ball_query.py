@@ -5,7 +5,7 @@ Index N, one past the last point, stands for nothing: whoever gathers rows appen
 
 import itertools
 import math
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[
     return nearest, np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
 
 
-@cache
+@lru_cache(maxsize=64)  # the radius in columns follows the scan where that is wide
 def _visiting_order(radius: float) -> NDArray[np.int32]:
     """(row, column) offsets (M, 2) of the columns that a ball of so many columns' radius can reach, shuffled."""
     reach = math.ceil(radius + _ROUNDING)

@@ -35,7 +35,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """Write `checkpoint` to `path`."""
         path = Path(path)
         with atomic_path(path) as temporary:
-            torch.save(checkpoint, temporary)
+            with temporary.open("wb") as file:  # of a path torch's error is no OSError where the disk is full
+                torch.save(checkpoint, file)
             if path.name == LAST:
                 if self.keep_last and path.exists():
                     with atomic_path(path.with_name(PREVIOUS)) as previous:
@@ -59,8 +60,11 @@ class BestCheckpoint(ModelCheckpoint):
         path = Path(str(self.dirpath)) / BEST
         if trainer.global_step and path.exists():
             with contextlib.suppress(*_UNREADABLE):  # then the next validation replaces it
-                states = torch.load(path, map_location="cpu", weights_only=True)["callbacks"]
-                self.load_state_dict(states[self.state_key])
+                state = torch.load(path, map_location="cpu", weights_only=True)["callbacks"][self.state_key]
+                # Lightning forgets the loss where the folder has another name: a run may have been moved.
+                here = {"dirpath": self.dirpath, "best_model_path": str(path), "kth_best_model_path": str(path)}
+                best = {str(path): loss for loss in state["best_k_models"].values()}
+                self.load_state_dict({**state, **here, "best_k_models": best})
 
 
 class LastCheckpoint(Checkpoint):

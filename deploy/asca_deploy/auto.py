@@ -84,7 +84,6 @@ def choose(
         ProviderError: nothing in the precision that was asked for can be taken; says why.
         BundleError: the reference cannot run the graph.
     """
-    start = clock()
     reference = open_network(*REFERENCE)
     expected = detect(reference)
     candidates = [Candidate(*REFERENCE, _median_ms(detect, reference, clock), AGREES, weights)]
@@ -92,6 +91,7 @@ def choose(
     if precision not in (None, REFERENCE[1]):
         best = None
     del reference  # what cannot be taken must not stay in memory
+    start = clock()  # where the CPU is slow, the others are what it is asked for
     for name in names:
         if name == REFERENCE or precision not in (None, name[1]):
             continue

@@ -5,14 +5,23 @@ from pathlib import Path
 
 import pytest
 
-from asca_pillars.commands.export_steps import run_environment
+from asca_pillars.commands.export_steps import open_source, run_environment
 from asca_pillars.errors import TrainingError
 from asca_pillars.system import describe_environment
+from tests.export.tiny import tiny_checkpoint
+from tests.saved_checkpoint import save_checkpoint
 
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
     return tmp_path / "run" / "checkpoints" / "last.ckpt"
+
+
+def test_the_folder_of_a_run_s_checkpoints_is_its_weights(checkpoint: Path) -> None:
+    checkpoint.parent.mkdir(parents=True)
+    save_checkpoint(checkpoint.with_name("weights.ckpt"), tiny_checkpoint("none"))
+    source = open_source(checkpoint.parent)
+    assert source.path == checkpoint.with_name("weights.ckpt") and not source.score_thresholds
 
 
 def test_the_command_of_the_run_is_known(checkpoint: Path) -> None:

@@ -24,10 +24,12 @@ def test_a_file_becomes_a_checkpoint(tmp_path: Path) -> None:
 
 def test_refusals_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "text.pth").write_text("text")
+    (tmp_path / "last.ckpt").write_text("a training")
     for arguments, message in (
         (("none.pth", "-o", "out.ckpt"), "none.pth: no such file"),
         (("text.pth", "-o", "out.ckpt"), "text.pth: damaged, or holds more than weights"),
         (("text.pth", "-o", "out.pth"), "out.pth: give a name that ends in .ckpt"),
+        (("text.pth", "-o", "last.ckpt"), "last.ckpt: is there already"),
     ):
         done = run_here("import-weights", *arguments, cwd=tmp_path)
         assert done.returncode == 2 and done.stderr.startswith(f"asca: {message}"), done.stderr

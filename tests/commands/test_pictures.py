@@ -10,7 +10,7 @@ import yaml
 
 from asca_pillars.config import Config, DataConfig
 from asca_pillars.data.training_frames import open_frames
-from asca_pillars.errors import OutputError
+from asca_pillars.errors import ConfigError, OutputError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.pictures.training_pictures import draw_training_frame
 from asca_pillars.pictures.visualize import class_color, read_image
@@ -47,6 +47,8 @@ def test_training_frames_are_drawn_as_training_sees_them(tmp_path: Path) -> None
     (out / "mine.txt").write_text("kept")
     with pytest.raises(OutputError, match=r"mine\.txt"):
         invoke("inspect", root, "-c", tmp_path / "config.yaml", "--draw", 1, "--out", out)
+    with pytest.raises(ConfigError, match="is for the pictures of --draw"):
+        invoke("inspect", root, "-c", tmp_path / "config.yaml", "--out", out)
 
 
 def test_detections_are_drawn_beside_labels(tmp_path: Path) -> None:

@@ -173,8 +173,13 @@ def test_reduced_is_taken_only_where_it_pays(seconds: float, precision: str) -> 
     assert machine.choose().precision == precision
 
 
+def test_a_slow_cpu_leaves_the_others_their_time() -> None:
+    machine = Machine(cpu_float32=(FOUND, 3.0), openvino_float32=(FOUND, 0.5))
+    assert machine.choose().provider == "openvino"
+
+
 def test_candidates_come_to_an_end() -> None:
-    machine = Machine(cpu_float32=(FOUND, 0.3), openvino_reduced=(FOUND, 0.25), openvino_float32=(FOUND, 0.001))
+    machine = Machine(cpu_float32=(FOUND, 0.7), openvino_reduced=(FOUND, 0.6), openvino_float32=(FOUND, 0.001))
     choice = machine.choose()
     assert choice.precision == "reduced"
     assert outcomes(choice)["openvino_float32"] == "not tried, 2 s were over: ask for it by name"

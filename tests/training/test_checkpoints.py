@@ -1,8 +1,10 @@
 """Checkpoints of a run: two generations, the one to go on from; and whose run a folder holds."""
 
 import dataclasses
+import signal
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -13,7 +15,7 @@ from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.schema import to_dict
 from asca_pillars.training import loop
-from asca_pillars.training.checkpoints import AtomicCheckpointIO, checkpoint_to_resume
+from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loop import train
 from asca_pillars.training.run_folder import Seen, claim, measure_input
 from tests.scenes import write_dataset
@@ -60,6 +62,38 @@ def test_there_is_a_last_checkpoint_at_every_moment(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(Path, "replace", watched)
     save(tmp_path, 2, files)
     assert seen == [True, True]
+
+
+def test_a_run_that_was_moved_knows_its_best_loss(tmp_path: Path) -> None:
+    before, after = tmp_path / "before", tmp_path / "after"
+    after.mkdir()
+    callback, loss = BestCheckpoint(before), torch.tensor(0.5)
+    callback.best_model_score, callback.best_model_path = loss, str(before / "best.ckpt")
+    callback.kth_value, callback.kth_best_model_path = loss, callback.best_model_path
+    callback.best_k_models = {callback.best_model_path: loss}
+    torch.save({"callbacks": {callback.state_key: callback.state_dict()}}, after / "best.ckpt")
+    moved = BestCheckpoint(after)
+    strategy = SimpleNamespace(reduce_boolean_decision=lambda decision, **_: decision)
+    trainer = cast(Any, SimpleNamespace(global_step=7, strategy=strategy))
+    moved.on_train_start(trainer, cast(Any, None))
+    assert moved.best_model_path == moved.kth_best_model_path == str(after / "best.ckpt")
+    worse, better = torch.tensor(0.6), torch.tensor(0.4)
+    assert moved.check_monitor_top_k(trainer, better) and not moved.check_monitor_top_k(trainer, worse)
+
+
+def test_a_full_disk_is_an_error_of_the_system(tmp_path: Path) -> None:
+    """Which the command line tells in one line; of torch it would be a RuntimeError."""
+    resource = pytest.importorskip("resource", reason="limits of files are those of Unix")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"last\.ckpt"):
+            AtomicCheckpointIO(True).save_checkpoint({"weights": torch.zeros(1000)}, tmp_path / "last.ckpt")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not (tmp_path / "last.ckpt").exists()
 
 
 @pytest.mark.parametrize("size", [0, 1, 100, -1])

@@ -7,6 +7,7 @@ is labelled by the boxes of its own timestamp. Format: https://argoverse.github.
 from pathlib import Path
 
 import numpy as np
+from rich.progress import track
 
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
@@ -36,7 +37,7 @@ def read_argoverse2(root: Path) -> Imported:
     logs = sorted(path.parent for path in files_below(root) if path.name == "annotations.feather")
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
-    frames = [frame for log in logs for frame in _frames(log)]
+    frames = [frame for log in track(logs, "Reading logs", transient=True) for frame in _frames(log)]
     settings = BoxDataset(
         sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root), sensor_position=SENSOR_POSITION_M
     )

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
 
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
@@ -58,7 +59,8 @@ def read_waymo(root: Path, out: Path) -> Imported:
     with atomic_path(out / DATASET_FILE) as temporary:
         # It marks the folder from the start, so that an import that was killed can be given again.
         temporary.write_text(MARKER, encoding="utf-8")
-    frames = [frame for path in segments for frame in _frames(root, path, out.resolve() / "scans")]
+    bar = track(segments, "Reading segments", transient=True)
+    frames = [frame for path in bar for frame in _frames(root, path, out.resolve() / "scans")]
     top = _calibrations(root / "lidar_calibration" / segments[0].name).get(TOP)
     x, y, z = np.zeros(3) if top is None else np.round(top.vehicle_from_lidar[:3, 3], 3).tolist()
     settings = BoxDataset(

@@ -98,6 +98,6 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
         "global_step": weights.steps,
         "state_dict": {f"detector.{prefix}{name}": value for name, value in converted.items()},
     }
-    with atomic_path(out) as temporary:
-        torch.save(content, temporary)
+    with atomic_path(out) as temporary, temporary.open("wb") as file:  # see `AtomicCheckpointIO`
+        torch.save(content, file)
     return len(weights.state)

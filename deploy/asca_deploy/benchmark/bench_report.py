@@ -24,7 +24,7 @@ class BenchmarkReport:
     total_ms: Percentiles
     stages_ms: dict[str, Percentiles]
     outside_ms: Percentiles
-    """What is not spent in the two graphs: input check, pillars, scatter, decoding and suppression."""
+    """What is not spent in the graphs: input check, pillars, scatter, decoding and suppression."""
     outside_share: float
     """Median over frames of outside / total."""
     cold_ms: float
@@ -81,7 +81,7 @@ def benchmark(
     if not scans or rounds < 1:
         raise ValueError(f"{len(scans)} scans, {rounds} rounds: at least one of each is needed")
     cold_ms = run_frame(detector, scans[0]).total_ms
-    for _ in range(warmup):
+    for _ in track(warmup, "warm-up"):
         for scan in scans:
             detector(scan)
     passes = [[run_frame(detector, scan) for scan in scans] for _ in track(rounds, "stages")]

@@ -48,6 +48,7 @@ def measure_matrix(
     rounds: int = 10,
     track: Track = silently,
     mounting: Mounting | None = None,
+    threads: int | None = None,
 ) -> tuple[MatrixRow, ...]:
     """Open every way that there is and time those that run in alternation.
 
@@ -55,9 +56,10 @@ def measure_matrix(
         bundles: folders by name. The first one's default on the CPU is the reference and the first row.
         scans: (N, 4) each, LiDAR frame.
         mounting: of their sensor.
+        threads: beside one alone; None for the physical cores granted to the process.
     """
     opened: dict[Way, Detector | str] = {}
-    ways = [way for bundle in bundles for way in _ways(bundle)]
+    ways = [way for bundle in bundles for way in _ways(bundle, default_threads() if threads is None else threads)]
     for number in track(len(ways), "opening"):
         way = ways[number]
         # What does not run with so many threads does not with others, and is one row.
@@ -75,12 +77,12 @@ def measure_matrix(
     )
 
 
-def _ways(bundle: str) -> list[Way]:
+def _ways(bundle: str, most: int) -> list[Way]:
     return [
         Way(bundle, provider, precision, threads)
         for provider in sorted(PROVIDERS, key=lambda name: name != "cpu")
         for precision in PRECISIONS
-        for threads in sorted({default_threads(), 1} if provider in ON_THE_CPU else {default_threads()}, reverse=True)
+        for threads in sorted({most, 1} if provider in ON_THE_CPU else {most}, reverse=True)
     ]
 
 

@@ -1,11 +1,11 @@
-"""The file of `--json`, looked at before the work that goes into it."""
+"""A file that a command ends with, looked at before the work that goes into it."""
 
 from pathlib import Path
 
 from asca_pillars.files import atomic_path
 
 
-def require_writable_json(path: Path | None) -> None:
+def require_writable(path: Path | None) -> None:
     """Make sure that minutes of work do not end with a file that cannot be written; None is no file.
 
     Raises:
