@@ -5,7 +5,7 @@ import reprlib
 from collections.abc import Sequence
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 _LARGEST = 2.0**53  # of settings: up to here a float counts every whole number
 

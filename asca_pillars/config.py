@@ -18,8 +18,8 @@ from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.refine_config import RefineModel
-from asca_pillars.schema import Strict
 from asca_pillars.settings import read_settings, shipped_configs
+from asca_pillars.strict import Strict
 
 InsertMethod = Literal["none", "gt_aug", "rs_aug"]
 Precision = Literal["auto", "fp32", "bf16"]

@@ -7,7 +7,7 @@ from asca_pillars.bounds import require_bounds
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.targets import Assigner
 from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 from asca_pillars.tables.neck_tables import MaskRule
 
 CpaReading = Literal["none", "paper", "channel", "point"]

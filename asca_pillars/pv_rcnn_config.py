@@ -8,7 +8,7 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.points.anchor_proposals import AnchorProposals
 from asca_pillars.points.refined_detections import Scores
 from asca_pillars.points.voxel_scan import VoxelSetSettings
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 from asca_pillars.tables.voxel_spec import VoxelSpec
 
 Gate = Literal["none", "keypoint"]

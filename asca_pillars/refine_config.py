@@ -9,7 +9,7 @@ from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStageSettings
 from asca_pillars.points.refine_geometry import RefineSettings
 from asca_pillars.points.refined_detections import Scores
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 
 @dataclass(frozen=True)

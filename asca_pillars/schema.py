@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import reprlib
 from functools import cache
-from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import pydantic
 
@@ -15,12 +15,6 @@ T = TypeVar("T")
 _QUOTE = reprlib.Repr()  # cuts: a value may be as long as its file
 _QUOTE.maxstring = _QUOTE.maxother = 80
 _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
-
-
-class Strict:
-    """Base of the settings dataclasses: a key that does not exist, or a number that is not finite, is an error."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
 def parse(type_: type[T], data: dict[str, Any], source: str) -> T:

@@ -7,7 +7,8 @@ import pytest
 from pydantic import Discriminator, Tag
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.schema import Strict, parse, to_dict
+from asca_pillars.schema import parse, to_dict
+from asca_pillars.strict import Strict
 
 
 @dataclass(frozen=True)

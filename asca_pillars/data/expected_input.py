@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 _HIGHEST_M = 100.0  # ground below or above a sensor; farther, it is no measurement
 

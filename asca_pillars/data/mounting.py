@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.frame_change import FrameChange, is_rigid
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 Row: TypeAlias = tuple[float, float, float, float]
 

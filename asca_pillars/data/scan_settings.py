@@ -13,7 +13,7 @@ from asca_pillars.data.ground_height import HeightEstimate, measured_mounting
 from asca_pillars.data.mounting import Mounting, read_pose, refuse_axes_beside_pose
 from asca_pillars.data.scans.scan_reader import ReflectanceScale
 from asca_pillars.errors import ConfigError, ScanError
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 FEWEST_COLUMNS = 3
 SAMPLE_SCANS = 8  # that a height of "auto" looks at

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 ANCHOR_YAWS_RAD = (0.0, math.pi / 2)
 

@@ -14,7 +14,7 @@ from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 KERNELS = "asca_pillars.geometry.nms_kernels"
 

@@ -14,7 +14,7 @@ from asca_pillars.geometry.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 
 @dataclass(frozen=True)

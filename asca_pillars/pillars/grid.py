@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.fitting import HEAD_STRIDE, MAX_ZONES, NECK_STRIDE, fits, x_advice, y_advice
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
 

@@ -15,7 +15,7 @@ from asca_pillars.geometry.decode import MOST
 from asca_pillars.geometry.frame_report import ScanCounts
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 KERNELS = "asca_pillars.pillars.pillar_kernels"
 

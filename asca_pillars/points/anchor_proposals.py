@@ -10,7 +10,7 @@ from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.decode import HeadMaps, rotated_nms, sigmoid
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 
 @dataclass(frozen=True)

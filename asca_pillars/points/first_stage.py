@@ -13,7 +13,7 @@ from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.points.bilinear import bilinear_cells, read_map
 from asca_pillars.points.farthest_points import farthest_points, points_near_boxes
 from asca_pillars.points.proposals import ProposalSettings, propose
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 
 class FirstPass(NamedTuple):

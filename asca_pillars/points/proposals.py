@@ -11,7 +11,7 @@ from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode_candidates, suppress
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 
 @dataclass(frozen=True)

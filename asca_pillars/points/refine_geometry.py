@@ -15,7 +15,7 @@ from asca_pillars.points.cube_neighbors import nearest_in_cubes
 from asca_pillars.points.farthest_points import points_near_boxes
 from asca_pillars.points.first_stage import Proposed
 from asca_pillars.points.roi_grid import roi_grid_points
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 ROI_FEATURES = 4
 """Columns of `roi_features` beside one for each class."""

@@ -15,7 +15,7 @@ from asca_pillars.points.ball_query import ball_query, three_nearest
 from asca_pillars.points.bilinear import bilinear_cells
 from asca_pillars.points.farthest_points import farthest_points
 from asca_pillars.points.point_scales import PointScale, point_scales
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 from asca_pillars.tables.voxel_spec import VoxelSpec
 from asca_pillars.tables.voxel_tables import VoxelLevel, VoxelTableBuilder
 from asca_pillars.tables.voxels import voxelize

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 
 
 @dataclass(frozen=True)

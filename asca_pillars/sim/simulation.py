@@ -20,7 +20,6 @@ from asca_pillars.data.kitti import (
     write_labels,
 )
 from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.schema import Strict
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
 from asca_pillars.sim.parallel import ABOUT_FILE, check_wishes, claim_simulation, for_each, held_out
@@ -30,6 +29,7 @@ from asca_pillars.sim.sensor.image_border import outside_image
 from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import Returns, measure
 from asca_pillars.sim.world.scene import Scene, build, draw_scene
+from asca_pillars.strict import Strict
 
 _SHARD_FRAMES = 20  # of a cluster's worker: a second or two
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.kernels import load_kernels
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 from asca_pillars.tables.cell_map import MAX_Z_CELLS, CellMap
 from asca_pillars.tables.convolution import Shape
 

@@ -20,7 +20,7 @@ from asca_pillars.points.first_stage import FirstStageSettings
 from asca_pillars.points.refine_geometry import RefineSettings
 from asca_pillars.points.refined_detections import Scores
 from asca_pillars.points.voxel_scan import VoxelSetSettings
-from asca_pillars.schema import Strict
+from asca_pillars.strict import Strict
 from asca_pillars.tables.neck_tables import MaskRule
 from asca_pillars.tables.voxel_spec import VoxelSpec
 

@@ -39,11 +39,6 @@ class Session(Protocol):
         """
 
 
-def run_graph(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-    """The outputs of these names; of what is given the graph takes the inputs that it has."""
-    return session.run(outputs, {name: given[name] for name in session.inputs})
-
-
 def check_interface(
     path: Path, session: Session, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
 ) -> Session:

@@ -1,19 +1,19 @@
 """The pillar family's pipeline: pillarize, encode, scatter or tables, neck and head, decode (paper section 3)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK, CanvasFormat, PillarBundle
-from asca_deploy.graph import Session, check_interface, run_graph
+from asca_deploy.graph import Session, check_interface
 from asca_deploy.pillar_backbone import HeadAnswer, Maps, PillarBackbone
 from asca_deploy.pillar_graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
-from asca_deploy.pipeline import Laps, Pipeline, channels_first, take_free
+from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.geometry.decode import HeadMaps, decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.kernels import load_kernels
@@ -23,6 +23,8 @@ from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.pillars.pillarize import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.points.first_stage import FirstPass
 from asca_pillars.tables.neck_tables import NeckTableBuilder, NeckTables, table_inputs
+
+T = TypeVar("T")
 
 
 class PreparedPillars(NamedTuple):
@@ -261,6 +263,24 @@ class TableBackbone:
         rule = self._bundle.pillar.active_cells
         assert rule is not None
         return NeckTableBuilder(*self._bundle.spec.grid.map_shape, rule)
+
+
+def run_graph(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+    """The outputs of these names; of what is given the graph takes the inputs that it has."""
+    return session.run(outputs, {name: given[name] for name in session.inputs})
+
+
+def take_free(free: list[T], make: Callable[[], T]) -> T:
+    """One that is free, or a new one; appending it to `free` gives it back."""
+    try:
+        return free.pop()  # atomic, as append is: two threads never get the same one
+    except IndexError:
+        return make()
+
+
+def channels_first(channels_last: Sequence[NDArray[Any]]) -> HeadMaps[NDArray[np.float32]]:
+    """Head maps of one scan as a graph gives them, (1, H, W, C) each, as decoding reads them, (C, H, W) each."""
+    return HeadMaps(*(maps[0].transpose(2, 0, 1) for maps in channels_last))
 
 
 _: type[Pipeline[PreparedPillars, HeadAnswer]] = PillarPipeline  # mypy compares them

@@ -1,12 +1,11 @@
 """What a family of detectors has to bring along to be run by `Detector`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_report import ScanCounts
 
@@ -53,19 +52,3 @@ class Pipeline(Protocol[P, R]):
 
     def finish(self, raw: R, laps: Laps) -> Detections:
         """What the network answered -> boxes."""
-
-
-T = TypeVar("T")
-
-
-def take_free(free: list[T], make: Callable[[], T]) -> T:
-    """One that is free, or a new one; appending it to `free` gives it back."""
-    try:
-        return free.pop()  # atomic, as append is: two threads never get the same one
-    except IndexError:
-        return make()
-
-
-def channels_first(channels_last: Sequence[NDArray[Any]]) -> HeadMaps[NDArray[np.float32]]:
-    """Head maps of one scan as a graph gives them, (1, H, W, C) each, as decoding reads them, (C, H, W) each."""
-    return HeadMaps(*(maps[0].transpose(2, 0, 1) for maps in channels_last))

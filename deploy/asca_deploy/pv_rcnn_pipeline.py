@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
-from asca_deploy.graph import Interface, Session, check_interface, run_graph
-from asca_deploy.pipeline import Laps, Pipeline, channels_first, take_free
+from asca_deploy.graph import Interface, Session, check_interface
+from asca_deploy.pillar_pipeline import channels_first, run_graph, take_free
+from asca_deploy.pipeline import Laps, Pipeline
 from asca_deploy.pv_rcnn_graphs import (
     OUT,
     backbone_interface,

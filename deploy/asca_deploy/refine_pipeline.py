@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import REFINE, PillarBundle, RefineSection
-from asca_deploy.graph import Interface, Session, Tensor, check_interface, run_graph
-from asca_deploy.pillar_pipeline import PillarPipeline, PreparedPillars
+from asca_deploy.graph import Interface, Session, Tensor, check_interface
+from asca_deploy.pillar_pipeline import PillarPipeline, PreparedPillars, run_graph
 from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.errors import BundleError
 from asca_pillars.geometry.detections import Detections

@@ -193,7 +193,7 @@ def test_a_journal_of_other_settings_is_not_gone_on_with(
         run(drive, tmp_path, score=0.9)
     assert (tmp_path / JOURNAL_FILE).exists() and "beginning anew" not in capsys.readouterr().out
     assert min(box["score"] for line in run(drive, tmp_path, score=0.5) for box in line["boxes"]) < 0.9
-    assert "beginning anew: the run that was killed here had another " in capsys.readouterr().out
+    assert "beginning anew: another run was killed here, with another score" in capsys.readouterr().out
 
 
 def test_a_journal_of_another_pose_is_not_gone_on_with(

@@ -46,4 +46,3 @@ def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, te
         "--score 0.5 belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
     )
     assert "--gallery 2 belongs to --protocol kitti" in refusal(tmp_path, **waymo, data=root, gallery=2)
-    assert refusal(tmp_path, **texts, protocol="coco") == "--protocol coco: choose kitti, waymo, iou or distance"

@@ -1,9 +1,11 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.pillar_pipeline import Canvas
+from asca_deploy.pillar_pipeline import Canvas, take_free
 from asca_pillars.pillars.grid import PillarGrid
 
 # 8 + 16 + 32 columns by 16 rows, off center.
@@ -38,3 +40,22 @@ def test_the_image_is_allocated_once() -> None:
     second = canvas.scatter(np.ones((1, CHANNELS), np.float32), np.array([9]))
     assert first is second
     assert second.flags.c_contiguous
+
+
+class TakenMeanwhile(list[Any]):
+    """Its last entry is taken by another thread after one has looked and before one takes."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def __bool__(self) -> bool:
+        return True
+
+
+def test_what_is_free_is_used_again() -> None:
+    free = ["kept"]
+    assert (take_free(free, lambda: "made"), take_free(free, lambda: "made")) == ("kept", "made")
+
+
+def test_another_thread_may_take_the_last_one() -> None:
+    assert take_free(TakenMeanwhile(), lambda: "made") == "made"

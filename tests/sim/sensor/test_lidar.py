@@ -114,7 +114,7 @@ def test_the_sensor_of_kitti_has_its_pattern_and_its_car() -> None:
         ({"azimuth_steps": []}, "azimuth_steps"),
         ({"azimuth_counts": 9000}, "4096 firings"),
         ({"ring_gain": [1.0]}, "1 values for 64"),
-        ({"ego_first_ring": []}, "one value per sector"),
+        ({"ego_first_ring": []}, "ego_first_ring has 0 values, ego_beyond_ring 120"),
         ({"range_m": [9.0, 3.0]}, "lower bound"),
         ({"zero_power": [0, 5e-5]}, "zero_power is .*: must be positive"),
         ({"ring_bias_sigma_m": -0.1}, "ring_bias_sigma_m is -0.1: must not be negative"),
