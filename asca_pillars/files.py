@@ -184,6 +184,11 @@ def recover(folder: str | Path, *, again: bool = False) -> None:
                 shutil.rmtree(path)
 
 
+def is_hidden(relative: Path) -> bool:
+    """Whether it or a folder on the way to it is; `relative` to the folder that is searched."""
+    return any(part.startswith(".") for part in relative.parts)
+
+
 def _prepare(path: str | Path) -> Path:
     """The place that `path` leads to, in a folder that exists and holds nothing of killed writers."""
     target = Path(os.path.realpath(path))

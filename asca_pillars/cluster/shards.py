@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from asca_pillars.errors import OutputError
-from asca_pillars.files import atomic_path, write_json
+from asca_pillars.files import atomic_path, is_hidden, write_json
 
 RUN_SETTINGS = "run.json"
 _SUFFIX = ".jsonl"
@@ -89,7 +89,7 @@ class ShardFolder:
             return {
                 entry.name.removesuffix(_SUFFIX)
                 for entry in entries
-                if entry.name.endswith(_SUFFIX) and not entry.name.startswith(".")
+                if entry.name.endswith(_SUFFIX) and not is_hidden(Path(entry.name))
             }
 
     def write(self, shard: Shard, lines: Iterable[str]) -> None:

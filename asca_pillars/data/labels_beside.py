@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxSplit, frame_id_of
+from asca_pillars.data.boxes.box_frames import DATASET_FILE, frame_id_of
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.kitti import boxes_from_objects, objects_3d, read_calibration, read_labels
 
 DEPTH = 6  # folders above a scan in which a dataset.yaml is looked for

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxSplit
+from asca_pillars.data.boxes.box_frames import DATASET_FILE
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.labeled_split import LabeledSplit
 

@@ -6,7 +6,6 @@ is also in the metadata of each graph, under the graph's SHA-256, and the two ha
 
 import hashlib
 import json
-import reprlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from asca_deploy.bundle import (
     PvRcnnBundle,
 )
 from asca_deploy.layout import difference, layout_of
+from asca_deploy.manifest_file import EXPORT_AGAIN, LONGEST_REASON, first_misread, read_manifest
 from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.errors import AscaError, BundleError, printable
 from asca_pillars.files import write_json
@@ -41,9 +41,6 @@ _LATER_KEYS = {
 }
 _LATER_SPEC_KEYS = {"anchor_places": "cells", "anchor_scores": "own"}
 _LATER_GRID_KEYS = {"map": "warped"}
-_LARGEST_BYTES = 1 << 20
-_LONGEST_REASON = 300
-_EXPORT_AGAIN = "export the bundle again with `asca export`"
 
 
 def load_pillar_bundle(folder: str | Path) -> PillarBundle:
@@ -69,7 +66,7 @@ def load_bundle(folder: str | Path) -> Bundle:
     """
     folder = Path(folder)
     manifest = folder / MANIFEST
-    data = _read_manifest(manifest)
+    data = read_manifest(manifest)
     old = data["schema_version"] == 2
     stamped = {key: data.get(key) for key in (_ESSENTIALS_2 if old else _stamped_keys(data))}
     if old:
@@ -79,27 +76,27 @@ def load_bundle(folder: str | Path) -> Bundle:
     layout = _take_out_layout(manifest, data) if family is PillarBundle else None
     try:
         bundle = parse(family, data, str(manifest))
-        if ignored := _first_difference(data, to_dict(bundle)):
+        if ignored := first_misread(data, to_dict(bundle)):
             raise BundleError(f"`{ignored}` is missing or of the wrong type")
     except AscaError as error:
         # The grid and the classes check themselves and do not know the file they were read from.
-        raise BundleError(f"{_blamed(manifest, error)}; {_EXPORT_AGAIN}") from None
+        raise BundleError(f"{_blamed(manifest, error)}; {EXPORT_AGAIN}") from None
     except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
         raise BundleError(
-            f"{manifest}: a value makes no sense ({printable(str(error), _LONGEST_REASON)}); {_EXPORT_AGAIN}"
+            f"{manifest}: a value makes no sense ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}"
         ) from None
     if isinstance(bundle, PillarBundle):
         _verify_refine(manifest, bundle)
     if set(bundle.graphs) != set(bundle.graph_names):
         raise BundleError(
             f"{manifest}: a {bundle.kind} detector has the graphs {' and '.join(bundle.graph_names)}, not "
-            f"{printable(', '.join(bundle.graphs), _LONGEST_REASON) or 'none'}; {_EXPORT_AGAIN}"
+            f"{printable(', '.join(bundle.graphs), LONGEST_REASON) or 'none'}; {EXPORT_AGAIN}"
         )
     for graph in bundle.graphs.values():
         _verify_graph(folder, graph, stamped)
     if isinstance(bundle, PillarBundle) and (differs := difference(layout, layout_of(bundle.spec))):
         raise BundleError(
-            f"{manifest}: `pillar.layout.{differs}` is not what this version derives from `spec`; {_EXPORT_AGAIN}"
+            f"{manifest}: `pillar.layout.{differs}` is not what this version derives from `spec`; {EXPORT_AGAIN}"
         )
     return bundle
 
@@ -107,7 +104,7 @@ def load_bundle(folder: str | Path) -> Bundle:
 def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
     """The layout that a pillar detector's manifest writes down; later keys of `spec` get their first meaning."""
     if data.get("kind") == "pillar" and "refine" in data:
-        raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {_EXPORT_AGAIN}")
+        raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {EXPORT_AGAIN}")
     layout = None
     if isinstance(section := data.get("pillar"), dict):
         layout = section.pop("layout", None)
@@ -175,101 +172,21 @@ def _verify_refine(manifest: Path, bundle: PillarBundle) -> None:
     if bundle.kind != "pillar_refine":
         return
     if bundle.refine is None:
-        raise BundleError(f"{manifest}: `refine` is null, kind pillar_refine needs it; {_EXPORT_AGAIN}")
+        raise BundleError(f"{manifest}: `refine` is null, kind pillar_refine needs it; {EXPORT_AGAIN}")
     if len(bundle.refine.seen.proposals.quotas) != len(bundle.spec.classes):
-        raise BundleError(f"{manifest}: `refine.seen.proposals.quotas` has not one for each class; {_EXPORT_AGAIN}")
-
-
-def refuse_run_folder(folder: Path) -> None:
-    """Raise BundleError, which names the checkpoint, if it is the folder of a training run."""
-    last = folder / "checkpoints" / "last.ckpt"
-    if last.is_file():
-        raise BundleError(f"{folder} is the folder of a training run, no model bundle; give its checkpoint, {last}")
-
-
-def _read_manifest(manifest: Path) -> dict[str, Any]:
-    try:
-        if manifest.stat().st_size > _LARGEST_BYTES:
-            raise BundleError(f"{manifest} is larger than a manifest ever is (1 MiB); {_EXPORT_AGAIN}")
-        text = manifest.read_text(encoding="utf-8")
-        data = json.loads(text, object_pairs_hook=_without_duplicates, parse_constant=_no_number)
-    except (FileNotFoundError, NotADirectoryError):
-        refuse_run_folder(manifest.parent)
-        raise BundleError(
-            f"{manifest.parent} is no model bundle, it holds no {MANIFEST}; make one with `asca export`"
-        ) from None
-    except OSError as error:
-        raise BundleError(f"{manifest}: {error.strerror}") from None
-    except RecursionError:
-        raise BundleError(f"{manifest} is damaged (nested too deeply); {_EXPORT_AGAIN}") from None
-    except ValueError as error:  # of the JSON, or of its UTF-8
-        raise BundleError(
-            f"{manifest} is damaged ({printable(str(error), _LONGEST_REASON)}); {_EXPORT_AGAIN}"
-        ) from None
-    version = data.get("schema_version") if isinstance(data, dict) else None
-    if type(version) is not int:
-        shown = reprlib.repr(version)
-        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {shown}; {_EXPORT_AGAIN}")
-    if version > SCHEMA_VERSION:
-        raise BundleError(
-            f"{manifest}: schema_version {reprlib.repr(version)} is newer than {SCHEMA_VERSION}, which this version "
-            "reads; upgrade with `pip install --upgrade asca-pillars`"
-        )
-    if version < 2:
-        raise BundleError(f"{manifest}: schema_version {reprlib.repr(version)} is no longer read; {_EXPORT_AGAIN}")
-    return dict(data)
-
-
-def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        twice = next(key for number, (key, _) in enumerate(pairs) if key in dict(pairs[:number]))
-        raise ValueError(f"key `{printable(twice, _LONGEST_REASON)}` is there twice")
-    return found
-
-
-def _no_number(word: str) -> Any:
-    raise ValueError(f"{word} is no number")
+        raise BundleError(f"{manifest}: `refine.seen.proposals.quotas` has not one for each class; {EXPORT_AGAIN}")
 
 
 def _blamed(manifest: Path, error: AscaError) -> str:
     reason = str(error).removeprefix(f"{manifest}: ")
-    return f"{manifest}: {printable(reason, _LONGEST_REASON)}"
-
-
-def _first_difference(written: Any, understood: Any) -> str | None:
-    """Path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
-
-    A key that is understood as None need not be written: bundles made before there was such a key lack it.
-    """
-    if isinstance(understood, dict):
-        if not isinstance(written, dict):
-            return "*"
-        for key, value in understood.items():
-            if key not in written and value is None:
-                continue
-            if key not in written:
-                return str(key)
-            if inner := _first_difference(written[key], value):
-                return key if inner == "*" else f"{key}.{inner}"
-        return None
-    if isinstance(understood, list):
-        if not isinstance(written, list) or len(written) != len(understood):
-            return "*"
-        for index, (ours, theirs) in enumerate(zip(written, understood, strict=True)):
-            if inner := _first_difference(ours, theirs):
-                return str(index) if inner == "*" else f"{index}.{inner}"
-        return None
-    if isinstance(understood, float) and type(written) is int:
-        return None if written == understood else "*"
-    return None if type(written) is type(understood) and written == understood else "*"
+    return f"{manifest}: {printable(reason, LONGEST_REASON)}"
 
 
 def _verify_graph(folder: Path, graph: GraphFile, stamped: dict[str, Any]) -> None:
     """Raise BundleError unless the file is there, whole, complete in itself, and stamped with these values."""
     path = folder / graph.file
     if not path.is_file():
-        raise BundleError(f"{path} is missing; copy the whole folder, or {_EXPORT_AGAIN}")
+        raise BundleError(f"{path} is missing; copy the whole folder, or {EXPORT_AGAIN}")
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -278,20 +195,20 @@ def _verify_graph(folder: Path, graph: GraphFile, stamped: dict[str, Any]) -> No
     if found != graph.sha256:
         raise BundleError(
             f"{path} is damaged or belongs to another bundle: its SHA-256 is {found[:12]}..., {MANIFEST} says"
-            f" {graph.sha256[:12]}...; copy the whole folder again, or {_EXPORT_AGAIN}"
+            f" {graph.sha256[:12]}...; copy the whole folder again, or {EXPORT_AGAIN}"
         )
     try:
         metadata = read_metadata(content)
         if has_external_data(content):
-            raise BundleError(f"{path} keeps weights in another file, which no SHA-256 covers; {_EXPORT_AGAIN}")
+            raise BundleError(f"{path} keeps weights in another file, which no SHA-256 covers; {EXPORT_AGAIN}")
         for key, value in stamped.items():
             if key not in metadata or _canonical(json.loads(metadata[key])) != _canonical(value):
                 raise BundleError(
                     f"{folder / MANIFEST}: `{key}` is not the one that {graph.file} was exported with; "
-                    f"copy the whole folder again, or {_EXPORT_AGAIN}"
+                    f"copy the whole folder again, or {EXPORT_AGAIN}"
                 )
     except (ValueError, RecursionError) as error:
-        raise BundleError(f"{path} is damaged ({printable(str(error), _LONGEST_REASON)}); {_EXPORT_AGAIN}") from None
+        raise BundleError(f"{path} is damaged ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}") from None
 
 
 def _canonical(value: Any) -> str:

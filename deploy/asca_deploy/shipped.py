@@ -5,7 +5,8 @@ from importlib import resources
 from pathlib import Path
 
 from asca_deploy.bundle import MANIFEST, WEIGHTS
-from asca_deploy.manifest import load_bundle, refuse_run_folder
+from asca_deploy.manifest import load_bundle
+from asca_deploy.manifest_file import refuse_run_folder
 from asca_pillars.errors import BundleError
 
 

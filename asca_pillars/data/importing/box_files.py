@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from asca_pillars.data.boxes.box_split import BoxDataset, find_frames
+from asca_pillars.data.boxes.box_frames import find_frames
+from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.schema import parse, to_dict

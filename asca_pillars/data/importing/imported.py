@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import yaml
 
+from asca_pillars.data.boxes.box_frames import DATASET_FILE, frame_id_of
 from asca_pillars.data.boxes.box_records import BoxRecords, json_line
-from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, frame_id_of
+from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.kitti import write_image_set
 from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import ConfigError, DatasetError, OutputError

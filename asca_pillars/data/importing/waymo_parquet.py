@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
-from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
+from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
 from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points

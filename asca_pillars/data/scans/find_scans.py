@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from asca_pillars.errors import ScanError
+from asca_pillars.files import is_hidden
 
 SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
 PREPARED_FILE = "README.txt"
@@ -60,7 +61,7 @@ def files_below(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
     """The files in a folder whose names match, sorted; hidden ones are other programs', or left by a killed writer."""
-    return sorted(path for path in folder.glob(pattern) if not path.name.startswith("."))
+    return sorted(path for path in folder.glob(pattern) if not is_hidden(Path(path.name)))
 
 
 def _is_prepared(folder: Path) -> bool:
@@ -104,7 +105,7 @@ def is_scan(relative: Path) -> bool:
     """Whether it is a scan by its name; `relative` to the folder that is searched."""
     if relative.suffix.lower() == ".feather" and not relative.stem.isdecimal():
         return False  # Argoverse 2 names sweeps by their time; its labels and poses are feather files too
-    return relative.suffix.lower() in SCAN_SUFFIXES and not any(part.startswith(".") for part in relative.parts)
+    return relative.suffix.lower() in SCAN_SUFFIXES and not is_hidden(relative)
 
 
 def natural_order(path: Path) -> list[list[tuple[int, str]]]:

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import FIELDS
-from asca_pillars.data.boxes.box_split import DATASET_FILE
 from asca_pillars.data.kitti import in_image, write_image_set
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.files import atomic_path, write_json

@@ -20,7 +20,7 @@ from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.data.training_frames import open_frames
-from asca_pillars.errors import ConfigError, DatasetError
+from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.schema import to_dict
@@ -29,11 +29,6 @@ from tests.scenes import SPEC, make_scene, write_dataset
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))
-
-
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    return write_box_dataset(tmp_path / "own", 4)
 
 
 def test_the_layout_tells_the_reader(root: Path, tmp_path: Path) -> None:
@@ -51,37 +46,6 @@ def test_a_frame_holds_its_points_and_boxes(root: Path) -> None:
     assert split.label_types("000001") == ["Car", "Forklift"]
 
 
-def test_a_file_for_each_frame_gives_the_same(root: Path) -> None:
-    lines = (root / "labels.jsonl").read_text().splitlines()
-    (root / "labels").mkdir()
-    for number, line in enumerate(lines):
-        (root / "labels" / f"{number:06d}.json").write_text(line)
-    (root / "dataset.yaml").write_text("labels: labels\n")
-    split = BoxSplit(root)
-    assert split.frame_ids == tuple(f"{number:06d}" for number in range(4))
-    (root / "dataset.yaml").write_text("labels: labels.jsonl\n")
-    for frame_id in split.frame_ids:
-        assert np.array_equal(split.labeled_boxes(frame_id).boxes, BoxSplit(root).labeled_boxes(frame_id).boxes)
-
-
-def test_with_a_csv_scans_without_a_row_are_frames_without_objects(root: Path) -> None:
-    (root / "labels.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n000002.bin,Car,10,0,-1,4,2,1.5,0\n")
-    (root / "dataset.yaml").write_text("labels: labels.csv\n")
-    split = BoxSplit(root, "train")
-    assert [len(split.labeled_boxes(frame_id).boxes) for frame_id in split.frame_ids] == [0, 0, 1]
-
-
-def test_scans_that_are_no_folder_or_of_one_name_are_named(root: Path) -> None:
-    (root / "labels.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n000002.bin,Car,10,0,-1,4,2,1.5,0\n")
-    (root / "dataset.yaml").write_text("labels: labels.csv\nscans: scans/000000.bin\n")
-    with pytest.raises(DatasetError, match=r"000000\.bin: no such folder"):
-        BoxSplit(root).frame_ids  # noqa: B018
-    (root / "dataset.yaml").write_text("labels: labels.csv\n")
-    np.save(root / "scans" / "000001.npy", np.zeros((5, 4), np.float32))
-    with pytest.raises(DatasetError, match=r"000001\.bin and .*000001\.npy: both would be frame 000001; rename one"):
-        BoxSplit(root).frame_ids  # noqa: B018
-
-
 def test_a_scale_left_open_is_part_of_what_points_depend_on(root: Path) -> None:
     (root / "dataset.yaml").write_text("reflectance_scale: auto\n")
     before = BoxSplit(root).points_state("000000")
@@ -92,23 +56,6 @@ def test_a_scale_left_open_is_part_of_what_points_depend_on(root: Path) -> None:
         write_scan(path, points)
     after = BoxSplit(root)
     assert after.points("000000")[:, 3].max() < 0.1 and after.points_state("000000") != before
-
-
-def test_a_line_may_name_its_scan_from_elsewhere(root: Path) -> None:
-    labels = root / "labels.jsonl"
-    labels.write_text(labels.read_text().replace('"scan": "', f'"scan": "{root}/scans/'))
-    assert len(BoxSplit(root).frame_ids) == 4
-
-
-def test_scans_may_lie_anywhere_and_in_folders(root: Path, tmp_path: Path) -> None:
-    (tmp_path / "drive" / "a").mkdir(parents=True)
-    for path in (root / "scans").iterdir():
-        path.rename(tmp_path / "drive" / "a" / path.name)
-    labels = root / "labels.jsonl"
-    labels.write_text(labels.read_text().replace('"scan": "', '"scan": "a/'))
-    (root / "dataset.yaml").write_text(f"scans: {tmp_path / 'drive'}\n")
-    split = BoxSplit(root)
-    assert split.frame_ids[0] == "a/000000" and len(split.points("a/000000")) > 1000
 
 
 def test_points_are_turned_and_scaled_as_the_dataset_says(root: Path) -> None:
@@ -143,22 +90,6 @@ def test_the_mounting_has_the_words_of_the_options(root: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"scan": "9.bin", "boxes": []}', r"labels\.jsonl:1: no scan 9\.bin below .*correct the name"),
-        ('{"scan": "../000000.bin", "boxes": []}', r"labels\.jsonl:1: no scan"),
-        ('{"scan": "000000.bin", "boxes": []}\n' * 2, r"labels\.jsonl:2: 000000\.bin has labels in .*jsonl:1 already"),
-        ("", r"labels\.jsonl: no frame in it"),
-        ('{"scan": "000000.bin", "boxes": []}', r"000001: listed in ImageSets/train\.txt, but .* has no such frame"),
-    ],
-)
-def test_wrong_labels_are_named(root: Path, text: str, message: str) -> None:
-    (root / "labels.jsonl").write_text(text)
-    with pytest.raises(DatasetError, match=message):
-        BoxSplit(root, "train").frame_ids  # noqa: B018
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
         ("scan: x", "scans"),
         ("columns: 2", "columns 2"),
         ("reflectance_scale: 0", "must be positive"),
@@ -170,14 +101,6 @@ def test_wrong_labels_are_named(root: Path, text: str, message: str) -> None:
 def test_wrong_settings_are_named(root: Path, text: str, message: str) -> None:
     (root / "dataset.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        BoxSplit(root).frame_ids  # noqa: B018
-
-
-def test_per_frame_labels_need_their_scan(root: Path) -> None:
-    (root / "labels").mkdir()
-    (root / "labels" / "9.json").write_text('{"boxes": []}')
-    (root / "dataset.yaml").write_text("labels: labels\n")
-    with pytest.raises(DatasetError, match=r"9\.json: belongs to one scan .* there is none"):
         BoxSplit(root).frame_ids  # noqa: B018
 
 
