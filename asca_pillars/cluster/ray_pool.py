@@ -64,7 +64,7 @@ class RayPool(Generic[Result]):
         # No retries of Ray's own: a shard that ends its worker every time has to be noticed.
         options = {"num_cpus": cpus, "num_gpus": gpus, "max_retries": 0}
         self._task = ray.remote(_on_worker).options(**options)
-        self._job, self._seen, self._cpus = job, seen.absolute(), cpus
+        self._job, self._seen, self._cpus, self._gpus = job, seen.absolute(), cpus, gpus
         self._running: dict[Any, Shard] = {}
         self._limit, self._limit_until = 0, 0.0
 
@@ -77,6 +77,13 @@ class RayPool(Generic[Result]):
             self._limit = max(_LEAST_IN_FLIGHT, 2 * int(workers))
             self._limit_until = time.monotonic() + _RESOURCES_HOLD_S
         return len(self._running) < self._limit
+
+    def fits(self) -> bool:
+        """Whether a machine of the cluster is large enough for a job; if not, jobs wait until one joins."""
+        import ray
+
+        resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        return any(one.get("CPU", 0) >= self._cpus and one.get("GPU", 0) >= self._gpus for one in resources)
 
     def submit(self, shard: Shard) -> None:
         """Begin a shard, or let it wait for a free worker."""

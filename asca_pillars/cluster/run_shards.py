@@ -52,7 +52,13 @@ def run_shards(
             console.print(cluster, highlight=False)
             total = done + sum(len(shard.items) for shard in shards)
             task = bar.add_task(title, total=total, completed=done)
-            for outcome in work_off(shards, RayPool(job, seen, cpus=cpus, gpus=gpus)):
+            pool = RayPool(job, seen, cpus=cpus, gpus=gpus)
+            if not pool.fits():
+                needed = f"{cpus} CPUs" + (f" and {gpus} GPU" if gpus else "")
+                console.print(
+                    f"no machine of the cluster has {needed}, which each worker takes: waiting for one to join"
+                )
+            for outcome in work_off(shards, pool):
                 bar.advance(task, len(outcome.shard.items))
                 yield outcome
     finally:

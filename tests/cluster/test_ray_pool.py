@@ -100,6 +100,14 @@ def test_each_item_is_done(cluster: Any, tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir()} == set("01234"), "and what a killed writer left is gone"
 
 
+@pytest.mark.filterwarnings("default")
+def test_a_job_that_no_machine_is_large_enough_for_is_noticed(cluster: Any, tmp_path: Path) -> None:
+    with ray_pool.connected(cluster.address):
+        assert ray_pool.RayPool(partial(touch, tmp_path), tmp_path, cpus=1).fits()
+        assert not ray_pool.RayPool(partial(touch, tmp_path), tmp_path, cpus=2).fits(), "two machines of one CPU"
+        assert not ray_pool.RayPool(partial(touch, tmp_path), tmp_path, gpus=1).fits()
+
+
 def test_no_cluster_is_one_line() -> None:
     for address, reason in (("127.0.0.1:9", "refused"), ("nonsense", "Invalid address")):
         named = rf"--cluster {address}: .*{reason}.*; give HOST:PORT"
