@@ -93,38 +93,31 @@ def evaluate(
     from rich.console import Console
 
     from asca_pillars.commands import eval_steps as steps
+    from asca_pillars.commands.eval_arguments import EvalArguments, check_arguments, default_protocol
     from asca_pillars.commands.eval_files import claim
     from asca_pillars.commands.models import open_model
     from asca_pillars.data.kitti import KittiSplit
-    from asca_pillars.errors import ConfigError
     from asca_pillars.evaluation.predictions import read_predictions, read_truth
 
     console = Console(markup=False)
-    if protocol is None:
-        protocol = steps.default_protocol(data)
+    protocol = protocol or default_protocol(data)
     options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
-    if predictions is not None:
-        steps.check_of_a_model(predictions, options, min_score)
-    if split is not None and data is None:
-        raise ConfigError(f"--split {split} is a list of the frames of a dataset: give --data ROOT, too")
+    given = EvalArguments(protocol, model, data, split, predictions, labels, gallery, score, min_score, around)
+    check_arguments(given, options)
     split = "val" if split is None else split
     if protocol == "tracking":
-        from asca_pillars.commands.eval_tracks import check_arguments, evaluate_tracks
+        from asca_pillars.commands.eval_tracks import evaluate_tracks
 
-        check_arguments(model, labels, gallery, score, around=around)
+        assert data is not None and predictions is not None, "checked with the arguments"
         evaluate_tracks(data, split, predictions, out, json, console)
         return
     if protocol in ("iou", "distance"):
-        from asca_pillars.commands import eval_boxes
+        from asca_pillars.commands.eval_boxes import BoxTask, evaluate_boxes
 
-        box_task = eval_boxes.BoxTask(protocol, data, split, out, json, score, min_score, around)
-        eval_boxes.check_arguments(box_task, model, predictions, labels, gallery)
-        eval_boxes.evaluate_boxes(box_task, options, predictions, console)
+        assert data is not None, "checked with the arguments"
+        box_task = BoxTask(protocol, data, split, out, json, score, min_score, around)
+        evaluate_boxes(box_task, options, predictions, console)
         return
-    if around:
-        raise ConfigError("--around needs labels in every direction: give --protocol iou or distance, too")
-    steps.check_arguments(model, data, predictions, labels, gallery, score)
-    steps.check_protocol(protocol, data, gallery, score)
     claim(out, json)
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 
 from asca_pillars.commands.eval_files import COMMAND, MADE_BY, claim, write_report
-from asca_pillars.commands.eval_steps import TEXT_SCORE, check_score, model_scores, warn_of_unlike_scans
+from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.data.boxes.box_split import BoxSplit
@@ -29,7 +29,7 @@ class BoxTask:
     """What is evaluated, how, and where the report goes; the options of `asca eval` by the same names."""
 
     protocol: BoxProtocol
-    data: Path | None
+    data: Path
     split: str
     out: Path
     json: Path | None
@@ -38,27 +38,8 @@ class BoxTask:
     around: bool
 
 
-def check_arguments(
-    task: BoxTask, model: Path | None, predictions: Path | None, labels: Path | None, gallery: int | None
-) -> None:
-    """Refuse options that do not go together, with a ConfigError."""
-    option = f"--protocol {task.protocol}"
-    if task.data is None:
-        raise ConfigError(f"{option} needs the labels: give --data ROOT")
-    if predictions is not None and model is not None:
-        raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
-    if task.around and predictions is not None:
-        raise ConfigError("--around runs a model; predictions are scored as they are: leave one of them out")
-    if labels is not None:
-        raise ConfigError(f"--labels {labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
-    if gallery:
-        raise ConfigError(f"--gallery {gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes")
-    check_score(task.score)
-
-
 def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | None, console: Console) -> None:
     """Evaluate by IoU or by distance; print and write the tables, the JSON, and the model's predictions."""
-    assert task.data is not None, "checked with the arguments"
     claim(task.out, task.json)
     split = open_split(task.data, task.split)
     about: dict[str, Any] = {"data": str(task.data), "split": task.split}

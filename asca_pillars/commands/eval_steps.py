@@ -1,6 +1,5 @@
 """The steps of `asca eval`: what goes together, running the model, reports and pictures."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,9 +9,7 @@ from rich.console import Console
 from asca_pillars.commands.eval_files import COMMAND, MADE_BY, write_report
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model
-from asca_pillars.commands.options import MIN_SCORE, RuntimeOptions
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
@@ -54,63 +51,6 @@ def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: 
     scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE if score is None else score)
     about = {"predictions": str(predictions), "labels": str(labels)}
     return Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid().ranges, scores, about)
-
-
-def check_arguments(
-    model: Path | None,
-    data: Path | None,
-    predictions: Path | None,
-    labels: Path | None,
-    gallery_frames: int | None,
-    score: float | None,
-) -> None:
-    """Refuse options that do not go together, with a ConfigError."""
-    if predictions is not None and model is not None:
-        raise ConfigError(f"{model} and --predictions {predictions}: give a model or its predictions, not both")
-    if predictions is None and labels is not None:
-        raise ConfigError(f"--labels {labels} goes with --predictions DIR; a model is run on --data ROOT")
-    if predictions is None and data is None:
-        raise ConfigError("nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR")
-    if predictions is not None and labels is None and data is None:
-        raise ConfigError(f"--predictions {predictions} needs --labels DIR, or --data ROOT that has the labels")
-    if gallery_frames and data is None:
-        raise ConfigError(f"--gallery {gallery_frames} draws scans: give --data ROOT that has them")
-    check_score(score)
-
-
-def check_score(score: float | None) -> None:
-    """Refuse a --score that is no number; what predictions from elsewhere call a score may be any."""
-    if score is not None and not math.isfinite(score):
-        raise ConfigError(f"--score {score} must be a number")
-
-
-def check_of_a_model(predictions: Path, options: RuntimeOptions, min_score: float) -> None:
-    """Refuse what changes a model's boxes, where none is run; ConfigError names the first such option."""
-    plain = RuntimeOptions()
-    given = {
-        f"--provider {options.provider}": options.provider != plain.provider,
-        f"--precision {options.precision}": options.precision != plain.precision,
-        f"--threads {options.threads}": options.threads != plain.threads,
-        f"--min-score {min_score:g}": min_score != MIN_SCORE,
-    }
-    if options_given := [name for name, differs in given.items() if differs]:
-        raise ConfigError(
-            f"{options_given[0]} is for running a model; --predictions {predictions} are scored as they are"
-        )
-
-
-def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
-    """KITTI's, unless the dataset has no camera."""
-    return "kitti" if data is None or isinstance(open_split(data), KittiSplit) else "iou"
-
-
-def check_protocol(protocol: str, data: Path | None, gallery_frames: int | None, score: float | None) -> None:
-    """Refuse data without a camera, or options of the other protocol, with a ConfigError."""
-    if data is not None and not isinstance(open_split(data), KittiSplit):
-        raise ConfigError(f"--protocol {protocol}: {data} has no camera, which it needs; choose iou or distance")
-    if protocol == "waymo" and (gallery_frames or score is not None):
-        option = f"--gallery {gallery_frames}" if gallery_frames else f"--score {score:g}"
-        raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
 
 
 def check_classes(task: Task, frames: ScoredFrames) -> None:

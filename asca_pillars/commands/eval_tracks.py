@@ -18,34 +18,14 @@ from asca_pillars.evaluation.tracking.tracking_report import (
 from asca_pillars.system import describe_environment
 
 
-def check_arguments(
-    model: Path | None, labels: Path | None, gallery: int | None, score: float | None, *, around: bool
-) -> None:
-    """Refuse options of other protocols, with a ConfigError."""
-    if model is not None:
-        raise ConfigError(f"{model}: --protocol tracking runs no model; give --predictions, of asca detect --track")
-    if around:
-        raise ConfigError("--around runs a model; --protocol tracking scores tracks as they are: leave it out")
-    if labels is not None:
-        raise ConfigError(f"--labels {labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
-    if gallery:
-        raise ConfigError(f"--gallery {gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes")
-    if score is not None:
-        raise ConfigError(
-            f"--score {score:g}: --protocol tracking goes over all tracks; give it to asca detect --track"
-        )
-
-
 def evaluate_tracks(
-    data: Path | None, split: str, predictions: Path | None, out: Path, json_path: Path | None, console: Console
+    data: Path, split: str, predictions: Path, out: Path, json_path: Path | None, console: Console
 ) -> None:
     """Score tracks; print and write the table and the JSON.
 
     Raises:
-        AscaError: an option is missing, or a file cannot be read.
+        AscaError: a file cannot be read, or has no identities.
     """
-    if data is None or predictions is None:
-        raise ConfigError("--protocol tracking: give --data ROOT and --predictions, the output of asca detect --track")
     labels = open_split(data, split)
     if not isinstance(labels, BoxSplit):
         raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")

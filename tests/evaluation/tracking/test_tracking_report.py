@@ -216,7 +216,7 @@ def test_what_cannot_be_scored_is_refused(drives: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no line belongs to a frame"):
         score(drives, tmp_path, [{"scan": "elsewhere.bin", "time_s": 1e9, "boxes": []}])
     with pytest.raises(ConfigError, match="give --data"):
-        evaluate_tracks(None, "val", None, tmp_path, None, None)  # type: ignore[arg-type]
+        CliRunner().invoke(app, ["eval", "--protocol", "tracking"], catch_exceptions=False)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,121 @@
+"""Which options of `asca eval` go together."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from asca_pillars.commands.options import MIN_SCORE, RuntimeOptions
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
+from asca_pillars.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class EvalArguments:
+    """What is evaluated and on what; the options of `asca eval` by the same names."""
+
+    protocol: str
+    model: Path | None
+    data: Path | None
+    split: str | None
+    predictions: Path | None
+    labels: Path | None
+    gallery: int | None
+    score: float | None
+    min_score: float
+    around: bool
+
+
+def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
+    """KITTI's, unless the dataset has no camera."""
+    return "kitti" if data is None or isinstance(open_split(data), KittiSplit) else "iou"
+
+
+def check_arguments(given: EvalArguments, options: RuntimeOptions) -> None:
+    """Refuse options that do not go together, with a ConfigError that says which and what to do."""
+    if given.predictions is not None:
+        _check_no_runtime(given.predictions, options, given.min_score)
+    if given.split is not None and given.data is None:
+        raise ConfigError(f"--split {given.split} is a list of the frames of a dataset: give --data ROOT, too")
+    if given.protocol == "tracking":
+        _check_tracking(given)
+        return
+    if given.predictions is not None and given.model is not None:
+        raise ConfigError(
+            f"{given.model} and --predictions {given.predictions}: give a model or its predictions, not both"
+        )
+    if given.protocol in ("iou", "distance"):
+        _check_boxes(given)
+    else:
+        _check_kitti(given)
+    if given.score is not None and not math.isfinite(given.score):
+        raise ConfigError(f"--score {given.score} must be a number")  # predictions from elsewhere may call any a score
+
+
+def _check_no_runtime(predictions: Path, options: RuntimeOptions, min_score: float) -> None:
+    plain = RuntimeOptions()
+    given = {
+        f"--provider {options.provider}": options.provider != plain.provider,
+        f"--precision {options.precision}": options.precision != plain.precision,
+        f"--threads {options.threads}": options.threads != plain.threads,
+        f"--min-score {min_score:g}": min_score != MIN_SCORE,
+    }
+    if options_given := [name for name, differs in given.items() if differs]:
+        raise ConfigError(
+            f"{options_given[0]} is for running a model; --predictions {predictions} are scored as they are"
+        )
+
+
+def _check_tracking(given: EvalArguments) -> None:
+    if given.model is not None:
+        raise ConfigError(
+            f"{given.model}: --protocol tracking runs no model; give --predictions, of asca detect --track"
+        )
+    if given.around:
+        raise ConfigError("--around runs a model; --protocol tracking scores tracks as they are: leave it out")
+    _check_no_text(given)
+    if given.score is not None:
+        raise ConfigError(
+            f"--score {given.score:g}: --protocol tracking goes over all tracks; give it to asca detect --track"
+        )
+    if given.data is None or given.predictions is None:
+        raise ConfigError("--protocol tracking: give --data ROOT and --predictions, the output of asca detect --track")
+
+
+def _check_boxes(given: EvalArguments) -> None:
+    if given.data is None:
+        raise ConfigError(f"--protocol {given.protocol} needs the labels: give --data ROOT")
+    if given.around and given.predictions is not None:
+        raise ConfigError("--around runs a model; predictions are scored as they are: leave one of them out")
+    _check_no_text(given)
+
+
+def _check_no_text(given: EvalArguments) -> None:
+    """What only labels as KITTI text have."""
+    if given.labels is not None:
+        raise ConfigError(f"--labels {given.labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
+    if given.gallery:
+        raise ConfigError(
+            f"--gallery {given.gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes"
+        )
+
+
+def _check_kitti(given: EvalArguments) -> None:
+    if given.around:
+        raise ConfigError("--around needs labels in every direction: give --protocol iou or distance, too")
+    if given.predictions is None and given.labels is not None:
+        raise ConfigError(f"--labels {given.labels} goes with --predictions DIR; a model is run on --data ROOT")
+    if given.predictions is None and given.data is None:
+        raise ConfigError("nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR")
+    if given.predictions is not None and given.labels is None and given.data is None:
+        raise ConfigError(f"--predictions {given.predictions} needs --labels DIR, or --data ROOT that has the labels")
+    if given.gallery and given.data is None:
+        raise ConfigError(f"--gallery {given.gallery} draws scans: give --data ROOT that has them")
+    if given.data is not None and not isinstance(open_split(given.data), KittiSplit):
+        raise ConfigError(
+            f"--protocol {given.protocol}: {given.data} has no camera, which it needs; choose iou or distance"
+        )
+    if given.protocol == "waymo" and (given.gallery or given.score is not None):
+        option = f"--gallery {given.gallery}" if given.gallery else f"--score {given.score:g}"
+        raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
