@@ -95,3 +95,15 @@ def test_a_scan_with_nothing_to_compute_has_no_roofline(tiny_bundle: Path, tmp_p
 def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:
     with pytest.raises(ConfigError, match="compared with itself"):
         CliRunner().invoke(app, ["bench", "--compare", "asca_sim_int8"], catch_exceptions=False)
+
+
+def test_of_many_scans_some_are_timed(
+    tiny_bundle: Path, scan: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asca_pillars.commands.bench.MOST_SCANS", 3)
+    for number in range(7):
+        write_scan(tmp_path / "scans" / f"{number}.bin", scan[: 1000 - number])
+    command = ["bench", str(tmp_path / "scans"), "-b", str(tiny_bundle), "--rounds", "1", "--json"]
+    result = CliRunner().invoke(app, [*command, str(tmp_path / "report.json")], catch_exceptions=False)
+    assert "timing 3 of the 7 scans, evenly spaced" in result.output and "3 scan(s)" in result.output
+    assert json.loads((tmp_path / "report.json").read_text())["points"] == [1000, 997, 994]
