@@ -19,7 +19,7 @@ class DualAttention(nn.Module):
         half = max(channels // 2, 1)
         self.residual = residual
         self.channel_value = nn.Conv2d(channels, half, 1)
-        self.channel_query = nn.Conv2d(channels, 1, 1)
+        self.channel_query = nn.Conv2d(channels, 1, 1, bias=False)  # the softmax over places would not see a bias
         self.channel_out = nn.Linear(half, channels)
         self.channel_norm = nn.LayerNorm(channels)
         self.place_value = nn.Conv2d(channels, half, 1)

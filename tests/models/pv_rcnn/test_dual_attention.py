@@ -11,8 +11,8 @@ def by_hand(module: DualAttention, features: np.ndarray) -> np.ndarray:
     """Eq. (1)-(4) on one map (C, H, W), with loops over places."""
 
     def at(layer: torch.nn.Conv2d, value: np.ndarray) -> np.ndarray:
-        assert layer.bias is not None
-        return layer.weight[:, :, 0, 0].detach().numpy() @ value + layer.bias.detach().numpy()
+        bias = 0.0 if layer.bias is None else layer.bias.detach().numpy()
+        return np.asarray(layer.weight[:, :, 0, 0].detach().numpy() @ value + bias)
 
     places = [tuple(place) for place in np.ndindex(*features.shape[1:])]
     scores = np.array([at(module.channel_query, features[:, y, x])[0] for y, x in places])
