@@ -54,7 +54,7 @@ def run_shards(
             task = bar.add_task(title, total=total, completed=done)
             pool = RayPool(job, seen, cpus=cpus, gpus=gpus)
             if not pool.fits():
-                needed = f"{cpus} CPUs" + (f" and {gpus} GPU" if gpus else "")
+                needed = f"{cpus} CPU{'s'[: cpus > 1]}" + (" and a GPU" if gpus else "")
                 console.print(
                     f"no machine of the cluster has {needed}, which each worker takes: waiting for one to join"
                 )

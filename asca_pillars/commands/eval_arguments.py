@@ -50,7 +50,7 @@ def check_arguments(given: EvalArguments, options: RuntimeOptions) -> None:
     else:
         _check_kitti(given)
     if given.score is not None and not math.isfinite(given.score):
-        raise ConfigError(f"--score {given.score} must be a number")  # predictions from elsewhere may call any a score
+        raise ConfigError(f"--score {given.score} must be a number")  # any: predictions from elsewhere may hold logits
 
 
 def _check_no_runtime(predictions: Path, options: RuntimeOptions, min_score: float) -> None:

@@ -48,18 +48,9 @@ class SetAbstraction(nn.Module):
         found = (indices[:, :1] < positions.shape[0]).to(points.dtype)
         centers = F.linear(queries, first[:, :3]) * found  # (Q, widths[0])
         grouped = points.index_select(0, indices.reshape(-1)).unflatten(0, indices.shape) - centers[:, None]
-        return self._after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape)
+        return self.after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape)
 
-    def naive(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """`forward` as the equation is printed: the first layer once for each pair."""
-        rows = F.pad(torch.cat([positions, features], dim=1), (0, 0, 0, 1))
-        grouped = rows[indices]  # (Q, T, 3 + C)
-        found = (indices < positions.shape[0]).to(rows.dtype)[..., None]
-        relative = (grouped[..., :3] - queries[:, None]) * found
-        pairs = torch.cat([relative, grouped[..., 3:]], dim=2).flatten(0, 1)
-        return self._after_first(self.layers[0](pairs)).unflatten(0, indices.shape).max(dim=1).values
-
-    def _after_first(self, pairs: Tensor) -> Tensor:
+    def after_first(self, pairs: Tensor) -> Tensor:
         """What the first layer gives -> what the last one gives, both (Q * T, channels)."""
         pairs = torch.relu(self.norms[0](pairs))
         for layer, norm in zip(self.layers[1:], self.norms[1:], strict=True):
