@@ -19,7 +19,7 @@ def evaluate(
     model: Annotated[
         Path | None,
         typer.Argument(
-            help="Bundle (folder, or name of one that ships) or checkpoint (.ckpt). Default: the one that ships first."
+            help="Bundle (folder, or name of one that ships) or checkpoint (.ckpt). Default: asca_sim_int8."
         ),
     ] = None,
     *,
