@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
 
 from asca_deploy.bundle import (
     BACKBONE,
@@ -27,7 +26,7 @@ from asca_deploy.bundle import (
 from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.pillar_pipeline import PillarPipeline
 from asca_export import graphs
-from asca_export.fast_forms import FastBackbone
+from asca_export.fast_forms import FastBackbone, fast_encoder
 from asca_export.int8 import calibration_scans, quantize_bundle
 from asca_export.masked_forms import MarkedEncoder, MaskedBackbone
 from asca_export.parity import prove_parity
@@ -211,8 +210,8 @@ def _export_graphs(
 ) -> float:
     """Write both graphs; the backbone's multiply-accumulates, 10^9, of a sparse neck in the mean over the scans."""
     preparation = detector.preparation
-    encode: nn.Module = MarkedEncoder(detector.encode) if dense_neck else detector.encode
-    graphs.export_encoder(encode, graphs.graph_path(folder, ENCODER))
+    encode = fast_encoder(detector.encode)
+    graphs.export_encoder(MarkedEncoder(encode) if dense_neck else encode, graphs.graph_path(folder, ENCODER))
     path = graphs.graph_path(folder, BACKBONE)
     if dense_neck or preparation.active_cells is None:
         dense = MaskedBackbone(detector) if dense_neck else FastBackbone(detector)

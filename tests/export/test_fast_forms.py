@@ -2,19 +2,41 @@
 
 from pathlib import Path
 
+import onnx
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional
 
 from asca_export import graphs
-from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone, Upsample
+from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone, FastEncoder, Upsample, fast_encoder
+from asca_pillars.pillar_config import CpaReading
 from tests.export.tiny import tiny_detector
 
 
 def padded(image: torch.Tensor) -> torch.Tensor:
     """(1, C, ny, nx) -> the canvas (1, ny + 1, nx + 1, C) with zeros in its first row and column."""
     return functional.pad(image, (1, 0, 1, 0)).permute(0, 2, 3, 1)
+
+
+@pytest.mark.parametrize("cpa", ["none", "channel", "paper"])
+@torch.no_grad()
+def test_the_maximum_before_bias_and_relu(cpa: CpaReading, tmp_path: Path) -> None:
+    encode = tiny_detector(cpa).encode
+    fast = fast_encoder(encode)
+    assert isinstance(fast, FastEncoder)
+    counts = torch.tensor([1, 4, 2, 32, 1])
+    points = torch.randn(40, 9) * 3
+    given = (points, torch.arange(5).repeat_interleave(counts), counts)
+    torch.testing.assert_close(fast(*given), encode(*given), atol=1e-5, rtol=1e-5)
+    graphs.export_encoder(fast, tmp_path / "encoder.onnx")
+    operators = [node.op_type for node in onnx.load(tmp_path / "encoder.onnx").graph.node]
+    assert operators.index("MatMul") < operators.index("ScatterND") < operators.index("Relu")
+
+
+def test_an_encoder_that_needs_every_point_stays_as_it_is() -> None:
+    for encode in (tiny_detector("point").encode, tiny_detector("none", empty_slots=True).encode):
+        assert fast_encoder(encode) is encode
 
 
 @torch.no_grad()
@@ -56,6 +78,7 @@ def test_overlapping_outputs_are_no_depth_to_space() -> None:
 def test_the_detector_stays_as_it_was() -> None:
     detector = tiny_detector("none")
     before = {name: value.clone() for name, value in detector.state_dict().items()}
+    fast_encoder(detector.encode)
     FastBackbone(detector, CanvasSteps(torch.full((16,), 0.1), torch.full((16,), 9.0)))
     assert all(torch.equal(before[name], value) for name, value in detector.state_dict().items())
     assert detector.neck.get_submodule("blocks.0.0").padding == (1, 1)
