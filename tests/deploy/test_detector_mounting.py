@@ -100,7 +100,9 @@ def test_around_finds_in_each_quarter_what_a_turned_scan_has_ahead(tiny_bundle: 
 
 
 def test_a_turned_scan_gives_turned_boxes() -> None:
-    """To some centimeters: a ground that is estimated anew may pick other points of a full pillar.
+    """To three centimeters in float32: a ground that is estimated anew may pick other points of a full pillar.
+
+    In 8 bits that can choose another one of two nearly equal boxes of a car, 10 cm longer.
 
     On level ground: of a slope every pass is shown what the scan has ahead, and a turned scan has another way ahead.
     """
@@ -108,14 +110,14 @@ def test_a_turned_scan_gives_turned_boxes() -> None:
     plane = fit_ground_plane(points)
     assert plane is not None and plane.doubt is None
     points[:, 2] += points[:, :2] @ np.array(plane.normal[:2], np.float32) / plane.normal[2]
-    detector = Detector(view="around")
+    detector = Detector("asca_sim", view="around")
     assert detector.passes == 4
     turn = FrameChange.turn(np.pi / 2)
     expected, found = detector(points), detector(turn.points(points))
     assert len(expected) > 12
     turned, sure = turn.boxes(expected.boxes), expected.scores > 0.5  # others may fall below their threshold
     nearest = np.abs(found.boxes[None, :, :6] - turned[:, None, :6]).max(axis=2)
-    assert sure.sum() > 5 and (nearest.min(axis=1)[sure] < 0.1).all()
+    assert sure.sum() > 5 and (nearest.min(axis=1)[sure] < 0.03).all()
     np.testing.assert_allclose(found.scores[nearest.argmin(axis=1)][sure], expected.scores[sure], atol=0.05)
 
 
