@@ -10,6 +10,7 @@ from asca_pillars.data.corruption import corrupt_objects, lose_reflectance
 from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import bev_intersection
+from asca_pillars.geometry.rotations import transform_points
 
 OBJECT_TRIES = 10  # draws of one object's new pose before it stays where it is
 
@@ -63,8 +64,8 @@ def flip_y(frame: LabeledFrame) -> None:
 def rotate(frame: LabeledFrame, angle_rad: float) -> None:
     """Turn the frame, in place, counter-clockwise about the z axis."""
     rotation = _rotation(angle_rad)
-    frame.points[:, :2] = frame.points[:, :2] @ rotation.T
-    frame.boxes[:, :2] = frame.boxes[:, :2] @ rotation.T
+    for rows in (frame.points, frame.boxes):
+        transform_points(rows[:, :2], rotation, out=rows[:, :2])
     frame.boxes[:, 6] = wrap_angle(frame.boxes[:, 6] + np.float32(angle_rad))
 
 
@@ -90,7 +91,7 @@ def move_objects(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Gene
                 # Looked up only now: where labelled boxes overlap, a point goes with the first that takes it.
                 own = points_in_boxes(frame.points, frame.boxes[index : index + 1])[:, 0]
                 local = frame.points[own, :3] - frame.boxes[index, :3]
-                local[:, :2] = local[:, :2] @ _rotation(turn_rad).T
+                transform_points(local[:, :2], _rotation(turn_rad), out=local[:, :2])
                 frame.points[own, :3] = local + moved[:3]
                 frame.boxes[index] = moved
                 break

@@ -76,7 +76,8 @@ def _cut(xyz: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_
         return np.zeros(0, dtype=bool)
     if rng.random() < 0.5:
         center = xyz.mean(axis=0)  # angles against the object's own direction do not wrap
-        along, across = xyz[:, :2] @ center[:2], xyz[:, 1] * center[0] - xyz[:, 0] * center[1]
+        along = xyz[:, 0] * center[0] + xyz[:, 1] * center[1]
+        across = xyz[:, 1] * center[0] - xyz[:, 0] * center[1]
         angle = np.arctan2(across, along)
     else:
         angle = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ScanError
-from asca_pillars.geometry.common_plane import most_common_plane
+from asca_pillars.geometry.common_plane import most_common_plane, plane_heights
 
 NEAR_M = (3.0, 20.0)  # beyond the vehicle itself, before the beams become sparse
 CELL_M = 1.0
@@ -115,7 +115,7 @@ def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
         return None
     if (plane := most_common_plane(low, BAND_M)) is None:
         return None
-    above = low[:, 2] - low[:, :2] @ plane[:2] - plane[2]
+    above = low[:, 2] - plane_heights(plane, low)
     tilt = float(np.degrees(np.arctan(np.hypot(*plane[:2]))))
     share, below = float((np.abs(above) < BAND_M).mean()), float((above < -2 * BAND_M).mean())
     x, y, z = (np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(1 + np.square(plane[:2]).sum())).tolist()
@@ -127,7 +127,8 @@ def _low_points(points: NDArray[Any]) -> NDArray[np.float64]:
     xyz = points[:, :3].astype(np.float64)
     squared = np.square(xyz[:, :2]).sum(axis=1)
     near = xyz[(squared > NEAR_M[0] ** 2) & (squared < NEAR_M[1] ** 2)]
-    cells = np.floor(near[:, :2] / CELL_M).astype(np.int64) @ [1000, 1]
+    column, row = np.floor(near[:, :2] / CELL_M).astype(np.int64).T
+    cells = 1000 * column + row
     order = np.lexsort((near[:, 2], cells))
     _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
     return near[order[(first + count // 10)[count >= 3]]]

@@ -1,6 +1,7 @@
 """The plane that most of some points lie on, by RANSAC: a wall, cars and leaves among them do not move it."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 _DRAWS = 200
 _REFITS = 3
 _MIN_AREA_M2 = 10.0
+_MIN_SPREAD = 1e-9  # of points across a line through them, relative, squared
 
 
 def most_common_plane(
@@ -23,22 +25,54 @@ def most_common_plane(
         max_slope: a drawn plane that is steeper along x or y is none.
 
     Returns:
-        None where no draw is a plane that may be.
+        None where no draw is a plane that may be, or the points that lie on one are in a line.
     """
     if not len(points):
         return None
-    triples = points[np.random.default_rng(0).integers(0, len(points), (_DRAWS, 3))]
-    design = np.concatenate([triples[:, :, :2], np.ones((_DRAWS, 3, 1))], axis=2)
-    regular = np.abs(np.linalg.det(design)) > _MIN_AREA_M2  # of twice the triangle's area
-    planes = np.linalg.solve(design[regular], triples[regular, :, 2, None])[..., 0]
+    planes = _through_triples(points[np.random.default_rng(0).integers(0, len(points), (_DRAWS, 3))])
     planes = planes[(np.abs(planes[:, :2]) < max_slope).all(axis=1)]
     if not len(planes):
         return None
-    z, full = points[:, 2], np.column_stack([points[:, :2], np.ones(len(points))])
-    plane = planes[(np.abs(z - planes @ full.T) < band_m).sum(axis=1).argmax()]
+    x, y, z = np.ascontiguousarray(points.T)
+    heights = planes[:, :1] * x + planes[:, 1:2] * y + planes[:, 2:]
+    plane = planes[(np.abs(z - heights) < band_m).sum(axis=1).argmax()]
     for _ in range(_REFITS):
-        near = np.abs(z - full @ plane) < band_m
-        if near.sum() < 3:
+        near = np.abs(z - plane_heights(plane, points)) < band_m
+        refit = _least_squares(x[near], y[near], z[near])
+        if refit is None:
             return None
-        plane = np.linalg.lstsq(full[near], z[near], rcond=None)[0]
+        plane = refit
     return plane
+
+
+def plane_heights(plane: NDArray[np.float64], xy_m: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """z (...,) of a plane (3,) at (..., >=2), metres; no matrix product, see `rotations.transform_points`."""
+    a, b, c = plane.tolist()
+    return np.asarray(a * xy_m[..., 0].astype(np.float64) + b * xy_m[..., 1].astype(np.float64) + c)
+
+
+def _through_triples(triples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The planes (M, 3) through three points each, (n, 3, 3), of those that span some area seen from above."""
+    (x, y, z), u, v = triples[:, 0].T, (triples[:, 1] - triples[:, 0]).T, (triples[:, 2] - triples[:, 0]).T
+    area = u[0] * v[1] - u[1] * v[0]  # twice the triangle's
+    regular = np.abs(area) > _MIN_AREA_M2
+    divisor = area[regular]
+    a = (u[2] * v[1] - u[1] * v[2])[regular] / divisor
+    b = (u[0] * v[2] - u[2] * v[0])[regular] / divisor
+    return np.stack([a, b, z[regular] - a * x[regular] - b * y[regular]], axis=1)
+
+
+def _least_squares(
+    x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """The plane (3,) with the least squares of distances along z from points, (n,) each; None if they are in a line."""
+    if len(x) < 3:
+        return None
+    middle = x.mean(), y.mean(), z.mean()
+    x, y, z = x - middle[0], y - middle[1], z - middle[2]
+    xx, xy, yy, xz, yz = (x * x).sum(), (x * y).sum(), (y * y).sum(), (x * z).sum(), (y * z).sum()
+    divisor = xx * yy - xy * xy
+    if divisor <= _MIN_SPREAD * xx * yy:
+        return None
+    a, b = (xz * yy - yz * xy) / divisor, (yz * xx - xz * xy) / divisor
+    return np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])

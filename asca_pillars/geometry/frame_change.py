@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.rotations import transform_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +48,9 @@ class FrameChange:
 
         Of a row with a number that is not finite, x, y and z may all become not finite.
         """
-        changed = np.asarray(points, np.float32)
-        columns = changed.shape[1]
-        whole = np.zeros((columns, columns), np.float32)  # one matrix product of whole rows: several times as fast
-        whole[:3, :3] = self.axes.T
+        changed = np.array(points, np.float32, order="C")
         with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold lies outside every range
-            changed = changed @ whole
-            if self.shift_m.any():
-                changed[:, :3] += self.shift_m.astype(np.float32)
-        changed[:, 3:] = points[:, 3:]
+            transform_points(changed[:, :3], self.axes, self.shift_m, out=changed[:, :3])
         return changed
 
     def boxes(self, boxes: NDArray[Any]) -> NDArray[np.float32]:
@@ -63,9 +58,9 @@ class FrameChange:
 
         Exact where z stays vertical. A box has no tilt of its own: in a tilted frame it is off by the frame's tilt.
         """
-        centers = boxes[:, :3].astype(np.float64) @ self.axes.T + self.shift_m
+        centers = transform_points(boxes[:, :3].astype(np.float64), self.axes, self.shift_m)
         yaw = boxes[:, 6].astype(np.float64)
-        arrows = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) @ self.axes[:2, :2].T
+        arrows = transform_points(np.stack([np.cos(yaw), np.sin(yaw)], axis=1), self.axes[:2, :2])
         turned = wrap_angle(np.arctan2(arrows[:, 1], arrows[:, 0]).astype(np.float32))
         return np.concatenate([centers, boxes[:, 3:6], turned[:, None]], axis=1).astype(np.float32)
 

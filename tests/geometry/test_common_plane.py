@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.geometry.common_plane import most_common_plane
+from asca_pillars.geometry.common_plane import _least_squares, most_common_plane, plane_heights
 
 SLOPES = st.floats(-0.25, 0.25)
 
@@ -51,3 +51,19 @@ def test_points_without_a_plane() -> None:
     assert most_common_plane(line, 0.1) is None
     assert most_common_plane(steep, 0.1, max_slope=0.3) is None
     assert most_common_plane(steep, 0.1) == pytest.approx((0.5, 0, -5), abs=0.02)
+
+
+@given(SLOPES, SLOPES, st.floats(-3, 1), st.integers(3, 60))
+def test_the_plane_of_least_squares_is_numpys(a: float, b: float, c: float, count: int) -> None:
+    points = on_plane(np.random.default_rng(count), (a, b, c), count)
+    design = np.column_stack([points[:, :2], np.ones(count)])
+    expected = np.linalg.lstsq(design, points[:, 2], rcond=None)[0]
+    found = _least_squares(*points.T)
+    assert found is not None
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    np.testing.assert_allclose(plane_heights(found, points), design @ expected, atol=1e-8)
+
+
+def test_least_squares_of_points_in_a_line() -> None:
+    assert _least_squares(*np.linspace((0, 0, 1), (3, 5, 2), 9).T) is None
+    assert _least_squares(*np.zeros((3, 2))) is None

@@ -1,4 +1,4 @@
-"""Rotation matrices against scipy's, about every axis."""
+"""Rotation matrices against scipy's, about every axis; transformed points against the matrix product."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from asca_pillars.geometry.rotations import of_quaternions, of_roll_pitch_yaw
+from asca_pillars.geometry.rotations import of_quaternions, of_roll_pitch_yaw, transform_columns, transform_points
 
 quaternions = st.tuples(*[st.floats(-2, 2)] * 4)
 angles = st.tuples(*[st.floats(-7, 7)] * 3)
@@ -31,3 +31,24 @@ def test_roll_comes_first_and_yaw_last_about_axes_that_stand_still(drawn: list[t
 def test_what_is_no_rotation_does_not_look_like_one(quaternion: tuple[float, ...]) -> None:
     rotations = of_quaternions(np.array([quaternion, (1, 0, 0, 0)]))
     assert np.isnan(rotations[0]).all() and rotations[1].tolist() == np.eye(3).tolist()
+
+
+@given(st.integers(0, 3), st.integers(1, 3), st.integers(1, 3), st.sampled_from([np.float32, np.float64]))
+def test_points_are_transformed_as_by_a_product(count: int, given_axes: int, axes: int, kind: type) -> None:
+    rng = np.random.default_rng(count)
+    points = rng.uniform(-60, 60, (count, given_axes)).astype(kind)
+    matrix, shift = rng.normal(size=(axes, given_axes)), rng.normal(size=axes)
+    expected = points.astype(np.float64) @ matrix.T
+    for found, added in ((transform_points(points, matrix, shift), shift), (transform_points(points, matrix), 0.0)):
+        assert found.dtype == kind and found.shape == (count, axes)
+        np.testing.assert_allclose(found, expected + added, rtol=1e-5, atol=1e-4)
+    np.testing.assert_array_equal(transform_columns(points.T, matrix, shift), transform_points(points, matrix, shift).T)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_points_are_transformed_in_place(count: int) -> None:
+    points = np.random.default_rng(1).uniform(-60, 60, (count, 4)).astype(np.float32)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    expected = np.stack([-points[:, 1], points[:, 0], points[:, 2], points[:, 3]], axis=1)
+    transform_points(points[:, :3], turn, out=points[:, :3])
+    np.testing.assert_array_equal(points, expected)

@@ -15,6 +15,7 @@ from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import paired_bev_touch
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.rotations import transform_columns, transform_points
 
 PLACE_TRIES = 32  # places that are tried for one object
 CHECKED_PLACES = 4  # of those on free ground, looked at closely
@@ -111,8 +112,8 @@ class Rays:
                 continue
             cos, sin = math.cos(yaw), math.sin(yaw)
             into_box = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-            ray = into_box @ self._ends[:, near]
-            center = (into_box @ (x, y, z))[:, None]
+            ray = transform_columns(self._ends[:, near], into_box)
+            center = transform_columns(np.array([[x], [y], [z]]), into_box)
             ray[np.abs(ray) < 1e-9] = 1e-9
             half = np.array([[length], [width], [height]]) / 2
             one, other = (center - half) / ray, (center + half) / ray
@@ -172,7 +173,7 @@ def _turned(item: StoredObject, box: NDArray[np.float32], turn_rad: float) -> St
     """The object at its new box (7,), to which it was turned about the sensor's vertical axis."""
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     points = item.points.copy()
-    points[:, :2] = points[:, :2] @ np.array([[cos, sin], [-sin, cos]], dtype=np.float32)
+    transform_points(points[:, :2], np.array([[cos, -sin], [sin, cos]]), out=points[:, :2])
     points[:, 2] += box[2] - item.box[2]
     return StoredObject(box, item.label, points)
 

@@ -23,9 +23,9 @@ from asca_pillars.data.insertion.ground_fit import (
     Ground,
     fit_ground,
     order_by_cell,
-    plane_heights,
 )
 from asca_pillars.geometry.boxes import footprints
+from asca_pillars.geometry.common_plane import plane_heights
 
 CELL_M = 0.25
 OBSTACLE_M = (0.25, 2.5)  # above the ground: what stands in the way of a person or a car

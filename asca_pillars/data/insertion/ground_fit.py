@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.common_plane import most_common_plane
+from asca_pillars.geometry.common_plane import most_common_plane, plane_heights
 
 REACH_M = 80.0  # beyond this, nothing is looked at
 LATTICE_M = 1.0
@@ -46,11 +46,6 @@ class Ground:
     def heights(self, xy_m: _Floats) -> NDArray[np.float64]:
         """z (N,) of the ground at (N, 2), interpolated; beside the lattice as at its border."""
         return plane_heights(self.plane, xy_m) + _interpolate(self.rise_m, self.origin_m, LATTICE_M, xy_m)
-
-
-def plane_heights(plane: NDArray[np.float64], xy_m: _Floats) -> NDArray[np.float64]:
-    """z (N,) of a plane at (N, 2)."""
-    return np.asarray(xy_m @ plane[:2] + plane[2], dtype=np.float64)
 
 
 def fit_plane(points: _Floats) -> NDArray[np.float64] | None:

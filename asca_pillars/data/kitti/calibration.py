@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import corners
+from asca_pillars.geometry.rotations import transform_columns
 
 DEFAULT_IMAGE_SIZE_WH = (1242, 375)
 NEAR_PLANE_M = 0.1
@@ -84,10 +85,8 @@ def in_image(
     """
     # Coordinates by rows, and sums in place: several times faster than many short rows and new memory for each step.
     xyz = np.ascontiguousarray(points_lidar[..., :3].reshape(-1, 3).T, np.float64)
-    rect = calib.rect_from_lidar_matrix[:3, :3] @ xyz
-    rect += calib.rect_from_lidar_matrix[:3, 3:]
-    image = calib.p2[:, :3] @ rect
-    image += calib.p2[:, 3:]
+    rect = transform_columns(xyz, calib.rect_from_lidar_matrix[:3, :3], calib.rect_from_lidar_matrix[:3, 3])
+    image = transform_columns(rect, calib.p2[:, :3], calib.p2[:, 3])
     before = image[2] >= NEAR_PLANE_M
     image[:2] /= np.where(before, image[2], 1.0)
     (u, v), (width, height) = image[:2], image_size_wh
@@ -187,8 +186,9 @@ def write_calibration(path: str | Path, calib: Calibration) -> None:
 
 
 def _transform(matrix: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
-    result: NDArray[np.float64] = points @ matrix[:3, :3].T + matrix[:3, 3]
-    return result
+    shape = (*points.shape[:-1], len(matrix[:3]))
+    columns = points.reshape(-1, 3).T.astype(np.float64)
+    return transform_columns(columns, matrix[:3, :3], matrix[:3, 3]).T.reshape(shape)
 
 
 def _matrix(

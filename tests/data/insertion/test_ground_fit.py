@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.data.insertion.ground_fit import fit_ground, fit_plane, plane_heights
+from asca_pillars.data.insertion.ground_fit import fit_ground, fit_plane
+from asca_pillars.geometry.common_plane import plane_heights
 from tests.data.insertion.simple_streets import cast, stand
 
 SLOPES = st.floats(-0.06, 0.06)
