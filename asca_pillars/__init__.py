@@ -11,6 +11,8 @@ The names below are the stable ones (docs/API.md). They are imported when they a
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from asca_pillars.telemetry import disable_telemetry
+
 if TYPE_CHECKING:
     from asca_deploy import Bundle, Detector, ScanQueue, Tracker, Tracks, load_bundle
     from asca_pillars.data.mounting import Mounting
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from asca_pillars.geometry.frame_report import FrameReport
 
 __version__ = "0.1.0"
+
+disable_telemetry()  # before anything imports onnxruntime, which reads the environment then
 
 __all__ = [
     "AscaError",

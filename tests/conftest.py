@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+import asca_pillars  # noqa: F401  (before a test imports onnxruntime: it refuses that one's reports)
+
 # How long an example takes depends on what else the machine does, and says nothing about whether it is right.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = (ROOT / "asca_pillars", ROOT / "deploy" / "asca_deploy", ROOT / "export" / "asca_export")
 SHARED_NAMES = {"__init__.py", "conftest.py"}
 LAYERS = (  # what is in one of them imports from those before it
-    {"errors"},
+    {"errors", "telemetry"},
     {"locks"},
     {"files", "processes", "schema", "strict", "system", "yaml_text"},
     {"cluster", "geometry"},

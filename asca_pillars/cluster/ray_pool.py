@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import os
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -29,7 +28,6 @@ def connected(address: str) -> Iterator[str]:
     Raises:
         ClusterError: there is no such cluster, or it does not let this process in.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
     import ray
 
     own = {"num_cpus": default_threads(), "include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES}

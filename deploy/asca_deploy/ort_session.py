@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import onnxruntime
 from numpy.typing import NDArray
 
 from asca_deploy.graph import Tensor
+from asca_deploy.onnx_runtime import onnxruntime
 from asca_pillars.errors import BundleError, ProviderError
 
 OLDEST = (1, 25)

@@ -38,7 +38,7 @@ std::vector<float> read_points(const std::string& path) {
 // Print the boxes, and what the stages take: the median of the repeats.
 template <typename T>
 void run(const std::string& folder, const nlohmann::json& manifest, const std::vector<float>& points, int repeats) {
-    const Ort::Env env(ORT_LOGGING_LEVEL_ERROR, "asca");
+    const Ort::Env env = make_env("asca");
     Detector<T> detector(env, folder, manifest);
     for (const Box& box : detector.detect(points)) {
         const auto& name = manifest.at("spec").at("classes")[box.label].at("name").get_ref<const std::string&>();

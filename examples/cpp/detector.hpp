@@ -5,6 +5,7 @@
 #include <chrono>
 #include <cstdint>
 #include <cstdio>
+#include <cstdlib>
 #include <fstream>
 #include <map>
 #include <optional>
@@ -76,6 +77,19 @@ inline Values table_inputs(const NeckTables& tables) {
 }
 
 }  // namespace detail
+
+// ONNX Runtime's environment. Version 1.32 and later report to their maker unless the variable says otherwise before the
+// environment is made; what the user has set stays.
+inline Ort::Env make_env(const char* name) {
+#ifdef _WIN32
+    if (std::getenv("ORT_DISABLE_TELEMETRY") == nullptr) _putenv_s("ORT_DISABLE_TELEMETRY", "1");
+#else
+    setenv("ORT_DISABLE_TELEMETRY", "1", 0);
+#endif
+    Ort::Env env(ORT_LOGGING_LEVEL_ERROR, name);
+    if (std::string(std::getenv("ORT_DISABLE_TELEMETRY")) == "1") env.DisableTelemetryEvents();
+    return env;
+}
 
 // bundle.json of a bundle that this program can run.
 inline nlohmann::json read_manifest(const std::string& folder) {

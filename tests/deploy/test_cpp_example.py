@@ -99,6 +99,13 @@ def test_it_finds_the_boxes_of_the_models_that_ship(detect: Path, tmp_path: Path
         assert_golden(detect, shipped_bundles()[name], sample_scan_path(), tmp_path / name)
 
 
+def test_it_leaves_nothing_behind(detect: Path, tmp_path: Path) -> None:
+    """onnxruntime writes an identifier to the home folder when it is going to report."""
+    command = [detect, shipped_bundles()["asca_small_sim"], sample_scan_path()]
+    subprocess.run(command, check=True, capture_output=True, env={"HOME": str(tmp_path)})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_grid_of_three_zones_beyond_both_limits(
     detect: Path, tiny_bundle: Path, sparse_bundle: Path, tmp_path: Path
 ) -> None:

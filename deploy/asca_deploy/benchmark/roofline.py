@@ -9,10 +9,10 @@ from importlib import resources
 from time import perf_counter
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Bundle
+from asca_deploy.onnx_runtime import onnxruntime
 
 SIZE = 2048
 """Rows and columns of the constant matrix in both graphs."""
