@@ -65,8 +65,6 @@ def read_foreign(path: str | Path) -> ForeignWeights:
             f"{path}: damaged, or holds more than weights, which is not read ({unread(error)}); where the library that "
             "wrote it is installed, write a file with `model_state` (OpenPCDet) or `state_dict` (mmdetection3d) alone"
         ) from error
-    if not isinstance(content, dict):
-        content = {}
     if "hyper_parameters" in content:
         raise TrainingError(f"{path}: a checkpoint of `asca train`, which needs no import; give it to `asca export`")
     for key, library in _STATES.items():
