@@ -23,6 +23,7 @@ from asca_pillars.models.checkpoint import Checkpoint
 from benchmarks.made_recordings import point_cloud2
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.recordings.cloud_recordings import stamps, store, write_mcap
+from tests.models.openpcdet import mmdetection3d_networks
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
 from tests.saved_checkpoint import save_checkpoint
 from tests.scenes import write_dataset
@@ -118,7 +119,10 @@ def write_files(root: Path) -> None:
         checkpoint = root / "runs" / name / "checkpoints" / "last.ckpt"
         checkpoint.parent.mkdir(parents=True)
         save_checkpoint(checkpoint, untrained)
-    write_foreign(root / "pointpillar.pth", PointPillars(64, (64, 128, 256), (3, 5, 5), 128, 3).state_dict())
+    published = 64, (64, 128, 256), (3, 5, 5), 128, 3
+    write_foreign(root / "pointpillar.pth", PointPillars(*published).state_dict())
+    theirs = mmdetection3d_networks.PointPillars(*published)
+    mmdetection3d_networks.write_mmdetection3d(root / "hv_pointpillars_3class.pth", theirs.state_dict())
 
 
 def _rows(frame: Any) -> str:

@@ -1,4 +1,4 @@
-"""`asca import-weights`: a detector that OpenPCDet trained, as a checkpoint that `asca` exports and evaluates."""
+"""`asca import-weights`: a detector of OpenPCDet or mmdetection3d as a checkpoint that `asca` exports and evaluates."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,27 +10,33 @@ from asca_pillars.commands.options import OverridesOption
 
 
 def import_weights(
-    file: Annotated[Path, typer.Argument(help="Checkpoint of OpenPCDet's PointPillars or PV-RCNN (.pth).")],
+    file: Annotated[
+        Path, typer.Argument(help="Checkpoint of OpenPCDet's or mmdetection3d's PointPillars or PV-RCNN (.pth).")
+    ],
     *,
     out: Annotated[Path, typer.Option("--out", "-o", help="Checkpoint to write, such as pointpillars.ckpt.")],
     config: Annotated[
         Path | None,
         typer.Option(
             "--config",
-            help="YAML of the model, or the name of one that ships. Default: openpcdet_pointpillars_kitti or "
-            "pv_rcnn_kitti, the published models on KITTI. Other ranges, classes or widths need their own.",
+            help="YAML of the model, or the name of one that ships. Default: the published model on KITTI "
+            "(openpcdet_pointpillars_kitti, pv_rcnn_kitti, mmdetection3d_pointpillars_kitti, "
+            "mmdetection3d_pv_rcnn_kitti). Other ranges, classes or widths need their own.",
         ),
     ] = None,
     override: OverridesOption = None,
 ) -> None:
-    """Import weights of OpenPCDet: every array of the file finds its place, or the command names it and stops.
+    """Import weights of OpenPCDet or mmdetection3d 1.x.
 
-    The file is read as data alone, nothing in it is executed. What is written is a checkpoint as `asca train` writes
-    it: `asca export` makes a bundle of it, `asca eval` judges it, `asca train --init` goes on from it.
+    Every array of the file finds its place, or the command names it and stops. The file is read as data alone, nothing
+    in it is executed. What is written is a checkpoint as `asca train` writes it: `asca export` makes a bundle of it,
+    `asca eval` judges it, `asca train --init` goes on from it.
 
     Examples:
 
     asca import-weights pointpillar.pth -o pointpillars.ckpt
+
+    asca import-weights hv_pointpillars_secfpn_6x8_160e_kitti-3d-3class.pth -o pointpillars.ckpt
 
     asca export pointpillars.ckpt -o pointpillars --scans data/kitti/training/velodyne
     """

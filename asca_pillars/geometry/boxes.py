@@ -23,9 +23,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Bin 0 holds the yaws in [pi/4, 5pi/4), bin 1 the others. Most boxes stand near an anchor's yaw, and near a
-# bin's border the bin is hard to tell: so no border lies on an anchor's yaw.
-_BIN_START_RAD = math.pi / 4
+DIRECTION_OFFSET_RAD = math.pi / 4
+"""Where direction bin 0 begins unless a detector says otherwise: it holds the yaws in [pi/4, 5pi/4), bin 1 the others.
+
+Most boxes stand near an anchor's yaw, and near a bin's border the bin is hard to tell: so no border lies on an anchor's
+yaw.
+"""
 
 # Nothing is a hundred times as long as its anchor, but exp() of what an untrained or overflowing network
 # answers can be infinite, and an infinite box makes NaN of every overlap it takes part in.
@@ -106,7 +109,9 @@ def points_in_boxes(
 
 
 def encode_boxes(
-    boxes: NDArray[np.floating[Any]], anchors: NDArray[np.floating[Any]]
+    boxes: NDArray[np.floating[Any]],
+    anchors: NDArray[np.floating[Any]],
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Boxes as the network learns them: boxes and anchors (..., 7) -> residuals (..., 7), direction (...,).
 
@@ -114,7 +119,8 @@ def encode_boxes(
     difference in [-pi, pi); direction is the bin 0 or 1 of the box's yaw. The paper's eq. 12 as printed
     takes the logarithm of a difference; this is the encoding of PointPillars, which the paper says it
     adopts. The yaw is carried twice: as a residual, in which the loss does not see half a turn (it takes
-    the sine of the error), and as one of two direction bins, which settles it.
+    the sine of the error), and as one of two direction bins, the first of which begins at `direction_offset_rad`,
+    which settles it.
     """
     box, anchor = boxes.astype(np.float64), anchors.astype(np.float64)
     diagonal = np.hypot(anchor[..., 3], anchor[..., 4])[..., None]
@@ -129,18 +135,21 @@ def encode_boxes(
     ).astype(np.float32)
     # From the rounded residual, as the decoder will see it: a yaw within rounding of a bin's border must not
     # come back turned round.
-    return residuals, direction_bins(residuals[..., 6].astype(np.float64) + anchor[..., 6])
+    return residuals, direction_bins(residuals[..., 6].astype(np.float64) + anchor[..., 6], direction_offset_rad)
 
 
-def direction_bins(yaw_rad: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+def direction_bins(
+    yaw_rad: NDArray[np.floating[Any]], direction_offset_rad: float = DIRECTION_OFFSET_RAD
+) -> NDArray[np.int64]:
     """Bin 0 or 1 of each yaw: (...,) -> (...,); the two directions of a heading are in different bins."""
-    return (np.mod(yaw_rad - _BIN_START_RAD, 2 * math.pi) >= math.pi).astype(np.int64)
+    return (np.mod(yaw_rad - direction_offset_rad, 2 * math.pi) >= math.pi).astype(np.int64)
 
 
 def decode_boxes(
     residuals: NDArray[np.floating[Any]],
     direction: NDArray[np.integer[Any]],
     anchors: NDArray[np.floating[Any]],
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> NDArray[np.float32]:
     """Inverse of `encode_boxes`: residuals (..., 7), direction (...,), anchors (..., 7) -> boxes (..., 7).
 
@@ -151,8 +160,8 @@ def decode_boxes(
     center = anchor[..., :2] + residual[..., :2] * diagonal
     z = anchor[..., 2:3] + residual[..., 2:3] * anchor[..., 5:6]
     size = anchor[..., 3:6] * np.exp(np.clip(residual[..., 3:6], -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
-    into_bin = np.mod(residual[..., 6] + anchor[..., 6] - _BIN_START_RAD, math.pi)
-    yaw = _BIN_START_RAD + math.pi * direction + into_bin
+    into_bin = np.mod(residual[..., 6] + anchor[..., 6] - direction_offset_rad, math.pi)
+    yaw = direction_offset_rad + math.pi * direction + into_bin
     boxes = np.concatenate([center, z, size, yaw[..., None]], axis=-1).astype(np.float32)
     boxes[..., 6] = wrap_angle(yaw.astype(np.float32))
     return boxes

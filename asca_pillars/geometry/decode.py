@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, ClassSpec
-from asca_pillars.geometry.boxes import decode_boxes
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.kernels import load_kernels
 from asca_pillars.geometry.overlap import bev_iou
@@ -87,6 +87,7 @@ def decode(
     classes: tuple[ClassSpec, ...],
     post: PostProcess,
     cells: NDArray[np.integer[Any]] | None = None,
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Detections:
     """Detections of one scan, best first.
 
@@ -98,11 +99,12 @@ def decode(
         maps: logits and residuals on the head's map.
         anchors: (H, W, A, 7) from `make_anchors` for the same grid and classes.
         cells: (M,) flat index of the head cell of each of the maps' rows, ascending; None if they are maps.
+        direction_offset_rad: where direction bin 0 begins, see `DetectorSpec`.
 
     Raises:
         ValueError: if maps, anchors and classes do not belong together.
     """
-    return suppress(decode_candidates(maps, anchors, classes, post, cells), classes, post)
+    return suppress(decode_candidates(maps, anchors, classes, post, cells, direction_offset_rad), classes, post)
 
 
 def decode_candidates(
@@ -111,6 +113,7 @@ def decode_candidates(
     classes: tuple[ClassSpec, ...],
     post: PostProcess,
     cells: NDArray[np.integer[Any]] | None = None,
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Candidates:
     """The first half of `decode`: what reaches its class's threshold, (n, 7) boxes in the LiDAR frame.
 
@@ -139,7 +142,8 @@ def decode_candidates(
     residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
     directions = rows.directions.reshape(-1, count, 2)[row, anchor]
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
-        boxes = decode_boxes(residuals, directions.argmax(axis=-1), anchors.reshape(-1, count, 7)[cell, anchor])
+        own = anchors.reshape(-1, count, 7)[cell, anchor]
+        boxes = decode_boxes(residuals, directions.argmax(axis=-1), own, direction_offset_rad)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)
     dropped = np.count_nonzero(~usable & np.isfinite(logits))
     return Candidates(

@@ -1,5 +1,6 @@
 """What every family of detectors shares: where it looks, for which classes, and how its head maps become boxes."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.anchors import KITTI_CLASSES, ClassSpec, make_anchors
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
 from asca_pillars.geometry.decode import HeadMaps, PostProcess, decode
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
@@ -22,17 +24,23 @@ class DetectorSpec(Strict, ABC):
     """Classes and post-processing; each family adds the grid that its ranges and head cells come from.
 
     Raises:
-        ConfigError: if there is no class or two have the same name.
+        ConfigError: if there is no class or two have the same name, or the direction bins begin beyond half a turn.
     """
 
     classes: tuple[ClassSpec, ...] = KITTI_CLASSES
     post: PostProcess = field(default_factory=PostProcess)
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD
+    """Yaw at which direction bin 0 begins, half a turn before bin 1; -pi/2 in mmdetection3d's PointPillars."""
 
     def __post_init__(self) -> None:
         if not self.classes:
             raise ConfigError("classes is empty: a detector needs at least one class")
         if len({name.casefold() for name in self.class_names}) < len(self.classes):  # evaluations fold case
             raise ConfigError(f"classes {', '.join(self.class_names)} must have different names")
+        if not abs(self.direction_offset_rad) <= math.pi:
+            raise ConfigError(
+                f"direction_offset_rad {self.direction_offset_rad:g} must lie between -pi and pi; it is in radians"
+            )
 
     @property
     @abstractmethod
@@ -82,4 +90,4 @@ class DetectorSpec(Strict, ABC):
 
         With `cells` (M,), flat indices: from rows (M, channels) of these head cells.
         """
-        return decode(maps, self.anchors, self.classes, self.post, cells)
+        return decode(maps, self.anchors, self.classes, self.post, cells, self.direction_offset_rad)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, IGNORED, ClassSpec
-from asca_pillars.geometry.boxes import encode_boxes, points_in_boxes
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, encode_boxes, points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 
 Assigner = Literal["overlap", "atss"]
@@ -47,6 +47,7 @@ def assign_targets(
     boxes: NDArray[np.float32],
     labels: NDArray[np.int64],
     assigner: Assigner = "overlap",
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Targets:
     """Match anchors with boxes by the overlap of their axis-aligned bird's-eye footprints.
 
@@ -68,6 +69,7 @@ def assign_targets(
         boxes: (N, 7) labelled boxes.
         labels: (N,) index into `classes`, or IGNORED.
         assigner: which of both.
+        direction_offset_rad: where direction bin 0 begins, see `DetectorSpec`.
     """
     wanted = np.flatnonzero(labels != IGNORED)
     if assigner == "overlap":
@@ -76,7 +78,7 @@ def assign_targets(
         state, positives, matched = _match_nearest(anchors, boxes, labels, wanted)
     state[_ignored(anchors, classes, boxes[labels == IGNORED]) & (state == 0)] = -1
     found = anchors.reshape(-1, 7)[positives]
-    residuals, directions = encode_boxes(boxes[matched], found)
+    residuals, directions = encode_boxes(boxes[matched], found, direction_offset_rad)
     return Targets(state, positives, found, residuals, directions, matched)
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import pickle
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,7 +47,9 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     if not path.is_file():
         raise TrainingError(f"{path}: no such checkpoint; a run keeps its own in RUN/checkpoints/last.ckpt")
     try:
-        content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        content = read_plain(path)
+        if "hyper_parameters" not in content and (library := _library_of(content)):
+            raise TrainingError(f"{path}: a checkpoint of {library}; `asca import-weights` makes one of ours of it")
         config = parse(Config, content["hyper_parameters"]["config"], str(path))
         detector = build_model(config.model)
         weights = {
@@ -58,11 +61,34 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         measured = content["hyper_parameters"].get("expected_input")
         expected = None if measured is None else parse(ExpectedInput, measured, str(path))
         steps = int(content["global_step"])
+    except TrainingError:
+        raise
     except ConfigError as error:
         raise TrainingError(f"{error}; the checkpoint was made by another version of asca-pillars") from None
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
         raise TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({unread(error)})") from error
     return Checkpoint(config, detector.eval(), steps, expected)
+
+
+def read_plain(path: Path) -> dict[str, Any]:
+    """The dictionary that a file of `torch.save` holds, weights only: nothing in the file is executed.
+
+    Raises:
+        ValueError: it holds something else than a dictionary.
+        Exception: whatever the damaged bytes happen to trigger in `torch.load`.
+    """
+    with warnings.catch_warnings(action="ignore"):  # of pickles that are no checkpoints; the error says so
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(content, dict):
+        raise ValueError(f"it holds a {type(content).__name__}, where a checkpoint holds a dictionary")
+    return content
+
+
+def _library_of(content: Mapping[str, Any]) -> str | None:
+    """Whose training wrote a checkpoint that is not ours, where `asca import-weights` may know it."""
+    if "model_state" in content:
+        return "OpenPCDet"
+    return "mmdetection3d" if "meta" in content and "state_dict" in content else None
 
 
 def unread(error: Exception) -> str:
@@ -73,7 +99,7 @@ def unread(error: Exception) -> str:
     if isinstance(error, pickle.UnpicklingError):
         return "it is not plain arrays and settings; nothing in it was executed"
     if isinstance(error, KeyError):
-        return f"no {error}"
+        return f"no {error}" if isinstance(error.args[0], str) else "it is no file of torch.save"
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
@@ -83,7 +109,7 @@ def save_weights(checkpoint: Path, path: Path) -> None:
     Matrices and kernels are float16; what is added or divided by (biases, statistics of the normalization) stays
     float32. Optimizer and averaging are left out: a run cannot be resumed from it.
     """
-    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    content = read_plain(checkpoint)
     content = {
         "hyper_parameters": content["hyper_parameters"],
         "global_step": content["global_step"],

@@ -62,7 +62,8 @@ def propose_anchors(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, set
     finite = np.isfinite(best)
     chosen = _best(np.where(finite, best, -np.inf), min(settings.candidates, int(finite.sum())))
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
-        boxes = decode_boxes(residuals[chosen], directions[chosen].argmax(axis=1), spec.anchors.reshape(-1, 7)[chosen])
+        bins, anchors = directions[chosen].argmax(axis=1), spec.anchors.reshape(-1, 7)[chosen]
+        boxes = decode_boxes(residuals[chosen], bins, anchors, spec.direction_offset_rad)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions[chosen]).all(axis=1)
     lost = int((~finite).sum() + (~usable).sum())
     boxes, chosen = boxes[usable], chosen[usable]

@@ -55,7 +55,7 @@ def propose(
     classes = tuple(replace(item, score_threshold=settings.score_threshold) for item in spec.classes)
     # Room for every candidate: the quotas choose, not a common limit.
     post = PostProcess(settings.nms_iou, settings.candidates, settings.candidates * len(classes))
-    candidates = decode_candidates(maps, spec.anchors, classes, post, cells)
+    candidates = decode_candidates(maps, spec.anchors, classes, post, cells, spec.direction_offset_rad)
     return best_of_each_class(suppress(candidates, classes, post, max(settings.quotas)), settings.quotas)
 
 

@@ -12,12 +12,27 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
+from asca_pillars.config import ModelConfig
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
-from asca_pillars.models.checkpoint import unread
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import read_plain, unread
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
+_OTHERWISE_FILLED = (AttributeError, TypeError)  # of a dictionary whose values are of other types
+_OF_A_RUN = {
+    "state_dict": dict,
+    "optimizer_states": list,
+    "lr_schedulers": list,
+    "loops": dict,
+    "callbacks": dict,
+    "epoch": int,
+    "global_step": int,
+    "pytorch-lightning_version": str,
+}
+"""What a run goes on from; weights.ckpt has no more than the weights."""
+_WEIGHTS_ALONE = "holds weights alone, not the state of a run (weights.ckpt is such a file)"
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -59,8 +74,8 @@ class BestCheckpoint(ModelCheckpoint):
         super().on_train_start(trainer, pl_module)
         path = Path(str(self.dirpath)) / BEST
         if trainer.global_step and path.exists():
-            with contextlib.suppress(*_UNREADABLE):  # then the next validation replaces it
-                state = torch.load(path, map_location="cpu", weights_only=True)["callbacks"][self.state_key]
+            with contextlib.suppress(*_UNREADABLE, *_OTHERWISE_FILLED):  # then the next validation replaces it
+                state = read_plain(path)["callbacks"][self.state_key]
                 # Lightning forgets the loss where the folder has another name: a run may have been moved.
                 here = {"dirpath": self.dirpath, "best_model_path": str(path), "kth_best_model_path": str(path)}
                 best = {str(path): loss for loss in state["best_k_models"].values()}
@@ -90,25 +105,48 @@ class LastCheckpoint(Checkpoint):
         trainer.save_checkpoint(self.folder / LAST)
 
 
-def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
-    """The newest checkpoint of a run that can be read, or None in a new run; and what is wrong with a newer one.
+def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None, str | None]:
+    """The newest checkpoint that a run can go on from, or None in a new run; and what is wrong with a newer one.
+
+    Args:
+        folder: of the run's checkpoints.
+        model: of the run.
 
     Raises:
         TrainingError: there are checkpoints, but none to go on from.
     """
-    damage: list[str] = []
+    unusable: list[str] = []
+    weights = folder / BEST
     for path in (folder / LAST, folder / PREVIOUS):
         if not path.exists():
             continue
-        try:
-            torch.load(path, map_location="cpu", weights_only=True, mmap=False)
-        except _UNREADABLE as e:
-            damage.append(f"{path} is damaged ({unread(e)})")
-        else:
-            return path, damage[0] if damage else None
-    if damage:
+        if (reason := _why_unusable(path, model)) is None:
+            return path, unusable[0] if unusable else None
+        unusable.append(f"{path} {reason}")
+        weights = path if reason == _WEIGHTS_ALONE else weights
+    if unusable:
         raise TrainingError(
-            f"{damage[0]} and there is no {PREVIOUS} to go on from; start a new run in another --out, "
-            f"with the weights of this one if {folder / BEST} is there: --init {folder / BEST}"
+            f"{unusable[0]} and there is no {PREVIOUS} to go on from; start a new run in another --out, "
+            f"with the weights of this one if {weights} is there: --init {weights}"
         )
     return None, None
+
+
+def _why_unusable(path: Path, model: ModelConfig) -> str | None:
+    """Why a run of this model cannot go on from the checkpoint; None if it can."""
+    try:
+        content = read_plain(path)
+    except _UNREADABLE as error:
+        return f"is damaged ({unread(error)})"
+    if "state_dict" not in content:
+        return "is no checkpoint of a run (no 'state_dict')"
+    if any(name not in content for name in _OF_A_RUN):
+        return _WEIGHTS_ALONE
+    for name, kind in _OF_A_RUN.items():
+        if not isinstance(content[name], kind):
+            return f"is damaged (`{name}` is a {type(content[name]).__name__})"
+    wanted = {f"detector.{name}": array.shape for name, array in build_model(model).state_dict().items()}
+    found = {name: getattr(array, "shape", None) for name, array in content["state_dict"].items()}
+    if wrong := [name for name in wanted if found.get(name) != wanted[name]]:
+        return f"is of another network ({wrong[0].removeprefix('detector.')} differs)"
+    return None

@@ -96,7 +96,7 @@ def _train(
     view = config.data.camera_view and open_split(data_root).has_camera
     config = replace(config, data=replace(config.data, camera_view=view))
     recover(checkpoints, again=True)  # another process may have been killed there since
-    resumed, damage = checkpoint_to_resume(checkpoints)
+    resumed, damage = checkpoint_to_resume(checkpoints, config.model)
     goes_on = resumed is not None
     config = replace(config, train=_with_settled_precision(config.train, out, resumes=goes_on))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)

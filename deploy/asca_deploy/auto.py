@@ -8,6 +8,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_deploy.graph import first_line
 from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.errors import ProviderError
 from asca_pillars.geometry.boxes import wrap_angle
@@ -150,8 +151,7 @@ def _try(
             return _Trial(Candidate(*name, None, differs), None)
         return _Trial(Candidate(*name, _median_ms(detect, network, clock), AGREES), network)
     except Exception as error:  # of onnxruntime or OpenVINO, which share no base; it only says that this one is out
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        return _Trial(Candidate(*name, None, f"does not run: {reason}"), None)
+        return _Trial(Candidate(*name, None, f"does not run: {first_line(error)}"), None)
 
 
 def _left_out(provider: str, elapsed_s: float) -> str | None:

@@ -159,6 +159,7 @@ class Detector:
 
         Raises:
             ScanError: `points` has another shape or does not hold real numbers.
+            BundleError: a graph fails while it runs; on other hardware than the CPU a ProviderError.
         """
         frame = self._open(points)
         # Pass by pass, so that all of them need no more than one pseudo-image.

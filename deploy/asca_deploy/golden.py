@@ -91,7 +91,9 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
     if isinstance(pipeline, RefinePipeline):
         return {**stages, **_second_stage(pipeline, first.backbone.infer_with_neck(placed), points)}
     spec, answer = pipeline.spec, pipeline.backbone.run(placed)
-    candidates = decode_candidates(answer.maps, spec.anchors, spec.classes, spec.post, answer.cells)
+    candidates = decode_candidates(
+        answer.maps, spec.anchors, spec.classes, spec.post, answer.cells, spec.direction_offset_rad
+    )
     boxes: dict[str, NDArray[Any]] = {
         "boxes": candidates.boxes,
         "scores": sigmoid(candidates.logits),

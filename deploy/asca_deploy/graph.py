@@ -39,6 +39,11 @@ class Session(Protocol):
         """
 
 
+def first_line(error: Exception) -> str:
+    """What a backend says of a failure, without the lines that follow."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].strip()
+
+
 def check_interface(
     path: Path, session: Session, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
 ) -> Session:

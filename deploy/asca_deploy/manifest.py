@@ -24,6 +24,7 @@ from asca_deploy.manifest_file import EXPORT_AGAIN, LONGEST_REASON, first_misrea
 from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.errors import AscaError, BundleError, printable
 from asca_pillars.files import write_json
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
 from asca_pillars.schema import parse, to_dict
 
 ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
@@ -32,9 +33,10 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 _ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTIALS[:-1], "pv_rcnn")}
 _ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
 # Of these sections, and of a pillar detector's `spec` and `spec.grid`, and what they are where they are not written: in
-# bundles made before there were sparse necks, scores of both stages, other anchors and pooled maps. Whether they were
-# taken out is told by the graphs' metadata.
-_LATER_KEYS = {
+# bundles made before there were sparse necks, scores of both stages, other direction bins and anchors, and pooled maps.
+# Whether they were taken out is told by the graphs' metadata.
+_LATER_KEYS: dict[str, dict[str, Any]] = {
+    "spec": {"direction_offset_rad": DIRECTION_OFFSET_RAD},
     "pillar": {"neck": "dense"},
     "refine": {"scores": "second"},
     "pv_rcnn": {"scores": "second"},

@@ -61,14 +61,14 @@ class OpenVinoSession:
     """
 
     def __init__(self, path: Path, precision: str, threads: int) -> None:
-        self._openvino = _import_openvino()
+        self._path, self._openvino = path, _import_openvino()
+        self._version = self._openvino.__version__.split("-")[0]
         try:
             core = _core()
             model = core.compile_model(core.read_model(path), _DEVICE, _properties(precision, threads))
-        except RuntimeError as error:  # the only one OpenVINO knows; its last line says the most
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
+        except RuntimeError as error:  # the only one OpenVINO knows
             raise BundleError(
-                f"OpenVINO {self._openvino.__version__.split('-')[0]} cannot run {path}: {reason}; "
+                f"OpenVINO {self._version} cannot run {path}: {_last_line(error)}; "
                 f"upgrade with `pip install --upgrade openvino`, or choose provider cpu"
             ) from error
         self._request = model.create_infer_request()
@@ -84,13 +84,27 @@ class OpenVinoSession:
         """See `graph.Session.run`; OpenVINO writes into new arrays, so that nothing is copied.
 
         Inputs and outputs are unitless and have the graph's fixed shapes, such as (1, ny + 1, nx + 1, C).
+
+        Raises:
+            ProviderError: OpenVINO fails, for example for want of memory.
         """
         found = [np.empty(shape, kind) for shape, kind in self._results]
-        with self._lock:  # a request refuses a second caller, and one network keeps all cores busy
-            for port, array in enumerate(found):
-                self._request.set_output_tensor(port, self._openvino.Tensor(array, shared_memory=True))
-            self._request.infer(dict(inputs), share_inputs=True)
+        try:
+            with self._lock:  # a request refuses a second caller, and one network keeps all cores busy
+                for port, array in enumerate(found):
+                    self._request.set_output_tensor(port, self._openvino.Tensor(array, shared_memory=True))
+                self._request.infer(dict(inputs), share_inputs=True)
+        except RuntimeError as error:
+            raise ProviderError(
+                f"OpenVINO {self._version} failed while it ran {self._path}: {_last_line(error)}; "
+                "provider cpu may run it"
+            ) from error
         return [found[self._ports[name]] for name in outputs]
+
+
+def _last_line(error: RuntimeError) -> str:
+    """The last line of what OpenVINO says, which says the most."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
 
 
 def _tensor(port: Any) -> Tensor:

@@ -2,18 +2,22 @@
 
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-from asca_deploy.graph import Tensor
+from asca_deploy.graph import Tensor, first_line
 from asca_deploy.onnx_runtime import onnxruntime
-from asca_pillars.errors import BundleError, ProviderError
+from asca_pillars.errors import BundleError, ProviderError, printable
 
 OLDEST = (1, 25)
+
+_LONGEST_REASON = 300  # onnxruntime tells whole call stacks
+_OTHER_VERSION = "upgrade with `pip install --upgrade onnxruntime`, or export the bundle again"
+_OUT_OF_MEMORY = re.compile("allocat|memory", re.IGNORECASE)
 
 # It turns layers that an 8-bit bundle keeps in floating point into 8-bit ones of its own making.
 _DISABLED_OPTIMIZERS = ["WeightBiasQuantization"]
@@ -102,10 +106,28 @@ class OrtSession:
     def __init__(self, path: Path, provider: str, precision: str, threads: int, *, keep_memory: bool = True) -> None:
         options = _session_options(threads)
         options.enable_cpu_mem_arena = keep_memory
-        session = _open(path, provider, precision, options)
-        self.inputs = {node.name: _tensor(node) for node in session.get_inputs()}
-        self.outputs = {node.name: _tensor(node) for node in session.get_outputs()}
-        self.run: Callable[[Sequence[str], Mapping[str, NDArray[Any]]], list[NDArray[Any]]] = session.run
+        self._path, self._provider = path, provider
+        self._session = _open(path, provider, precision, options)
+        self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
+        self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
+
+    def run(self, outputs: Sequence[str], inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        """See `graph.Session.run`: unitless inputs and outputs of the shapes that the graph declares.
+
+        Raises:
+            ProviderError: it fails on other hardware than the CPU, for example for want of memory.
+            BundleError: it fails on the CPU.
+        """
+        try:
+            return self._session.run(outputs, inputs)
+        except Exception as error:  # onnxruntime's exceptions share no other base
+            reason = printable(first_line(error), _LONGEST_REASON)
+            failed = f"onnxruntime {onnxruntime.__version__} failed while it ran {self._path}: {reason}"
+            if _OUT_OF_MEMORY.search(reason):
+                failed += "; give the process more memory, or it fewer points at once"
+            if self._provider != "cpu":
+                raise ProviderError(f"{failed}; provider cpu may run it") from error
+            raise BundleError(f"{failed}; {_OTHER_VERSION}") from error
 
 
 def _tensor(node: Any) -> Tensor:
@@ -129,12 +151,11 @@ def _open(path: Path, name: str, precision: str, options: onnxruntime.SessionOpt
             disabled_optimizers=_DISABLED_OPTIMIZERS,
         )
     except Exception as error:  # onnxruntime's exceptions share no other base
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         if name != "cpu":
             raise ProviderError(f"provider {name} cannot run {path}: {reason}; {chain[0].remedy}") from error
         raise BundleError(
-            f"onnxruntime {onnxruntime.__version__} cannot run {path}: {reason}; "
-            "upgrade with `pip install --upgrade onnxruntime`, or export the bundle again"
+            f"onnxruntime {onnxruntime.__version__} cannot run {path}: {reason}; {_OTHER_VERSION}"
         ) from error
     if session.get_providers()[0] != chain[0].ort_name:
         raise ProviderError(f"provider {name} does not start on this machine; {chain[0].remedy}")

@@ -84,7 +84,8 @@ class PillarPipeline:
 
     def finish(self, raw: HeadAnswer, laps: Laps) -> Detections:
         """Head maps (channels, H, W) -> boxes, LiDAR frame, above the score threshold that the rotated NMS keeps."""
-        detections = decode(raw.maps, self._anchors, self.spec.classes, self.spec.post, raw.cells)
+        spec = self.spec
+        detections = decode(raw.maps, self._anchors, spec.classes, spec.post, raw.cells, spec.direction_offset_rad)
         laps.append(("decode", perf_counter()))
         return detections
 

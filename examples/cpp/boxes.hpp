@@ -25,14 +25,15 @@ using Point = std::array<double, 2>;
 
 inline double modulo(double value, double divisor) { return value - divisor * std::floor(value / divisor); }
 
-inline Box decode(const float* residual, const float* direction, const std::array<float, 7>& anchor) {
+inline Box decode(const float* residual, const float* direction, const std::array<float, 7>& anchor,
+                  double direction_offset) {
     const double diagonal = std::hypot(double{anchor[3]}, double{anchor[4]});
     const auto grow = [](float ratio) {
         const double most = std::log(100.0);
         return std::exp(std::clamp(double{ratio}, -most, most));
     };
     const double bin = direction[1] > direction[0] ? kPi : 0;
-    const double yaw = kPi / 4 + bin + modulo(double{residual[6]} + anchor[6] - kPi / 4, kPi);
+    const double yaw = direction_offset + bin + modulo(double{residual[6]} + anchor[6] - direction_offset, kPi);
     Box box{};
     for (int axis = 0; axis < 2; ++axis)
         box.values[axis] = static_cast<float>(anchor[axis] + residual[axis] * diagonal);
@@ -100,6 +101,7 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
     const int64_t anchors = static_cast<int64_t>(classes.size()) * turns;
     const size_t candidates = spec.at("post").at("candidates"), most = spec.at("post").at("max_detections");
     const double nms_iou = spec.at("post").at("nms_iou");
+    const double direction_offset = spec.value("direction_offset_rad", detail::kPi / 4);
     std::vector<Box> all;
     for (size_t label = 0; label < classes.size(); ++label) {
         const auto& size = classes[label];
@@ -123,7 +125,7 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
                                            size.at("height_m"),
                                            yaws[anchor % turns]};
             const int64_t place = row * anchors + anchor;
-            Box found = detail::decode(residuals + 7 * place, directions + 2 * place, box);
+            Box found = detail::decode(residuals + 7 * place, directions + 2 * place, box, direction_offset);
             found.score = 1 / (1 + std::exp(double{negative}));
             found.label = static_cast<int>(label);
             const bool finite = std::all_of(found.values.begin(), found.values.end(),

@@ -136,8 +136,10 @@ def sparse_backbone_graph() -> onnx.ModelProto:
     return _model(nodes, inputs, outputs, weights)
 
 
-def write_bundle(folder: Path, uses_counts: bool = True, active_cells: MaskRule | None = None) -> Path:
-    """A valid bundle in `folder`, with a rule of active cells one with a sparse neck."""
+def write_bundle(
+    folder: Path, uses_counts: bool = True, active_cells: MaskRule | None = None, spec: PillarSpec = SPEC
+) -> Path:
+    """A valid bundle in `folder`, with a rule of active cells one with a sparse neck; `spec` has the grid of SPEC."""
     folder.mkdir(parents=True)
     onnx.save(encoder_graph(uses_counts), folder / "encoder.onnx")
     onnx.save(sparse_backbone_graph() if active_cells else backbone_graph(), folder / "backbone.onnx")
@@ -154,7 +156,7 @@ def write_bundle(folder: Path, uses_counts: bool = True, active_cells: MaskRule 
     bundle = PillarBundle(
         name="tiny",
         kind="pillar",
-        spec=SPEC,
+        spec=spec,
         pillar=PillarSection("none", CHANNELS, CanvasFormat(), "sparse" if active_cells else "dense", active_cells),
         precision="float32",
         backbone_gmac=0.1,

@@ -5,6 +5,7 @@ import json
 import shutil
 import struct
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,13 @@ def test_stages_on_a_grid_of_three_zones_beyond_both_limits(
     limits, pillars = tiny.SPEC.limits, stages["pillarize"]
     assert len(pillars["cells"]) == limits.max_pillars and pillars["point_counts"].max() == limits.max_points
     assert len(stages["suppress"]["boxes"]) > 2
+    assert_same_stages(tmp_path / "golden", bundle)
+
+
+def test_direction_bins_begin_where_the_bundle_says(tmp_path: Path) -> None:
+    bundle = tiny.write_bundle(tmp_path / "turned", spec=replace(tiny.SPEC, direction_offset_rad=-np.pi / 2))
+    write_scan(tmp_path / "scan.bin", tiny.make_scan())
+    assert len(write_golden(tmp_path / "golden", bundle, tmp_path / "scan.bin")["suppress"]["boxes"]) > 2
     assert_same_stages(tmp_path / "golden", bundle)
 
 

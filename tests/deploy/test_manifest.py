@@ -1,4 +1,5 @@
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,9 +9,10 @@ from typing import Any
 import onnx
 import pytest
 
+from asca_deploy import shipped_bundles
 from asca_deploy.bundle import MANIFEST, GraphFile, Parity
 from asca_deploy.layout import difference, layout_of
-from asca_deploy.manifest import bundle_to_json, graph_files, load_pillar_bundle, write_bundle_manifest
+from asca_deploy.manifest import bundle_to_json, graph_files, load_bundle, load_pillar_bundle, write_bundle_manifest
 from asca_pillars.errors import BundleError
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillar_spec import PillarSpec
@@ -40,6 +42,17 @@ def test_round_trip(bundle_copy: Path) -> None:
     write_bundle_manifest(bundle_copy, proven)
     assert load_pillar_bundle(str(bundle_copy)) == proven
     assert json.loads((bundle_copy / MANIFEST).read_text()) == bundle_to_json(proven)
+
+
+def test_direction_bins_begin_at_45_degrees_where_the_manifest_does_not_say(bundle_copy: Path) -> None:
+    for path in shipped_bundles().values():  # older than the key
+        spec = json.loads((path / MANIFEST).read_text())["spec"]
+        assert "direction_offset_rad" not in spec and load_bundle(path).spec.direction_offset_rad == math.pi / 4
+    turned = replace(load_pillar_bundle(bundle_copy).spec, direction_offset_rad=-math.pi / 2)
+    sign(bundle_copy, replace(load_pillar_bundle(bundle_copy), spec=turned))
+    assert load_pillar_bundle(bundle_copy).spec == turned
+    edit(bundle_copy, lambda data: data["spec"].pop("direction_offset_rad"))
+    assert_refused(bundle_copy, NOT_THE_GRAPHS.format("spec"))
 
 
 def test_layout_of_the_papers_grid(tiny_bundle: Path) -> None:

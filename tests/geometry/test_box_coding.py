@@ -47,6 +47,12 @@ def test_an_anchor_encodes_to_zero() -> None:
     assert direction.tolist() == [1, 0]  # 0 degrees lies below the border of 45, 90 above
 
 
+def test_directions_change_where_the_bins_begin() -> None:
+    boxes = np.tile(CAR_ANCHORS[0], (6, 1))
+    boxes[:, 6] = np.radians([-91, -89, 0, 89, 91, 180])
+    assert encode_boxes(boxes, CAR_ANCHORS[0], -math.pi / 2)[1].tolist() == [1, 0, 0, 0, 1, 1]
+
+
 def test_directions_change_at_45_and_225_degrees() -> None:
     degrees = np.array([44, 46, 134, 224, 226, 359, -1, -134, -136])
     boxes = np.tile(CAR_ANCHORS[0], (len(degrees), 1))
@@ -55,17 +61,18 @@ def test_directions_change_at_45_and_225_degrees() -> None:
         assert encode_boxes(boxes, anchor)[1].tolist() == [1, 0, 0, 0, 1, 1, 1, 1, 0]
 
 
+@pytest.mark.parametrize("offset", [math.pi / 4, -math.pi / 2, 0.0, math.pi])
 @pytest.mark.parametrize("anchor", CAR_ANCHORS)
-def test_every_yaw_survives(anchor: np.ndarray) -> None:
+def test_every_yaw_survives(anchor: np.ndarray, offset: float) -> None:
     # A full turn in steps that fall on the borders of the bins too, where rounding could turn a box round.
     yaws = np.concatenate([np.arange(0, 721) * math.pi / 360, -math.pi + np.arange(16) * math.pi / 8])
     yaws = np.concatenate([np.nextafter(yaws, -10), yaws, np.nextafter(yaws, 10)])
     boxes = np.tile(anchor.astype(np.float64), (len(yaws), 1))
     boxes[:, 6] = yaws
     for dtype in (np.float64, np.float32):
-        residuals, direction = encode_boxes(boxes.astype(dtype), anchor)
+        residuals, direction = encode_boxes(boxes.astype(dtype), anchor, offset)
         assert (np.abs(residuals[:, 6]) <= np.float32(math.pi)).all()
-        assert_same_boxes(decode_boxes(residuals, direction, anchor), boxes)
+        assert_same_boxes(decode_boxes(residuals, direction, anchor, offset), boxes)
 
 
 @given(st.integers(0, 2**32 - 1))

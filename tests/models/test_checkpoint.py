@@ -1,5 +1,6 @@
 """The small form of a checkpoint, and what its weights are known by."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -62,8 +63,27 @@ def test_nobody_is_told_to_execute_what_is_in_a_file(tmp_path: Path) -> None:
         assert "weights_only" not in str(refusal.value) and "\n" not in str(refusal.value)
     (tmp_path / LAST).write_bytes(path.read_bytes())
     with pytest.raises(TrainingError, match="nothing in it was executed") as refusal:
-        checkpoint_to_resume(tmp_path)
+        checkpoint_to_resume(tmp_path, NARROW.model)
     assert "weights_only" not in str(refusal.value)
+
+
+def test_what_is_none_of_ours_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path, state = tmp_path / "x.ckpt", {"a": torch.zeros(2)}
+    for content, message in (
+        ({"model_state": state}, "a checkpoint of OpenPCDet; `asca import-weights` makes one of ours"),
+        ({"meta": {}, "state_dict": state}, "a checkpoint of mmdetection3d; `asca import-weights`"),
+        (state, "no 'hyper_parameters'"),
+        (torch.zeros(3), "it holds a Tensor, where a checkpoint holds a dictionary"),
+        (None, "it holds a NoneType"),
+    ):
+        torch.save(content, path)
+        with pytest.raises(TrainingError, match=message):
+            load_checkpoint(path)
+    for data, message in ((b"hello", "it is no file of torch.save"), (pickle.dumps({"a": 1}), "not a checkpoint")):
+        path.write_bytes(data)
+        with pytest.raises(TrainingError, match=message):
+            load_checkpoint(path)
+    assert capfd.readouterr().err == ""  # torch warns of other pickles, which are not the user's to read
 
 
 def test_weights_are_known_by_names_shapes_and_values() -> None:

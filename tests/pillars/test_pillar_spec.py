@@ -53,6 +53,12 @@ def test_anchors_are_made_once_and_read_only() -> None:
         SPEC.anchors[0] = 0
 
 
+def test_direction_bins_begin_within_half_a_turn() -> None:
+    assert PillarSpec(direction_offset_rad=-np.pi).direction_offset_rad == -np.pi
+    with pytest.raises(ConfigError, match="direction_offset_rad -90 must lie between -pi and pi; it is in radians"):
+        PillarSpec(direction_offset_rad=-90)
+
+
 def test_classes_must_exist_and_differ() -> None:
     with pytest.raises(ConfigError, match="at least one class"):
         PillarSpec(classes=())

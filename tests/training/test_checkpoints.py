@@ -13,6 +13,8 @@ import yaml
 from asca_pillars.config import Config, DataConfig, TrainConfig
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import save_weights
 from asca_pillars.schema import to_dict
 from asca_pillars.training import loop
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
@@ -21,9 +23,17 @@ from asca_pillars.training.run_folder import Seen, claim, measure_input
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 
+MODEL = CONFIG.model
+
+
+def state_of_a_run(step: int) -> dict[str, Any]:
+    weights = {f"detector.{name}": array for name, array in build_model(MODEL).state_dict().items()}
+    lists: dict[str, Any] = {"optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
+    return lists | {"global_step": step, "epoch": 0, "state_dict": weights, "pytorch-lightning_version": "2.6"}
+
 
 def save(folder: Path, step: int, files: AtomicCheckpointIO) -> None:
-    files.save_checkpoint({"global_step": step}, folder / "last.ckpt")
+    files.save_checkpoint(state_of_a_run(step), folder / "last.ckpt")
 
 
 def learn(run: Path) -> None:
@@ -39,13 +49,13 @@ def step_of(path: Path | None) -> int:
 
 def test_the_last_two_are_kept(tmp_path: Path) -> None:
     files = AtomicCheckpointIO(keep_last=True)
-    assert checkpoint_to_resume(tmp_path) == (None, None)
+    assert checkpoint_to_resume(tmp_path, MODEL) == (None, None)
     for step in (1, 2, 3):
         save(tmp_path, step, files)
     assert step_of(tmp_path / "last.ckpt") == 3 and step_of(tmp_path / "previous.ckpt") == 2
-    assert checkpoint_to_resume(tmp_path) == (tmp_path / "last.ckpt", None)
+    assert checkpoint_to_resume(tmp_path, MODEL) == (tmp_path / "last.ckpt", None)
     (tmp_path / "last.ckpt").unlink()
-    assert checkpoint_to_resume(tmp_path) == (tmp_path / "previous.ckpt", None)
+    assert checkpoint_to_resume(tmp_path, MODEL) == (tmp_path / "previous.ckpt", None)
 
 
 def test_there_is_a_last_checkpoint_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,7 +113,7 @@ def test_a_truncated_checkpoint_is_passed_over_and_not_kept(tmp_path: Path, size
         save(tmp_path, step, files)
     whole = (tmp_path / "last.ckpt").read_bytes()
     (tmp_path / "last.ckpt").write_bytes(whole[:size])
-    resumed, damage = checkpoint_to_resume(tmp_path)
+    resumed, damage = checkpoint_to_resume(tmp_path, MODEL)
     assert step_of(resumed) == 1
     assert damage is not None and str(tmp_path / "last.ckpt") in damage and "\n" not in damage
     save(tmp_path, 3, AtomicCheckpointIO(keep_last=False))
@@ -113,8 +123,54 @@ def test_a_truncated_checkpoint_is_passed_over_and_not_kept(tmp_path: Path, size
 def test_only_damaged_checkpoints_are_one_line_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "last.ckpt").write_bytes(b"PK junk")
     with pytest.raises(TrainingError, match=r"last\.ckpt is damaged .*--init .*best\.ckpt") as caught:
-        checkpoint_to_resume(tmp_path)
+        checkpoint_to_resume(tmp_path, MODEL)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_state_of_a_run_is_named(tmp_path: Path) -> None:
+    whole, path = state_of_a_run(3) | {"hyper_parameters": {"config": to_dict(CONFIG)}}, tmp_path / "last.ckpt"
+    torch.save(whole, tmp_path / "whole.ckpt")
+    save_weights(tmp_path / "whole.ckpt", tmp_path / "weights.ckpt")
+    weights = torch.load(tmp_path / "weights.ckpt", weights_only=True)
+    other = {"detector.encode.linear.weight": torch.zeros(3, 9)}
+    for content, message in (
+        (weights, r"last\.ckpt holds weights alone, not the state of a run .*--init .*last\.ckpt"),
+        (whole["state_dict"], r"last\.ckpt is no checkpoint of a run"),
+        (torch.zeros(3), "is damaged .*it holds a Tensor"),
+        ([1, 2], "is damaged .*it holds a list"),
+        (whole | {"state_dict": 3}, "is damaged .`state_dict` is a int"),
+        (whole | {"loops": "x"}, "is damaged .`loops` is a str"),
+        (whole | {"state_dict": whole["state_dict"] | other}, r"another network \(encode\.linear\.weight differs"),
+    ):
+        torch.save(content, path)
+        with pytest.raises(TrainingError, match=message) as caught:
+            checkpoint_to_resume(tmp_path, MODEL)
+        assert "\n" not in str(caught.value)
+        torch.save(whole, tmp_path / "previous.ckpt")
+        resumed, wrong = checkpoint_to_resume(tmp_path, MODEL)
+        assert resumed == tmp_path / "previous.ckpt" and wrong is not None and wrong.startswith(str(path))
+        (tmp_path / "previous.ckpt").unlink()
+
+
+def test_a_best_checkpoint_of_another_kind_is_replaced(tmp_path: Path) -> None:
+    trainer = cast(Any, SimpleNamespace(global_step=7))
+    contents: list[Any] = [{"state_dict": {}}, torch.zeros(3), [1], {"callbacks": 3}]
+    for content in contents:
+        torch.save(content, tmp_path / "best.ckpt")
+        best = BestCheckpoint(tmp_path)
+        best.on_train_start(trainer, cast(Any, None))
+        assert not best.best_k_models
+
+
+def test_a_run_whose_last_checkpoint_is_its_weights_alone_is_one_line(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    last = train(CONFIG, data, tmp_path / "run")
+    (last.parent / "weights.ckpt").replace(last)
+    (last.parent / "previous.ckpt").unlink(missing_ok=True)
+    before = last.read_bytes()
+    with pytest.raises(TrainingError, match=r"last\.ckpt holds weights alone"):
+        train(CONFIG, data, tmp_path / "run")
+    assert last.read_bytes() == before
 
 
 def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:

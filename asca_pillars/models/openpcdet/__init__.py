@@ -1,1 +1,1 @@
-"""Weights that OpenPCDet trained, as checkpoints of ours."""
+"""Weights that OpenPCDet or mmdetection3d trained, as checkpoints of ours."""

@@ -1,7 +1,9 @@
-"""A checkpoint of OpenPCDet's PointPillars or PV-RCNN becomes one of ours."""
+"""A checkpoint of OpenPCDet's or mmdetection3d's PointPillars or PV-RCNN becomes one of ours."""
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,47 +13,93 @@ from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import unread
-from asca_pillars.models.openpcdet.links import convert_state
+from asca_pillars.models.openpcdet.links import Link, convert_state
+from asca_pillars.models.openpcdet.mmdetection3d_links import FIRST_LINEAR, FUSION, mmdetection3d_links
 from asca_pillars.models.openpcdet.pointpillars_links import pointpillars_links
 from asca_pillars.models.openpcdet.pv_rcnn_links import FIRST_CONVOLUTION, pv_rcnn_links
+from asca_pillars.models.openpcdet.weights_alone import load_weights_alone
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pv_rcnn_config import PvRcnnModel
 from asca_pillars.schema import to_dict
 
-CONFIG_OF = {"vfe.pfn_layers.0.linear.weight": "openpcdet_pointpillars_kitti", FIRST_CONVOLUTION: "pv_rcnn_kitti"}
+CONFIG_OF = {
+    "vfe.pfn_layers.0.linear.weight": "openpcdet_pointpillars_kitti",
+    FIRST_CONVOLUTION: "pv_rcnn_kitti",
+    FIRST_LINEAR: "mmdetection3d_pointpillars_kitti",
+    FUSION: "mmdetection3d_pv_rcnn_kitti",
+}
 """The configuration of the published model, by a name that only its family of checkpoints has."""
+
+_STATES: dict[str, Literal["OpenPCDet", "mmdetection3d"]] = {"model_state": "OpenPCDet", "state_dict": "mmdetection3d"}
+_NOT_LEGACY = re.compile(r"\blegacy['\"]?\s*[=:]\s*False\b")  # in a configuration as Python or as JSON writes it
 
 
 class ForeignWeights(NamedTuple):
-    """What OpenPCDet wrote."""
+    """What OpenPCDet or mmdetection3d wrote."""
 
     path: Path
     state: dict[str, Tensor]
     """Arrays by name."""
     steps: int
     """Optimizer steps behind them, as far as the file says."""
+    library: Literal["OpenPCDet", "mmdetection3d"] = "OpenPCDet"
+    classes: tuple[str, ...] = ()
+    """Names of the classes in their order, as far as the file says."""
+    legacy: bool = True
+    """Flag of mmdetection3d's encoder, see `encoder_links`; true unless the configuration in the file denies it."""
 
 
 def read_foreign(path: str | Path) -> ForeignWeights:
-    """Read a checkpoint of OpenPCDet, weights only: nothing in the file is executed.
+    """Read a checkpoint of OpenPCDet or mmdetection3d, weights only: nothing in the file is executed.
 
     Raises:
         TrainingError: no such file, damaged, or something else.
     """
     path = Path(path)
     if not path.is_file():
-        raise TrainingError(f"{path}: no such file; give a checkpoint of OpenPCDet (.pth)")
+        raise TrainingError(f"{path}: no such file; give a checkpoint of OpenPCDet or mmdetection3d (.pth)")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = load_weights_alone(path)
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
         raise TrainingError(
-            f"{path}: damaged, or holds more than weights, which is not read ({unread(error)})"
+            f"{path}: damaged, or holds more than weights, which is not read ({unread(error)}); where the library that "
+            "wrote it is installed, write a file with `model_state` (OpenPCDet) or `state_dict` (mmdetection3d) alone"
         ) from error
-    state = content.get("model_state") if isinstance(content, dict) else None
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise TrainingError(f"{path}: has no `model_state` with arrays, as OpenPCDet writes it")
-    steps = content.get("it")
-    return ForeignWeights(path, state, steps if isinstance(steps, int) and steps > 0 else 0)
+    if "hyper_parameters" in content:
+        raise TrainingError(f"{path}: a checkpoint of `asca train`, which needs no import; give it to `asca export`")
+    for key, library in _STATES.items():
+        state = content.get(key)
+        if isinstance(state, dict) and state and all(isinstance(value, Tensor) for value in state.values()):
+            return _described(ForeignWeights(path, state, 0, library), content)
+    raise TrainingError(
+        f"{path}: has neither `model_state` with arrays, as OpenPCDet writes it, nor `state_dict`, as mmdetection3d "
+        "does"
+    )
+
+
+def _described(weights: ForeignWeights, content: Mapping[str, Any]) -> ForeignWeights:
+    """The weights with what stands beside them in the file.
+
+    Raises:
+        TrainingError: mmdetection3d before 1.0 wrote them.
+    """
+    meta = content.get("meta")
+    meta = meta if isinstance(meta, dict) else {}
+    if str(meta.get("mmdet3d_version", "")).startswith("0."):
+        raise TrainingError(
+            f"{weights.path}: trained by mmdetection3d {meta['mmdet3d_version']}, whose boxes have other axes than "
+            "those of 1.0; give a checkpoint of 1.0 or later"
+        )
+    steps = content.get("it", meta.get("iter"))
+    described = meta.get("dataset_meta")
+    described = described if isinstance(described, dict) else {}
+    classes: Any = described.get("classes", described.get("CLASSES", meta.get("CLASSES", ())))
+    named = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
+    return weights._replace(
+        steps=steps if isinstance(steps, int) and steps > 0 else 0,
+        classes=tuple(classes) if named else (),
+        legacy=not any(_NOT_LEGACY.search(str(meta.get(key, ""))) for key in ("cfg", "config")),
+    )
 
 
 def published_config(weights: ForeignWeights) -> str:
@@ -64,7 +112,9 @@ def published_config(weights: ForeignWeights) -> str:
         if name in weights.state:
             return config
     some = ", ".join(sorted({name.split(".")[0] for name in weights.state})[:8])
-    raise TrainingError(f"{weights.path}: neither OpenPCDet's PointPillars nor its PV-RCNN; it has the parts {some}")
+    raise TrainingError(
+        f"{weights.path}: neither PointPillars nor PV-RCNN of OpenPCDet or mmdetection3d; it has the parts {some}"
+    )
 
 
 def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> int:
@@ -76,22 +126,27 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
         out: a file, such as pointpillars.ckpt.
 
     Raises:
-        ConfigError: `config` is of another family, or has what theirs cannot have.
+        ConfigError: `config` is of another family, has other classes, or what theirs cannot have.
         TrainingError: an array is missing, unknown, or of another shape; nothing is imported in part.
     """
-    model = config.model
-    if isinstance(model, PillarModel):
-        wanted, prefix = build_model(model).state_dict(), ""
-        links = list(pointpillars_links(model, weights.state))
-    elif isinstance(model, PvRcnnModel):
-        prefix = "network."
-        wanted = {name.removeprefix(prefix): value for name, value in build_model(model).state_dict().items()}
-        links = list(pv_rcnn_links(model, weights.state, wanted))
-    else:
-        raise ConfigError(f"model.kind = {model.kind}: OpenPCDet has none; give pillar or pv_rcnn")
+    model, names = config.model, config.model.spec.class_names
+    if not isinstance(model, PillarModel | PvRcnnModel):
+        raise ConfigError(f"model.kind = {model.kind}: {weights.library} has none; give pillar or pv_rcnn")
+    if len(weights.classes) == len(names) and tuple(map(str.casefold, weights.classes)) != tuple(
+        map(str.casefold, names)
+    ):
+        raise ConfigError(
+            f"{weights.path}: its classes are {', '.join(weights.classes)}, those of {config.name} {', '.join(names)}; "
+            "give a YAML with --config that has its classes in its order"
+        )
+    prefix = "" if isinstance(model, PillarModel) else "network."
+    wanted = {name.removeprefix(prefix): value for name, value in build_model(model).state_dict().items()}
+    links = _links(weights, model, wanted)
     linked = {link.target for link in links}
     if more := [name for name in wanted if name not in linked and not name.endswith("num_batches_tracked")]:
-        raise ConfigError(f"--config: OpenPCDet's model has no {more[0]}; switch off what {config.name} adds to it")
+        raise ConfigError(
+            f"--config: {weights.library}'s model has no {more[0]}; switch off what {config.name} adds to it"
+        )
     converted = convert_state(weights.state, links, wanted, str(weights.path))
     content = {
         "hyper_parameters": {"config": to_dict(config)},
@@ -101,3 +156,11 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
     with atomic_path(out) as temporary, temporary.open("wb") as file:  # see `AtomicCheckpointIO`
         torch.save(content, file)
     return len(weights.state)
+
+
+def _links(weights: ForeignWeights, model: PillarModel | PvRcnnModel, wanted: Mapping[str, Tensor]) -> list[Link]:
+    if weights.library == "mmdetection3d":
+        return list(mmdetection3d_links(model, weights.state, wanted, legacy=weights.legacy))
+    if isinstance(model, PillarModel):
+        return list(pointpillars_links(model, weights.state))
+    return list(pv_rcnn_links(model, weights.state, wanted))

@@ -1,8 +1,10 @@
-"""OpenPCDet's PointPillars as ours.
+"""The PointPillars of OpenPCDet, and the first layer of mmdetection3d's, as ours.
 
-Its points have a tenth feature, the height above the pillar's center. All pillars have the same center height, so the
+Their points have a tenth feature, the height above the pillar's center. All pillars have the same center height, so the
 feature is z less a constant: its weight joins that of z, and the constant joins the mean of the normalization. An empty
 slot has zeros in all ten, the height of the center included, and so it keeps its own value before the normalization.
+
+In mmdetection3d (`legacy`) the offsets to the pillar's center also take the place of x, y and z: their weights join.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,39 +17,64 @@ from asca_pillars.models.openpcdet.map_links import map_links
 from asca_pillars.pillar_config import PillarModel
 from asca_pillars.pillars.pillarize import FEATURES
 
-_LINEAR, _NORM = "vfe.pfn_layers.0.linear.weight", "vfe.pfn_layers.0.norm"
 _Z = FEATURES.index("z")
-_Z_CENTER = len(FEATURES)  # the one feature that ours does not have
+_X_CENTER, _Z_CENTER = FEATURES.index("x_center"), len(FEATURES)  # the last is the one feature that ours does not have
 
 
 def pointpillars_links(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Links for `build_pillar_detector(model)`; `state` has their unitless weights (out, in, ...) by name.
+    """Links for `build_pillar_detector(model)`; `state` has OpenPCDet's unitless weights (out, in, ...) by name.
 
     Raises:
         TrainingError: points with other features.
     """
+    yield from encoder_links(model, state, "vfe.pfn_layers.0")
+    yield from map_links(model.network.block_convs)
+
+
+def encoder_links(
+    model: PillarModel, state: Mapping[str, Tensor], layer: str, *, legacy: bool = False
+) -> Iterator[Link]:
+    """Links of the layer on points.
+
+    Args:
+        model: ours.
+        state: their unitless weights (out, in, ...) by name.
+        layer: their name of it.
+        legacy: whether the offsets to the pillar's center also stand in the place of x, y and z.
+
+    Raises:
+        TrainingError: points with other features.
+    """
+    name = f"{layer}.linear.weight"
     low_m, high_m = model.spec.grid.z_range_m
-    shape = tuple(state[_LINEAR].shape) if _LINEAR in state else None
+    shape = tuple(state[name].shape) if name in state else None
     if shape is not None and (len(shape) != 2 or shape[1] != _Z_CENTER + 1):
         raise TrainingError(
-            f"{_LINEAR} has shape {shape}: its points must have {_Z_CENTER + 1} features, x, y, z, intensity and six "
+            f"{name} has shape {shape}: its points must have {_Z_CENTER + 1} features, x, y, z, intensity and six "
             "offsets; others cannot be imported"
         )
 
-    def of_height(_: Tensor) -> Tensor:
-        return state[_LINEAR][:, _Z_CENTER] * ((low_m + high_m) / 2)
+    def explicit(weight: Tensor) -> Tensor:
+        """Their weight (out, 10) of x, y, z themselves and of their offsets, each once."""
+        weight = weight.clone()
+        if legacy:
+            weight[:, _X_CENTER:] += weight[:, : _Z + 1]
+            weight[:, : _Z + 1] = 0
+        return weight
+
+    def of_height(weight: Tensor) -> Tensor:
+        return explicit(weight)[:, _Z_CENTER] * ((low_m + high_m) / 2)
 
     def linear(weight: Tensor) -> Tensor:
-        merged = weight[:, :_Z_CENTER].clone()
-        merged[:, _Z] += weight[:, _Z_CENTER]
-        return merged
+        merged = explicit(weight)
+        merged[:, _Z] += merged[:, _Z_CENTER]
+        return merged[:, :_Z_CENTER]
 
-    yield Link(_LINEAR, "encode.linear.weight", linear)
-    for link in norm_links(_NORM, "encode.norm"):
+    yield Link(name, "encode.linear.weight", linear)
+    for link in norm_links(f"{layer}.norm", "encode.norm"):
         if link.target.endswith("running_mean"):
-            yield link._replace(convert=lambda mean: mean + of_height(mean))
+            yield link._replace(convert=lambda mean: mean + of_height(state[name]))
         else:
             yield link
     if model.network.empty_slots:
-        yield Link(_LINEAR, "encode.empty_slot", of_height)
-    yield from map_links(model.network.block_convs)
+        yield Link(name, "encode.empty_slot", of_height)

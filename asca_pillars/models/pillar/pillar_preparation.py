@@ -95,7 +95,9 @@ class PillarPreparation:
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points)
-        targets = assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels, self.assigner)
+        targets = assign_targets(
+            spec.anchors, spec.classes, frame.boxes, frame.labels, self.assigner, spec.direction_offset_rad
+        )
         return TargetedPillars(pillars, self.place(pillars), targets)
 
     def collate(self, frames: Sequence[TargetedPillars]) -> LabeledPillars:

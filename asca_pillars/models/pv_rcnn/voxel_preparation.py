@@ -47,7 +47,13 @@ class VoxelPreparation:
         scan = voxel_scan(points, spec, self.settings, spec.table_builder(training=True))
         return TargetedVoxels(
             scan,
-            assign_targets(spec.anchors, spec.classes, frame.boxes, frame.labels),
+            assign_targets(
+                spec.anchors,
+                spec.classes,
+                frame.boxes,
+                frame.labels,
+                direction_offset_rad=spec.direction_offset_rad,
+            ),
             keypoint_states(scan.keypoints, frame.boxes, frame.labels),
             frame.boxes,
             frame.labels,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.anchors import ClassSpec
+from asca_pillars.geometry.decode import PostProcess
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStage
 from asca_pillars.refine_config import RefineModel
@@ -69,7 +69,6 @@ def with_first_stage(model: RefineModel) -> RefineModel:
     )
 
 
-def _shape(spec: PillarSpec) -> tuple[object, ...]:
+def _shape(spec: PillarSpec) -> PillarSpec:
     """What the first stage computes with; thresholds and suppression are the second stage's own."""
-    unlimited: tuple[ClassSpec, ...] = tuple(replace(item, score_threshold=0.0) for item in spec.classes)
-    return spec.grid, spec.limits, unlimited
+    return replace(spec.with_score_threshold(0.0), post=PostProcess())

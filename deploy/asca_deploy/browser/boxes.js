@@ -1,6 +1,6 @@
 /** Head maps -> boxes: threshold, decode, rotated non-maximum suppression (asca_pillars/geometry/decode.py). */
 
-const BIN_START = Math.PI / 4;
+const DIRECTION_OFFSET = Math.PI / 4; // where bundle.json does not say
 const MAX_LOG_RATIO = Math.log(100);
 
 /**
@@ -15,6 +15,7 @@ const MAX_LOG_RATIO = Math.log(100);
 export function decodeCandidates(maps, grid, spec, yaws, cells) {
   const anchors = spec.classes.length * yaws.length;
   const floors = spec.classes.map(({ score_threshold: score }) => Math.log(score / (1 - score)));
+  const offset = spec.direction_offset_rad ?? DIRECTION_OFFSET;
   const best = spec.classes.map(() => []);
   maps.scores.forEach((logit, index) => {
     const anchor = index % anchors;
@@ -29,7 +30,7 @@ export function decodeCandidates(maps, grid, spec, yaws, cells) {
   return chosen
     .map(({ logit, anchor, row, label }) => {
       const own = anchorBox(grid, spec.classes[label], cells ? cells[row] : row, yaws[anchor % yaws.length]);
-      return { box: decodeBox(maps, row * anchors + anchor, own), score: 1 / (1 + Math.exp(-logit)), label };
+      return { box: decodeBox(maps, row * anchors + anchor, own, offset), score: 1 / (1 + Math.exp(-logit)), label };
     })
     .filter(({ box, score }) => box.every(Number.isFinite) && Number.isFinite(score));
 }
@@ -42,12 +43,12 @@ function anchorBox(grid, class_, cell, yaw) {
   return [x, y, class_.z_m, class_.length_m, class_.width_m, class_.height_m, yaw].map(Math.fround);
 }
 
-function decodeBox(maps, place, [x, y, z, length, width, height, yaw]) {
+function decodeBox(maps, place, [x, y, z, length, width, height, yaw], offset) {
   const residual = maps.boxes.subarray(7 * place, 7 * place + 7);
   const bin = maps.directions[2 * place + 1] > maps.directions[2 * place] ? 1 : 0;
   const diagonal = Math.hypot(length, width);
   const grow = (ratio) => Math.exp(Math.min(Math.max(ratio, -MAX_LOG_RATIO), MAX_LOG_RATIO));
-  const heading = BIN_START + Math.PI * bin + modulo(residual[6] + yaw - BIN_START, Math.PI);
+  const heading = offset + Math.PI * bin + modulo(residual[6] + yaw - offset, Math.PI);
   return Float32Array.of(
     x + residual[0] * diagonal,
     y + residual[1] * diagonal,

@@ -174,13 +174,13 @@ def test_files_that_are_no_weights(tmp_path: Path) -> None:
     for name, message in (
         ("text.pth", "damaged, or holds more than weights"),
         ("code.pth", "damaged, or holds more than weights"),
-        ("other.pth", "has no `model_state`"),
+        ("other.pth", "has neither `model_state` with arrays"),
         ("none.pth", "no such file"),
     ):
         with pytest.raises(TrainingError, match=message):
             read_foreign(tmp_path / name)
     with pytest.raises(
-        TrainingError, match="neither OpenPCDet's PointPillars nor its PV-RCNN; it has the parts backbone"
+        TrainingError, match="neither PointPillars nor PV-RCNN of OpenPCDet or mmdetection3d; it has the parts backbone"
     ):
         published_config(read_foreign(tmp_path / "unknown.pth"))
 

@@ -1,8 +1,9 @@
 """OpenPCDet's PV-RCNN, imported from both versions of spconv: the same values after every part."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -50,10 +51,10 @@ def foreign_network(model: PvRcnnModel = MODEL, channels: dict[str, int] = CHANN
     )
 
 
-def in_layout(state: dict[str, Tensor], layout: str) -> dict[str, Tensor]:
+def in_layout(state: dict[str, Tensor], layout: str, prefix: str = "backbone_3d") -> dict[str, Tensor]:
     axes = LAYOUTS[layout]
     return {
-        name: value.permute(axes).contiguous() if name.startswith("backbone_3d") and value.ndim == 5 else value
+        name: value.permute(axes).contiguous() if name.startswith(prefix) and value.ndim == 5 else value
         for name, value in state.items()
     }
 
@@ -85,51 +86,87 @@ def test_sparse_weights_of_every_layout_are_the_dense_ones(foreign: PvRcnn, tmp_
 
 
 def test_every_part_gives_what_theirs_gives(foreign: PvRcnn, tmp_path: Path) -> None:
-    ours = imported(foreign, tmp_path)
+    ours, part, pfe, head = imported(foreign, tmp_path), foreign.backbone_3d, foreign.pfe, foreign.roi_head
+
+    def fully_connected(layers: torch.nn.Module) -> Callable[[Tensor], Tensor]:
+        return lambda rows: layers(rows[..., None])[..., 0]
+
+    parts = Parts(
+        [[part.conv_input, *part.conv1], list(part.conv2), list(part.conv3), list(part.conv4), [part.conv_out]],
+        foreign.backbone_2d,
+        foreign.dense_head,
+        [list(layer.mlps) for layer in (pfe.SA_rawpoints, *pfe.SA_layers)],
+        pfe.vsa_point_feature_fusion,
+        foreign.point_head.cls_layers,
+        list(head.roi_grid_pool_layer.mlps),
+        fully_connected(head.shared_fc_layer),
+        fully_connected(head.cls_layers),
+        fully_connected(head.reg_layers),
+    )
+    assert_same_parts(parts, ours)
+
+
+class Parts(NamedTuple):
+    """The parts of somebody else's PV-RCNN, by what they compute."""
+
+    blocks: Sequence[Sequence[Any]]
+    """Convolution and normalization of each layer of conv1 to conv4 and of conv_out."""
+    backbone: Callable[[Tensor], Tensor]
+    head: Callable[[Tensor], Sequence[Tensor]]
+    balls: Sequence[Sequence[torch.nn.Module]]
+    """Of each source, an MLP for each radius."""
+    fuse: Callable[[Tensor], Tensor]
+    weigh: Callable[[Tensor], Tensor]
+    grid_balls: Sequence[torch.nn.Module]
+    shared: Callable[[Tensor], Tensor]
+    """Of the channels of a whole grid, those of its points side by side: (R, C * points) -> (R, hidden)."""
+    confidence: Callable[[Tensor], Tensor]
+    residuals: Callable[[Tensor], Tensor]
+
+
+def assert_same_parts(theirs: Parts, ours: OurNetwork) -> None:
+    """Every part of MODEL's network gives what their part gives of the same input."""
     detector = PvRcnnDetector(MODEL, ours).eval()
     scans = batch(detector, frame(0)).scans
     with torch.inference_mode():
         first = ours.propose(scans)
-        volumes = voxel_volumes(foreign, scans)
-        for level, theirs, own in zip(first.levels, volumes, scans.levels, strict=True):
+        volumes = voxel_volumes(theirs.blocks, scans)
+        for level, volume, own in zip(first.levels, volumes, scans.levels, strict=True):
             torch.testing.assert_close(
-                level.double(), torch.from_numpy(at_cells(theirs, own.cells.numpy())), atol=1e-4, rtol=1e-4
+                level.double(), torch.from_numpy(at_cells(volume, own.cells.numpy())), atol=1e-4, rtol=1e-4
             )
         seen_from_above = volumes[-1].float().flatten(1, 2)  # (1, C * D, H, W)
-        features = foreign.backbone_2d(seen_from_above)
-        for ours_map, their_map in zip(first.maps, foreign.dense_head(features), strict=True):
+        for ours_map, their_map in zip(first.maps, theirs.head(theirs.backbone(seen_from_above)), strict=True):
             torch.testing.assert_close(ours_map, their_map, atol=1e-4, rtol=1e-3)
 
         described, logits = ours.describe(scans, first.levels, first.canvas)
         cells = seen_from_above[0].flatten(1).T
         parts: Any = [sum(cells[scans.bev_cells[:, i]] * scans.bev_weights[:, i, None] for i in range(4))]
         sources = {"points": scans.points[:, 3:], "conv2": first.levels[1], "conv4": first.levels[3]}
-        balls, layers = iter(scans.ball_indices), (foreign.pfe.SA_rawpoints, *foreign.pfe.SA_layers)
-        for layer, positions, rows in zip(layers, scans.positions, sources.values(), strict=True):
-            parts += [pooled(mlp, positions, rows, scans.keypoints, next(balls)) for mlp in layer.mlps]
+        balls = iter(scans.ball_indices)
+        for mlps, positions, rows in zip(theirs.balls, scans.positions, sources.values(), strict=True):
+            parts += [pooled(mlp, positions, rows, scans.keypoints, next(balls)) for mlp in mlps]
         joined = torch.cat(parts, dim=1)  # theirs: map, raw points, levels
-        their_logits = foreign.point_head.cls_layers(joined)
+        their_logits = theirs.weigh(joined)
         torch.testing.assert_close(logits, their_logits[:, 0], atol=1e-4, rtol=1e-3)
-        their_features = foreign.pfe.vsa_point_feature_fusion(joined) * torch.sigmoid(their_logits)
+        their_features = theirs.fuse(joined) * torch.sigmoid(their_logits)
         torch.testing.assert_close(described, their_features, atol=1e-4, rtol=1e-3)
 
         boxes = frame(0).boxes[:3]
         grid = grid_neighbors(scans.keypoints.numpy(), boxes, SETTINGS)
         indices, points = [torch.from_numpy(index) for index in grid.indices], torch.from_numpy(grid.points)
         confidence, residuals = ours.refine(scans.keypoints, described, points, indices)
-        mlps = foreign.roi_head.roi_grid_pool_layer.mlps
-        balls_of = [pooled(mlp, scans.keypoints, described, points, i) for mlp, i in zip(mlps, indices, strict=True)]
+        pairs = zip(theirs.grid_balls, indices, strict=True)
+        balls_of = [pooled(mlp, scans.keypoints, described, points, index) for mlp, index in pairs]
         of_grid = torch.cat(balls_of, dim=1).view(len(boxes), SETTINGS.grid_size**3, -1)
-        shared = foreign.roi_head.shared_fc_layer(of_grid.permute(0, 2, 1).reshape(len(boxes), -1, 1))
-        torch.testing.assert_close(confidence, foreign.roi_head.cls_layers(shared)[:, 0, 0], atol=1e-4, rtol=1e-3)
-        torch.testing.assert_close(residuals, foreign.roi_head.reg_layers(shared)[..., 0], atol=1e-4, rtol=1e-3)
+        shared = theirs.shared(of_grid.permute(0, 2, 1).reshape(len(boxes), -1))
+        torch.testing.assert_close(confidence, theirs.confidence(shared)[:, 0], atol=1e-4, rtol=1e-3)
+        torch.testing.assert_close(residuals, theirs.residuals(shared), atol=1e-4, rtol=1e-3)
 
 
-def voxel_volumes(foreign: PvRcnn, scans: Any) -> list[Tensor]:
+def voxel_volumes(blocks: Sequence[Sequence[Any]], scans: Any) -> list[Tensor]:
     """Dense volumes (1, C, D, H, W) of conv1 to conv4 and conv_out, zero where no voxel is active."""
     volume, volumes = dense(scans.features.numpy(), scans.levels[0].cells.numpy(), SPEC.level_shapes[0]), []
-    part = foreign.backbone_3d
-    blocks = [[part.conv_input, *part.conv1], list(part.conv2), list(part.conv3), list(part.conv4), [part.conv_out]]
     for number, block in enumerate(blocks):
         cells = scans.levels[number].cells.numpy()
         for place, (convolution, norm) in enumerate(block):
