@@ -52,7 +52,7 @@ def argoverse_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str
 
 
 def aligned_size_error(found: Doubles, objects: Doubles) -> Doubles:
-    """Scale error of boxes (K, 7) that are laid over each other, center on center and heading on heading.
+    """Scale error of boxes (K, 7), metres and radians, laid over each other, center on center and heading on heading.
 
     The API's `iou_3d_axis_aligned` divides the common volume by the product of the larger extents, which is the volume
     of the smallest box around both, not that of their union.
