@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def test_a_note_says_which_labels_lie_outside_the_detectors_ranges(root: Path, p
     boxes = [box for line in lines if line["scan"].endswith(("1.bin", "2.bin")) for box in line["boxes"]]
     ahead = sum(0 <= box["x_m"] < 20 and -10 <= box["y_m"] < 10 for box in boxes)
     assert 0 < ahead < len(boxes)
-    scopes = {
+    scopes: dict[str, dict[str, Any]] = {
         "do not state the detector's ranges": {},
         f"{len(boxes) - ahead} of {len(boxes)} labelled boxes": {"ranges_m": [[0, 20], [-10, 10]]},
         "": {"ranges_m": None},

@@ -22,7 +22,7 @@ def test_it_survives_a_line(around: bool) -> None:
 def test_the_lowest_end_is_inside_and_the_highest_is_not() -> None:
     scope = DetectorScope(("Car",), ((0.0, 50.0), (-20.0, 20.0)))
     boxes = np.zeros((4, 7))
-    boxes[:, :2] = [[0, -20], [50, 0], [10, 20], [49.9, 19.9]]
+    boxes[:, :2] = np.array([[0, -20], [50, 0], [10, 20], [49.9, 19.9]])
     assert scope.holds(boxes).tolist() == [True, False, False, True]
 
 
