@@ -51,19 +51,28 @@ class InsertConfig(Strict):
         proportions: how often each class is wanted in the augmented training set, by name, relative to each other;
             empty: every class as often as any other.
         min_points: objects with fewer points inside their box do not enter the database.
+        disable_after_epoch: objects are inserted in so many epochs at the start of a run, and in none after them; if
+            not given, in all.
     """
 
     method: InsertMethod = "none"
     objects: int = 6
     proportions: dict[str, float] = field(default_factory=dict)
     min_points: int = 5
+    disable_after_epoch: int | None = None
 
     def __post_init__(self) -> None:
         require_bounds("augment.insert", self, ("objects",), low=0)
         require_bounds("augment.insert", self, ("min_points",), low=1)
+        if self.disable_after_epoch is not None:
+            require_bounds("augment.insert", self, ("disable_after_epoch",), low=1)
         for name, share in self.proportions.items():
             if not (math.isfinite(share) and share >= 0):
                 raise ConfigError(f"augment.insert.proportions.{name} = {share:g}: must be at least 0")
+
+    def inserts_in(self, epoch: int) -> bool:
+        """Whether objects are inserted in an epoch, counted from 0."""
+        return self.method != "none" and (self.disable_after_epoch is None or epoch < self.disable_after_epoch)
 
 
 @dataclass(frozen=True)

@@ -214,6 +214,7 @@ model:
         ("augment.point_dropout", "-0.1", "must lie between 0 and 1"),
         ("augment.insert.objects", "-1", "must be at least 0"),
         ("augment.insert.min_points", "0", "must be at least 1"),
+        ("augment.insert.disable_after_epoch", "0", "must be at least 1"),
         ("augment.insert.proportions.Car", "-1", "must be at least 0"),
         ("augment.object_shift_m", "-0.1", "must be at least 0"),
         ("augment.rotation_rad", ".inf", "should be a finite number"),

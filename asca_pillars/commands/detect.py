@@ -104,6 +104,7 @@ def detect(
     from asca_pillars.commands.detect_scans import detect_scans
     from asca_pillars.commands.models import open_detector
     from asca_pillars.commands.scan_input import ScanInput, scan_settings
+    from asca_pillars.data.boxes.detector_scope import detector_scope
     from asca_pillars.data.recordings.open_recording import is_recording
     from asca_pillars.data.scans.find_scans import name_scans
 
@@ -153,4 +154,6 @@ def detect(
     detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
-    detect_scans(named, scan_input, detector, ResultWriter(out, pictures=pictures is not False), console)
+    scope = detector_scope(detector.spec, around=around)
+    writer = ResultWriter(out, pictures=pictures is not False, scope=scope)
+    detect_scans(named, scan_input, detector, writer, console)

@@ -25,6 +25,7 @@ from asca_pillars.commands.extras import require
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.commands.scan_input import ScanInput
+from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.scan_reader import ReflectanceScale, Scan, read_scan
@@ -87,7 +88,8 @@ class DetectShard:
     def _line(self, detector: Detector, path: str, scale: ReflectanceScale) -> str:
         try:
             scan = self._read(self.start / path, scale)
-            return as_line(scan_content(Path(path), scan, detector(scan.points)))
+            scope = detector_scope(detector.spec, around=self.around)
+            return as_line(scan_content(Path(path), scan, detector(scan.points), scope))
         except ClusterError:
             raise
         except ScanError as error:

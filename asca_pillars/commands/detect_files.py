@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import Detections
+from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.labels_beside import labels_beside
 from asca_pillars.data.scans.scan_reader import Scan
@@ -28,13 +29,14 @@ class ResultWriter:
     Args:
         out: the folder: absent, empty, or that of an earlier run. Results of other scans in it stay.
         pictures: False writes no picture.
+        scope: what the detector could find.
 
     Raises:
         OutputError: when the block is entered, if `out` holds files of something else.
     """
 
-    def __init__(self, out: Path, *, pictures: bool) -> None:
-        self.out, self._pictures = out, pictures
+    def __init__(self, out: Path, *, pictures: bool, scope: DetectorScope) -> None:
+        self.out, self._pictures, self._scope = out, pictures, scope
         self._stack = ExitStack()
         self._lines: IO[str] | None = None
         self.remarks: list[str] = []
@@ -54,7 +56,7 @@ class ResultWriter:
         if self._lines is None:
             self._lines = self._open()
         calibration = self._calibration(path)  # first: of several remarks a user sees the first one
-        content = scan_content(path, scan, detections)
+        content = scan_content(path, scan, detections, self._scope)
         write_json(self._named(name, ".json"), content)
         self._lines.write(as_line(content))
         if self._pictures:
@@ -111,13 +113,14 @@ def as_line(content: dict[str, Any]) -> str:
     return json.dumps(content) + "\n"
 
 
-def scan_content(path: Path, scan: Scan, detections: Detections) -> dict[str, Any]:
-    """What is written of one scan, as plain values; `path` names it."""
+def scan_content(path: Path, scan: Scan, detections: Detections, scope: DetectorScope) -> dict[str, Any]:
+    """What is written of one scan, as plain values; `path` names it, `scope` is the detector's."""
     report, notes = detections.report, scan.notes
     return {
         "scan": str(path),
         "frame": "that of the scan; box centers; yaw about z, from x towards y",
         "boxes": detections.to_dicts(),
+        "detector": scope.to_json(),
         **asdict(report.counts),
         "passes": report.passes,
         "points_not_finite": report.non_finite_points + notes.dropped_points,

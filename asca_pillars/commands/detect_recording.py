@@ -36,6 +36,7 @@ from asca_pillars.commands.recording_results import (
 )
 from asca_pillars.commands.rerun_file import RerunFile, require_own_rrd
 from asca_pillars.commands.scan_input import said_of_scale
+from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.recordings.odometry import Poses, read_poses
@@ -119,7 +120,8 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
         if task.track:
             _check_times(times_ns, task, topic.name, poses, console)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
-        count, classes = _write(task, results, scans, calibration, about)
+        scope = detector_scope(detector.spec, around=task.around)
+        count, classes = _write(task, results, scans, calibration, scope, about)
         journal.remove()
     boxes = ", ".join(f"{classes[name]} {name}" for name in detector.spec.class_names)
     console.print(f"{count} scans, in all {boxes}", highlight=False)
@@ -220,17 +222,15 @@ def _about(
 ) -> dict[str, Any]:
     """All that detections depend on: a journal of anything else is not gone on with."""
     files = recording_files(task.path)
-    ranges = detector.spec.ranges
     return {
         "recording": str(task.path),
         "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files],
         "topic": topic,
         "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         "runs_on": detector.runs_on,
-        "classes": list(detector.spec.class_names),
+        **detector_scope(detector.spec, around=task.around).to_json(),
         "score": least,
         "around": task.around,
-        "ranges_m": None if task.around else [list(ranges.x_m), list(ranges.y_m)],
         "mounting": to_dict(mounting),  # what the files that `reading` names had in them
         "reading": {name: None if value is None else str(value) for name, value in asdict(reading).items()},
     }
@@ -248,6 +248,7 @@ def _write(
     results: Iterator[Found],
     scans: RecordedScans,
     calibration: Any,
+    scope: DetectorScope,
     about: dict[str, Any],
 ) -> tuple[int, Counter[str]]:
     """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
@@ -255,7 +256,7 @@ def _write(
         place = places.enter_context(atomic_path(task.out / ABOUT_FILE))
         place.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")
         text = places.enter_context(atomic_path(task.out / RUN_FILE))
-        files: list[ResultFile] = [JsonLines(open_text(handles, text), task.path.name)]
+        files: list[ResultFile] = [JsonLines(open_text(handles, text), task.path.name, scope)]
         if calibration is not None:
             kitti = places.enter_context(atomic_path(task.out / KITTI_FILE))
             files.append(KittiTracks(open_text(handles, kitti), calibration))

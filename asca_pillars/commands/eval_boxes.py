@@ -11,6 +11,7 @@ from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_u
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError
@@ -70,7 +71,14 @@ def _run(model: Model, split: LabeledSplit, task: BoxTask, console: Console) -> 
     """Run the model and write what it finds: what is scored is read from there, so that it can be scored again."""
     with atomic_directory(task.out / "predictions", COMMAND, MADE_BY) as folder:
         camera_view = split.has_camera and model.camera_view
-        write_box_predictions(folder / PREDICTIONS, split, model.detect, camera_view=camera_view, console=console)
+        write_box_predictions(
+            folder / PREDICTIONS,
+            split,
+            model.detect,
+            scope=detector_scope(model.spec, around=task.around),
+            camera_view=camera_view,
+            console=console,
+        )
         about = {"model": model.about, "data": str(split.root), "split": split.name, "files": [PREDICTIONS]}
         write_json(folder / MADE_BY, about)
     warn_of_unlike_scans(model, len(split.frame_ids), console)

@@ -14,6 +14,14 @@ def prepare(
     data: DataOption,
     override: OverridesOption = None,
     workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+    kitti_split: Annotated[
+        bool,
+        typer.Option(
+            "--kitti-split",
+            help="Before that, write ImageSets/train.txt and val.txt with the 3,712 and 3,769 frames that papers train "
+            "and validate on (Chen et al., 2015), for KITTI's 7,481 scans.",
+        ),
+    ] = False,
 ) -> None:
     """Compute once what training needs of a dataset.
 
@@ -28,6 +36,12 @@ def prepare(
     from asca_pillars.config import load_config
 
     settings = load_config(config, override or ())
+    console = Console(markup=False)
+    if kitti_split:
+        from asca_pillars.data.kitti.train_val_split import write_train_val_lists
+
+        for path in write_train_val_lists(data):
+            console.print(f"written: {path}", soft_wrap=True, highlight=False)
     require("train")
     from asca_pillars.data.insertion.free_maps import prepare_free_spaces
     from asca_pillars.data.insertion.insert_objects import prepare_inserter
@@ -50,4 +64,4 @@ def prepare(
     lines = [f"{inserter.database.path}: {len(inserter.database)} objects of {len(split.frame_ids)} frames"]
     for name, objects, share in zip(spec.class_names, inserter.candidates, inserter.shares, strict=True):
         lines.append(f"  {name}: {len(objects)} with {insert.min_points} or more points, drawn {share:.0%} of the time")
-    Console(markup=False).print("\n".join(lines), soft_wrap=True, highlight=False)
+    console.print("\n".join(lines), soft_wrap=True, highlight=False)

@@ -14,6 +14,7 @@ from asca_deploy import Detections
 from asca_deploy.tracker import MAX_SCAN_GAP_S, Tracker
 from asca_deploy.tracks import Tracks
 from asca_pillars.commands.recording_journal import Journal
+from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
 from asca_pillars.geometry.frame_change import FrameChange
 
@@ -106,8 +107,8 @@ def said_of_stamps(times_ns: Sequence[int]) -> str | None:
 class JsonLines:
     """A line for each scan: records as `asca detect` writes them for files, with time, and with identities if any."""
 
-    def __init__(self, file: IO[str], recording: str) -> None:
-        self._file, self._recording = file, recording
+    def __init__(self, file: IO[str], recording: str, scope: DetectorScope) -> None:
+        self._file, self._recording, self._detector = file, recording, scope.to_json()
 
     def write(self, found: Found) -> None:
         """One line."""
@@ -118,6 +119,7 @@ class JsonLines:
             "time_ns": found.time_ns,
             "frame_id": found.frame_id,
             "boxes": boxes,
+            "detector": self._detector,
             "points_not_finite": found.dropped_points,
         }
         self._file.write(json.dumps(line) + "\n")

@@ -58,7 +58,7 @@ class TrainingFrames:
             camera_view=self.camera_view,
             min_points=self.min_points,
         )
-        if self.inserter is not None:
+        if self.inserter is not None and self.inserter.settings.inserts_in(epoch):
             # A generator of its own: all other draws stay what they are without insertion.
             frame = insert_objects(frame, self.inserter, np.random.default_rng((self.seed, epoch, number, 1)))
         if self.augmentation is not None and rng is not None:

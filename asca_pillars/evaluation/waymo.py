@@ -6,7 +6,7 @@ Definition: P. Sun et al., "Scalability in Perception for Autonomous Driving: Wa
 - Boxes match by a 3D IoU of at least 0.7 for vehicles and 0.5 for every other class, one to one within a frame and a
   class, so that the sum of IoU is greatest. Scores take no part in it: for each cutoff 0, 0.01, ..., 1 the detections
   that reach it are matched anew.
-- What holds no LiDAR point is no object. Up to 5 points, or the labelers' word, make an object LEVEL_2. At LEVEL_2
+- What holds no LiDAR point is no object. Up to 5 points make an object LEVEL_2. At LEVEL_2
   every object counts. At LEVEL_1 an unfound LEVEL_2 object is not missed, but one that was found is a find
   like any other, in the precision and on both sides of the recall.
 - A find has the heading accuracy 1 - d / pi, d in [0, pi] being the difference of the headings. APH puts the sum of

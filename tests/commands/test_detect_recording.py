@@ -15,7 +15,8 @@ import pytest
 
 pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
 
-from asca_deploy import sample_scan_path
+from asca_deploy import find_bundle, sample_scan_path
+from asca_deploy.manifest import load_bundle
 from asca_pillars.commands import detect_recording as steps
 from asca_pillars.commands import extras
 from asca_pillars.commands.detect import detect
@@ -46,13 +47,19 @@ def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys:
     lines = run(drive, tmp_path)
     assert [line["time_ns"] for line in lines] == stamps(SCANS)
     assert lines[0]["frame_id"] == "lidar" and "track_id" not in lines[0]["boxes"][0]
+    spec = load_bundle(find_bundle(None)).spec
+    ranges_m = [list(spec.ranges.x_m), list(spec.ranges.y_m)]
+    assert [line["detector"] for line in lines] == [{"classes": list(spec.class_names), "ranges_m": ranges_m}] * SCANS
     assert {path.name for path in tmp_path.iterdir()} == {"detections.jsonl", "recording.json"}
     said = capsys.readouterr().out
     assert "/lidar: 5 scans" in said and "ms of CPU per scan" in said
     # The same boxes as of the scan alone.
     np.save(tmp_path / "scan.npy", POINTS)
     detect([tmp_path / "scan.npy"], out=tmp_path / "alone", threads=1, pictures=False)
-    assert json.loads((tmp_path / "alone" / "scan.json").read_text())["boxes"] == lines[0]["boxes"]
+    alone = json.loads((tmp_path / "alone" / "scan.json").read_text())
+    assert (alone["boxes"], alone["detector"]) == (lines[0]["boxes"], lines[0]["detector"])
+    detect([tmp_path / "scan.npy"], out=tmp_path / "around", threads=1, pictures=False, around=True)
+    assert json.loads((tmp_path / "around" / "detections.jsonl").read_text())["detector"]["ranges_m"] is None
 
 
 def test_tracks_last_and_move(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

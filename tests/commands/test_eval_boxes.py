@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,6 +76,26 @@ def test_a_model_is_run_and_scores_the_same_again(root: Path, tmp_path: Path) ->
     of_car = [[score for score in one["iou"] if score["class_name"] == "Car"] for one in (report, again)]
     assert of_car[0] == of_car[1] and len(of_car[0]) > 0
     invoke("eval", "--data", root, "--out", first)  # replaces its own
+
+
+def test_a_note_says_which_labels_lie_outside_the_detectors_ranges(root: Path, perfect: Path, tmp_path: Path) -> None:
+    lines = [json.loads(line) for line in perfect.read_text().splitlines()]
+    boxes = [box for line in lines if line["scan"].endswith(("1.bin", "2.bin")) for box in line["boxes"]]
+    ahead = sum(0 <= box["x_m"] < 20 and -10 <= box["y_m"] < 10 for box in boxes)
+    assert 0 < ahead < len(boxes)
+    scopes: dict[str, dict[str, Any]] = {
+        "do not state the detector's ranges": {},
+        f"{len(boxes) - ahead} of {len(boxes)} labelled boxes": {"ranges_m": [[0, 20], [-10, 10]]},
+        "": {"ranges_m": None},
+    }
+    for text, scope in scopes.items():
+        detector = {"detector": {"classes": ["Car", "Forklift"], **scope}}
+        perfect.write_text("".join(json.dumps(line | detector) + "\n" for line in lines))
+        invoke("eval", "--data", root, "--predictions", perfect, "--out", tmp_path / "out")
+        report = json.loads((tmp_path / "out" / "iou.json").read_text())
+        said = [note for note in report["notes"] if "detector's ranges" in note]
+        assert [text in note for note in said] == [True] * bool(text)
+        assert {score["ap"] for score in report["iou"] if score["band"] == "all"} == {100.0}
 
 
 def test_scans_of_another_mounting_are_brought_to_the_models(tmp_path: Path) -> None:

@@ -133,6 +133,18 @@ def test_the_order_of_detections_does_not_matter() -> None:
         assert score_of(truth, found(*scored), 2).ap == pytest.approx(25)
 
 
+def test_a_label_turned_by_exactly_pi_is_found() -> None:
+    """The tool's polygon code gives one such pair of its example files an overlap of 0; its overlap is 1."""
+    rng = np.random.default_rng(0)
+    truth, detections = [], []
+    for _ in range(500):
+        there = [*rng.uniform(-60, 60, 2), 0.0, *rng.uniform(1, 6, 3), rng.uniform(-pi, pi)]
+        truth.append(labelled(there))
+        detections.append(found((0.9, [*there[:6], there[6] + pi])))
+    score = score_of(truth, detections)
+    assert score.ap == pytest.approx(100) and score.aph == pytest.approx(0, abs=1e-4)
+
+
 @settings(max_examples=20)
 @given(st.lists(st.tuples(st.sampled_from([0, 1, 2]), st.integers(-9, 9)), min_size=1, unique_by=lambda item: item[1]))
 def test_labels_score_100_against_themselves(places: list[tuple[int, int]]) -> None:

@@ -54,7 +54,7 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             same = frames.setdefault(frame_id_of(path, scans), BoxFrame(path, labels, nothing)).scan
             if same != path:
                 raise DatasetError(f"{same} and {path}: both would be frame {frame_id_of(path, scans)}; rename one")
-    for scan, records, place, time_s in read_frames(labels):
+    for scan, records, place, time_s, _ in read_frames(labels):
         path = _find_scan(scan, scans, place)
         frame_id = frame_id_of(path, scans)
         if frame_id in places:

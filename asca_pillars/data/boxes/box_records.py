@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import wrap_angle
 
@@ -46,13 +47,14 @@ class BoxRecords(NamedTuple):
 class NamedRecords(NamedTuple):
     """Records of a frame, the scan that they are said to belong to, and where they stand: FILE:LINE.
 
-    `time_s` is the frame's time stamp, None where a line has none.
+    `time_s` is the frame's time stamp, `detector` what the records were found by; None where a line states none.
     """
 
     scan: str
     records: BoxRecords
     place: str
     time_s: float | None = None
+    detector: DetectorScope | None = None
 
 
 def read_frames(path: Path) -> Iterator[NamedRecords]:
@@ -114,8 +116,10 @@ def records_from(
     )
 
 
-def json_line(scan: str, records: BoxRecords, time_s: float | None = None) -> str:
-    """One line of a *.jsonl file, with its line break, of a scan with this time stamp."""
+def json_line(
+    scan: str, records: BoxRecords, time_s: float | None = None, detector: DetectorScope | None = None
+) -> str:
+    """One line of a *.jsonl file, with its line break, of a scan with this time stamp, found by this detector."""
     boxes = []
     for box, kind, score, track_id in zip(*records, strict=True):
         record: dict[str, Any] = {"class": kind}
@@ -125,8 +129,13 @@ def json_line(scan: str, records: BoxRecords, time_s: float | None = None) -> st
         if track_id is not None:
             record["track_id"] = track_id
         boxes.append(record)
-    stamp = {} if time_s is None else {"time_s": time_s}
-    return json.dumps({"scan": scan, **stamp, "boxes": boxes}) + "\n"
+    line: dict[str, Any] = {"scan": scan}
+    if time_s is not None:
+        line["time_s"] = time_s
+    line["boxes"] = boxes
+    if detector is not None:
+        line["detector"] = detector.to_json()
+    return json.dumps(line) + "\n"
 
 
 def _json_lines(path: Path) -> Iterator[NamedRecords]:
@@ -138,7 +147,8 @@ def _json_lines(path: Path) -> Iterator[NamedRecords]:
         scan = content.get("scan") if isinstance(content, dict) else None
         if not isinstance(scan, str) or not scan:
             raise DatasetError(f'{place}: no "scan"; a line is {{"scan": "NAME.bin", "boxes": [...]}}')
-        yield NamedRecords(scan, _json_records(content, place), place, _time_s(content))
+        detector = scope_from_json(content.get("detector"))
+        yield NamedRecords(scan, _json_records(content, place), place, _time_s(content), detector)
 
 
 def _time_s(content: Any) -> float | None:

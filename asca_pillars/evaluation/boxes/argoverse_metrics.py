@@ -8,8 +8,8 @@ NeurIPS Datasets and Benchmarks 2021, and its API (`av2.evaluation.detection`) w
 - Up to 100 detections of a class in a frame count, by score, and what is less than 150 m away.
 - Precision at a recall is the best at that recall or beyond, taken at the recalls 0, 0.01, ... 1, in between linearly,
   0 beyond the highest. AP is their mean, and the class' AP the mean over the distances.
-- Errors are means over the true positives below 2 m: ATE in m, ASE 1 - IoU of the sizes laid over each other, AOE
-  in rad. Without one they are 2 m, 1 and pi.
+- Errors are means over the true positives below 2 m: ATE in m, ASE (`aligned_size_error`, which is not nuScenes'),
+  AOE in rad. Without one they are 2 m, 1 and pi.
 - CDS = AP * mean(1 - ATE / 2 m, 1 - ASE, 1 - AOE / pi).
 
 The API restricts both sides to the map's region of interest; without a map everything counts here.
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.evaluation.boxes.box_pairs import UNMATCHED, BoxPairs, Doubles, EvaluatedFrame, pair_class
-from asca_pillars.evaluation.boxes.nuscenes_metrics import DISTANCES_M, ERROR_DISTANCE_M, RECALLS, size_error
+from asca_pillars.evaluation.boxes.nuscenes_metrics import DISTANCES_M, ERROR_DISTANCE_M, RECALLS
 from asca_pillars.geometry.boxes import wrap_angle
 
 MAX_DETECTIONS = 100
@@ -51,6 +51,19 @@ def argoverse_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str
     return [_score(pair_class(within, name, _closeness), name) for name in class_names]
 
 
+def aligned_size_error(found: Doubles, objects: Doubles) -> Doubles:
+    """Scale error of boxes (K, 7), metres and radians, laid over each other, center on center and heading on heading.
+
+    The API's `iou_3d_axis_aligned` divides the common volume by the product of the larger extents, which is the volume
+    of the smallest box around both, not that of their union.
+
+    Returns:
+        (K,) in [0, 1).
+    """
+    shared = np.minimum(found[:, 3:6], objects[:, 3:6]).prod(axis=1)
+    return 1 - shared / np.maximum(found[:, 3:6], objects[:, 3:6]).prod(axis=1)
+
+
 def _closeness(found: Doubles, objects: Doubles) -> Doubles:
     return -np.linalg.norm(found[:, None, :3] - objects[None, :, :3], axis=2)
 
@@ -74,7 +87,7 @@ def _score(pairs: BoxPairs, name: str) -> ArgoverseScore:
     if true.any():
         found, own = pairs.found[true], pairs.objects[owner[true]]
         turned = np.abs(wrap_angle(found[:, 6] - own[:, 6]))
-        errors = np.array([distance_m[true].mean(), size_error(found, own).mean(), turned.mean()])
+        errors = np.array([distance_m[true].mean(), aligned_size_error(found, own).mean(), turned.mean()])
     cds = ap * float(np.mean(1 - errors / _WORST))
     ate_m, ase, aoe_rad = errors.tolist()
     return ArgoverseScore(name, objects, 100 * ap, ate_m, ase, aoe_rad, 100 * cds)

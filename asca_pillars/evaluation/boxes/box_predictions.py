@@ -10,10 +10,11 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_pillars.data.boxes.box_records import NamedRecords, json_line, records_from
+from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
-from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame
+from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame, stated_scope
 from asca_pillars.evaluation.predictions import shortage
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.detections import Detections
@@ -24,10 +25,12 @@ NEAR_LABEL_M = 4.0
 
 @dataclass(frozen=True)
 class BoxFrames:
-    """Frames with labels and predictions, and those that have no predictions."""
+    """Frames with labels and predictions, those that have no predictions, and what the detector could have found."""
 
     frames: tuple[EvaluatedFrame, ...]
     without_predictions: tuple[str, ...]
+    scope: DetectorScope | None
+    """None where the predictions do not state it."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -43,12 +46,13 @@ def write_box_predictions(
     split: LabeledSplit,
     detect: Callable[[NDArray[np.float32]], Detections],
     *,
+    scope: DetectorScope,
     camera_view: bool,
     console: Console | None = None,
 ) -> None:
     """Run a detector over a split and write a line for each frame (`data.boxes.box_records`), in the scan's own frame.
 
-    The detector gets points (N, 4), only those in the camera's view if `camera_view`.
+    The detector gets points (N, 4), only those in the camera's view if `camera_view`. Each line states its `scope`.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
@@ -59,7 +63,7 @@ def write_box_predictions(
             found = detect(split.points(frame_id, camera_view=camera_view))
             boxes = found.boxes if level.is_identity else level.inverse.boxes(found.boxes)
             records = records_from(boxes, found.names, found.scores)
-            file.write(json_line(f"{frame_id}{split.scan_path(frame_id).suffix}", records))
+            file.write(json_line(f"{frame_id}{split.scan_path(frame_id).suffix}", records, detector=scope))
 
 
 def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | None = None) -> BoxFrames:
@@ -91,7 +95,7 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
         found_types = tuple(records.types[row] for row in kept)
         frames.append(EvaluatedFrame(frame_id, objects, types, visible, found[kept], found_types, records.scores[kept]))
     missing = tuple(frame_id for frame_id in split.frame_ids if frame_id not in predictions)
-    return BoxFrames(tuple(frames), missing)
+    return BoxFrames(tuple(frames), missing, stated_scope(path, predictions.values()))
 
 
 def _can_be_judged(
@@ -103,7 +107,7 @@ def _can_be_judged(
 
 
 def _require_scores(lines: Iterable[NamedRecords]) -> None:
-    for _, records, place, _ in lines:
-        if np.isnan(records.scores).any():
-            number = int(np.isnan(records.scores).argmax()) + 1
-            raise DatasetError(f"{place}, box {number}: no `score`; every prediction needs one")
+    for line in lines:
+        if np.isnan(line.records.scores).any():
+            number = int(np.isnan(line.records.scores).argmax()) + 1
+            raise DatasetError(f"{line.place}, box {number}: no `score`; every prediction needs one")

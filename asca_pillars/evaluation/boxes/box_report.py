@@ -79,6 +79,8 @@ def box_notes(report: BoxReport) -> list[str]:
     others = [f"{name} ({count})" for name, count in types.items() if name not in report.class_names]
     hidden = sum(int((~frame.visible).sum()) for frame in report.frames.frames)
     notes = [f"Labelled, but no class that is evaluated: {', '.join(others)}"] if others else []
+    if scope_note := _scope_note(report):
+        notes.append(scope_note)
     if hidden:
         notes.append(f"{hidden} labelled boxes hold no point and count neither as missed nor as found")
     best = [
@@ -89,6 +91,26 @@ def box_notes(report: BoxReport) -> list[str]:
     if best:
         notes.append(f"Scores with the best F1 on this data, within {MATCH_M:g} m: {', '.join(best)}")
     return notes
+
+
+def _scope_note(report: BoxReport) -> str | None:
+    scope = report.frames.scope
+    if scope is None:
+        return (
+            "The predictions do not state the detector's ranges: labelled boxes count in every direction, and those "
+            "outside the ranges as missed"
+        )
+    count = outside = 0
+    for frame in report.frames.frames:
+        own = np.array([kind in report.class_names for kind in frame.object_types], bool) & frame.visible
+        count += int(own.sum())
+        outside += int((own & ~scope.holds(frame.objects)).sum())
+    if not outside:
+        return None
+    return (
+        f"{outside} of {count} labelled boxes of these classes lie outside the detector's ranges, {scope.where()}; "
+        "they count, as missed"
+    )
 
 
 def box_json(report: BoxReport) -> dict[str, Any]:

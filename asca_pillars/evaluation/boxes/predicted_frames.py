@@ -1,6 +1,7 @@
 """Which frame of a dataset each line of predictions belongs to: by the name of its scan's file, or by its time."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.boxes.box_records import NamedRecords, read_frames
 from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 
@@ -40,6 +42,26 @@ def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedReco
             "predictions of a recording, give its labels the recording's `time_s`"
         )
     return found
+
+
+def stated_scope(path: Path, lines: Iterable[NamedRecords]) -> DetectorScope | None:
+    """What the detector could have found, as all of the lines state it; None where that is not known.
+
+    Lines of earlier versions state nothing; then a `recording.json` beside `path`, the file of the lines, does.
+
+    Raises:
+        DatasetError: that file cannot be read.
+    """
+    stated = {line.detector for line in lines}
+    if stated != {None}:
+        return stated.pop() if len(stated) == 1 else None
+    beside = path.parent / "recording.json"
+    if not beside.is_file():
+        return None
+    try:
+        return scope_from_json(json.loads(beside.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{beside}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None
 
 
 def _frame_of_line(

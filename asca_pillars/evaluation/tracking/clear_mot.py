@@ -6,7 +6,8 @@ others are matched one to one for the greatest total similarity. Then, over N_la
     MOTA = 1 - (misses + false boxes + identity switches) / N_labels
 
 An identity switch is a match with another identity than that of the object's last match; a fragmentation is a match
-after frames in which the object was missed, when it had been matched before (Li, Huang, Nevatia, CVPR 2009).
+after frames in which the object was missed, when it had been matched before (Li, Huang, Nevatia, CVPR 2009). TrackEval
+counts the return of an object that was not labelled meanwhile, too, and no gap of frames in which nothing was found.
 """
 
 from collections.abc import Sequence

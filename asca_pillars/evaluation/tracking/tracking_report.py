@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.boxes.box_records import NamedRecords
 from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import DatasetError
-from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame
+from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame, stated_scope
 from asca_pillars.evaluation.report_page import TextTable
 from asca_pillars.evaluation.tracking.clear_mot import ClearMot, clear_mot
 from asca_pillars.evaluation.tracking.hota import Hota, hota
@@ -45,7 +46,18 @@ class TrackingReport:
     frames_found: int
     not_scored: dict[str, int]
     """How many labels there are of each class that is not scored, because the detector does not know it."""
+    scope: DetectorScope | None
+    """What the detector could have found; None where the predictions do not state it."""
+    outside: int
+    """Labels of the scored classes that are not counted because they lie outside its ranges."""
+    hidden: int
+    """Labels of the scored classes within its ranges that are not counted because hardly anything is seen of them."""
     about: dict[str, Any]
+
+    @property
+    def counted(self) -> int:
+        """How many labels are counted."""
+        return sum(one.clear.labels for one in self.scores)
 
 
 @dataclass(frozen=True)
@@ -54,7 +66,9 @@ class _Frame:
 
     labels: Boxes
     types: tuple[str, ...]
-    counted: Any
+    counted: NDArray[np.bool_]
+    outside: int
+    hidden: int
     found: Boxes
     found_types: tuple[str, ...]
 
@@ -63,9 +77,9 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
     """Score the tracks that `asca detect --track` wrote.
 
     `predictions_by_frame` says which frame a line belongs to. Labelled frames without a line count as frames in which
-    nothing was found. Not counted are labels outside the ranges that the predictions' folder notes (recording.json), of
-    fewer than MIN_POINTS points and of unknown occlusion. Scored are the detector's classes, which the folder notes,
-    too; without it those that are predicted.
+    nothing was found. Not counted are labels outside the ranges that the predictions state (`stated_scope`), of fewer
+    than MIN_POINTS points and of unknown occlusion. Scored are the detector's classes, which they state, too, and
+    those that are predicted.
 
     Args:
         split: labels with `track_id`; a frame's folder is its sequence.
@@ -78,21 +92,24 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
     """
     path = predictions / "detections.jsonl" if predictions.is_dir() else predictions
     found = predictions_by_frame(path, split)
-    about_run = _about_run(path.parent / "recording.json")
-    names = about_run.get("classes") or sorted({kind for one in found.values() for kind in one.records.types})
+    scope = stated_scope(path, found.values())
+    predicted = sorted({kind for one in found.values() for kind in one.records.types})
+    names = tuple(dict.fromkeys((*(() if scope is None else scope.classes), *predicted)))
     sequences: dict[str, list[_Frame]] = {}
     labelled: Counter[str] = Counter()
     numbers: dict[str, int] = {}
+    outside = hidden = 0
     for frame_id in _in_order(split.frame_ids, split.times_s):
-        frame = _frame(split, frame_id, found.get(frame_id), names, about_run.get("ranges_m"), numbers)
+        frame = _frame(split, frame_id, found.get(frame_id), names, scope, numbers)
         labelled.update(frame.types)
+        outside, hidden = outside + frame.outside, hidden + frame.hidden
         sequences.setdefault(frame_id.rpartition("/")[0], []).append(frame)
     scores = []
     for name in names:
         frames = [[_of_class(frame, name) for frame in own] for own in sequences.values()]
         scores.append(ClassScore(name, hota(frames), clear_mot(frames, CLEAR_IOU)))
     not_scored = {kind: count for kind, count in sorted(labelled.items()) if kind not in names}
-    return TrackingReport(subject, scores, len(split.frame_ids), len(found), not_scored, about)
+    return TrackingReport(subject, scores, len(split.frame_ids), len(found), not_scored, scope, outside, hidden, about)
 
 
 def tracking_tables(report: TrackingReport) -> list[TextTable]:
@@ -117,7 +134,8 @@ def tracking_notes(report: TrackingReport) -> list[str]:
     """What is to be known beside the numbers."""
     notes = [
         "HOTA and its parts by 3D IoU, means over 0.05 to 0.95 (Luiten et al., 2021); MOTA, switches and fragments at "
-        f"3D IoU {CLEAR_IOU:g}."
+        f"3D IoU {CLEAR_IOU:g}.",
+        _counted_note(report),
     ]
     if report.frames_found < report.frames:
         notes.append(
@@ -128,6 +146,20 @@ def tracking_notes(report: TrackingReport) -> list[str]:
         classes = ", ".join(f"{name} ({count})" for name, count in report.not_scored.items())
         notes.append(f"Labelled and not scored, because no prediction is of such a class: {classes}.")
     return notes
+
+
+def _counted_note(report: TrackingReport) -> str:
+    total = report.counted + report.outside + report.hidden
+    left_out = f"{report.hidden} have fewer than {MIN_POINTS} points or unknown occlusion"
+    counted = f"{report.counted} of {total} labels are counted"
+    if report.scope is None:
+        return (
+            f"{counted}, in every direction and at any distance: the predictions do not state the detector's ranges, "
+            f"as the lines of asca detect do (`detector`), and labels outside them count as missed; {left_out}."
+        )
+    if report.scope.ranges_m is None:
+        return f"{counted}: the detector's ranges are {report.scope.where()}; {left_out}."
+    return f"{counted}: {report.outside} lie outside the detector's ranges, {report.scope.where()}; {left_out}."
 
 
 def tracking_json(report: TrackingReport) -> dict[str, Any]:
@@ -149,6 +181,10 @@ def tracking_json(report: TrackingReport) -> dict[str, Any]:
         "frames": report.frames,
         "frames_found": report.frames_found,
         "not_scored": report.not_scored,
+        "detector": None if report.scope is None else report.scope.to_json(),
+        "labels_counted": report.counted,
+        "labels_outside_ranges": report.outside,
+        "labels_hidden": report.hidden,
         "classes": classes,
     }
 
@@ -170,25 +206,25 @@ def _frame(
     frame_id: str,
     found: NamedRecords | None,
     names: Sequence[str],
-    ranges: Any | None,
+    scope: DetectorScope | None,
     numbers: dict[str, int],
 ) -> _Frame:
     records = split.records(frame_id)
-    counted = np.array([kind in names for kind in records.types], bool)
+    known = np.array([kind in names for kind in records.types], bool)
+    seen, inside = np.ones(len(known), bool), np.ones(len(known), bool)
     for row, record in enumerate(_label_records(split, frame_id)):
-        counted[row] &= _number(record.get("points"), MIN_POINTS) >= MIN_POINTS
-        counted[row] &= _number(record.get("occluded"), 0) < UNKNOWN_OCCLUSION
-    if ranges is not None:
-        level = split.labeled_boxes(frame_id).boxes  # ranges are the model's, labels may lie in other axes
-        for axis, (low, high) in enumerate(ranges):
-            counted &= (level[:, axis] >= low) & (level[:, axis] <= high)
+        seen[row] &= _number(record.get("points"), MIN_POINTS) >= MIN_POINTS
+        seen[row] &= _number(record.get("occluded"), 0) < UNKNOWN_OCCLUSION
+    if scope is not None:
+        inside = scope.holds(split.labeled_boxes(frame_id).boxes)  # its axes are level, those of labels may not be
     labels = Boxes(records.boxes, _ids(records.track_ids, str(split.labels_path), numbers))
+    counts = known & seen & inside, int((known & ~inside).sum()), int((known & inside & ~seen).sum())
     if found is None:
-        return _Frame(labels, records.types, counted, Boxes(np.empty((0, 7), np.float32), np.empty(0, np.int64)), ())
+        nothing = Boxes(np.empty((0, 7), np.float32), np.empty(0, np.int64))
+        return _Frame(labels, records.types, *counts, nothing, ())
     own = found.records
-    return _Frame(
-        labels, records.types, counted, Boxes(own.boxes, _ids(own.track_ids, found.place, numbers)), own.types
-    )
+    boxes = Boxes(own.boxes, _ids(own.track_ids, found.place, numbers))
+    return _Frame(labels, records.types, *counts, boxes, own.types)
 
 
 def _label_records(split: BoxSplit, frame_id: str) -> list[dict[str, Any]]:
@@ -217,13 +253,3 @@ def _in_order(frame_ids: Sequence[str], times: Mapping[str, float]) -> list[str]
     if all(frame_id in times for frame_id in frame_ids):
         return sorted(frame_ids, key=lambda frame_id: times[frame_id])
     return sorted(frame_ids, key=lambda frame_id: natural_order(Path(frame_id)))
-
-
-def _about_run(path: Path) -> dict[str, Any]:
-    """What `asca detect` notes of itself beside its results: its classes, and x and y in metres where it looked."""
-    if not path.is_file():
-        return {}
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise DatasetError(f"{path}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None

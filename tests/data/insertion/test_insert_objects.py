@@ -182,6 +182,21 @@ def test_samples_depend_on_seed_epoch_and_frame_alone(root: Path, method: str) -
     assert len(first.points) != len(second.points) or not np.array_equal(first.points, second.points)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_from_an_epoch_on_nothing_is_inserted(root: Path, method: str) -> None:
+    always, early, never = (
+        open_dataset(root, settings_, training=True)
+        for settings_ in (config(method), config(method, disable_after_epoch=2), config("none"))
+    )
+    for epoch in range(4):
+        # Which is why the order in which samples are asked for, as by a run that resumes, does not matter.
+        like = always if epoch < 2 else never
+        for number in (3, 2):
+            sample, expected = early.sample(epoch, number).frame, like.sample(epoch, number).frame
+            assert np.array_equal(sample.points, expected.points) and np.array_equal(sample.boxes, expected.boxes)
+    assert len(early.sample(1, 3).frame.boxes) > len(early.sample(2, 3).frame.boxes)
+
+
 def test_any_number_of_workers_gives_the_same(root: Path) -> None:
     frames = open_dataset(root, config("rs_aug"), training=True)
     batches = [[(0, number), (1, number)] for number in range(FRAMES)]

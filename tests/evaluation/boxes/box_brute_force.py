@@ -125,12 +125,21 @@ def interpolate(at: float, xs: list[float], ys: list[float]) -> float:
     raise AssertionError
 
 
-def errors_of(box: Box, other: Box, *, flat: bool) -> list[float]:
-    moved = math.dist(box[:2], other[:2]) if flat else math.dist(box[:3], other[:3])
+def nuscenes_errors(box: Box, other: Box) -> list[float]:
     shared = math.prod(min(a, b) for a, b in zip(box[3:6], other[3:6], strict=True))
     size = 1 - shared / (math.prod(box[3:6]) + math.prod(other[3:6]) - shared)
-    turned = abs(math.remainder(box[6] - other[6], 2 * math.pi))
-    return [moved, size, turned]
+    return [math.dist(box[:2], other[:2]), size, turned(box, other)]
+
+
+def argoverse_errors(box: Box, other: Box) -> list[float]:
+    kept = 1.0  # of each extent the smaller one over the larger one
+    for a, b in zip(box[3:6], other[3:6], strict=True):
+        kept *= min(a, b) / max(a, b)
+    return [math.dist(box[:3], other[:3]), 1 - kept, turned(box, other)]
+
+
+def turned(box: Box, other: Box) -> float:
+    return abs(math.remainder(box[6] - other[6], 2 * math.pi))
 
 
 def nuscenes(frames: list[EvaluatedFrame], name: str) -> tuple[float, list[float]]:
@@ -150,7 +159,7 @@ def nuscenes(frames: list[EvaluatedFrame], name: str) -> tuple[float, list[float
                 above += max(interpolate(recall, recalls, precisions) - 0.1, 0)
         aps.append(100 * above / 90 / 0.9)
         if limit == 2.0 and confidence[11] > 0:
-            each = [(score, errors_of(box, owner, flat=True)) for score, _, box, owner in taken if owner is not None]
+            each = [(score, nuscenes_errors(box, owner)) for score, _, box, owner in taken if owner is not None]
             running = [[sum(e[k] for _, e in each[: n + 1]) / (n + 1) for k in range(3)] for n in range(len(each))]
             scores = [score for score, _ in each][::-1]
             sampled = [c for c in confidence[11:] if c > 0]
@@ -183,7 +192,7 @@ def argoverse(frames: list[EvaluatedFrame], name: str) -> tuple[float, list[floa
                 best = [max(precision for _, precision in curve[n:]) for n in range(len(curve))]
                 total += interpolate(SAMPLES[percent], [recall for recall, _ in curve], best)
         aps.append(total / 101)
-    each = [errors_of(box, own, flat=False) for away, box, own in firsts if own is not None and away < 2]
+    each = [argoverse_errors(box, own) for away, box, own in firsts if own is not None and away < 2]
     errors = [sum(e[k] for e in each) / len(each) for k in range(3)] if each else [2.0, 1.0, math.pi]
     ap = sum(aps) / 4
     cds = ap * sum(1 - error / worst for error, worst in zip(errors, (2, 1, math.pi), strict=True)) / 3

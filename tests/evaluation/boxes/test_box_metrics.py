@@ -145,6 +145,17 @@ def test_argoverse_by_hand() -> None:
     assert score.cds == pytest.approx(100 * 51 / 101 / 2 * (0.25 + 1 + 0.5) / 3)
 
 
+def test_argoverse_size_error_is_the_published_vector() -> None:
+    # The API's test of `iou_3d_axis_aligned`: sizes (4, 10, 3) and (9, 5, 2) have 4 * 5 * 2 / (9 * 10 * 3) in common.
+    found = [(0.9, box(10, size=(4, 10, 3)))]
+    score = argoverse_scores([frame([box(10, size=(9, 5, 2))], found)], ["Car"])[0]
+    assert score.ase == pytest.approx(1 - 40 / 270, abs=1e-12)
+    assert score.ap == pytest.approx(100) and score.cds == pytest.approx(100 * (1 + 40 / 270 + 1) / 3)
+    # nuScenes divides by the volume of the union, 120 + 90 - 40.
+    nusc = nuscenes_scores([frame([box(10, size=(9, 5, 2))], found)], ["Car"])[0]
+    assert nusc.ase == pytest.approx(1 - 40 / 170)
+
+
 def test_argoverse_gives_an_object_to_the_best_score_alone() -> None:
     # The better one is nearest to the object at 10 but 3 m off; the other cannot have it, though it is on the spot.
     found = [(0.9, box(13)), (0.8, box(10))]

@@ -85,10 +85,35 @@ def test_labels_of_frames_without_a_line_are_misses(drives: Path, tmp_path: Path
 
 def test_what_the_detector_cannot_see_is_not_counted(drives: Path, tmp_path: Path) -> None:
     everything = sum(one.clear.labels for one in score(drives, tmp_path, labels(drives)).scores)
-    (tmp_path / "recording.json").write_text(json.dumps({"ranges_m": [[0, 69], [-30, 30]]}))
-    ahead = score(drives, tmp_path, labels(drives))
-    assert 0 < sum(one.clear.labels for one in ahead.scores) < everything
+    stated = {"classes": CLASSES, "ranges_m": [[0, 69], [-30, 30]]}
+    ahead = score(drives, tmp_path, [line | {"detector": stated} for line in labels(drives)])
+    assert 0 < ahead.counted < everything and ahead.outside > 0
     assert all(one.clear.false_boxes == 0 for one in ahead.scores), "boxes of labels that do not count go with them"
+    # Results of earlier versions state it in recording.json alone.
+    (tmp_path / "recording.json").write_text(json.dumps(stated))
+    assert score(drives, tmp_path, labels(drives)).scores == ahead.scores
+    # What the lines state comes first: the file may be of an earlier run into the same folder.
+    around = score(drives, tmp_path, [line | {"detector": stated | {"ranges_m": None}} for line in labels(drives)])
+    assert (around.counted, around.outside) == (everything, 0)
+
+
+def test_a_note_says_which_labels_are_counted_and_why(drives: Path, tmp_path: Path) -> None:
+    unknown = score(drives, tmp_path, labels(drives))
+    assert unknown.scope is None and unknown.hidden > 0
+    total = unknown.counted + unknown.hidden
+    note = tracking_notes(unknown)[1]
+    assert note.startswith(f"{unknown.counted} of {total} ") and "do not state the detector's ranges" in note
+    stated = {"detector": {"classes": CLASSES, "ranges_m": [[0, 69], [-30, 30]]}}
+    known = score(drives, tmp_path, [line | stated for line in labels(drives)])
+    assert known.counted + known.outside + known.hidden == total
+    note = tracking_notes(known)[1]
+    assert note.startswith(f"{known.counted} of {total} ") and f"{known.outside} lie outside" in note
+    assert "x 0 to 69 m and y -30 to 30 m" in note
+    content = tracking_json(known)
+    assert (content["labels_counted"], content["labels_outside_ranges"]) == (known.counted, known.outside)
+    # Lines of two detectors: of neither it is known what it could have found in the other's frames.
+    half = [line | (stated if index < 6 else {}) for index, line in enumerate(labels(drives))]
+    assert score(drives, tmp_path, half).scope is None
 
 
 def test_a_class_that_is_never_found_is_scored_or_named(drives: Path, tmp_path: Path) -> None:
@@ -97,7 +122,7 @@ def test_a_class_that_is_never_found_is_scored_or_named(drives: Path, tmp_path: 
         line["boxes"] = [box for box in line["boxes"] if box["class"] != "Pedestrian"]
     report = score(drives, tmp_path, lines)
     assert report.not_scored["Pedestrian"] > 0 and "Pedestrian" in tracking_notes(report)[-1]
-    (tmp_path / "recording.json").write_text(json.dumps({"classes": CLASSES}))
+    (tmp_path / "recording.json").write_text(json.dumps({"classes": CLASSES, "ranges_m": None}))
     report = score(drives, tmp_path, lines)
     missed = next(one for one in report.scores if one.name == "Pedestrian")
     assert missed.clear.misses == missed.clear.labels > 0 and "Pedestrian" not in report.not_scored

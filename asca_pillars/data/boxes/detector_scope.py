@@ -1,0 +1,61 @@
+"""What a detector could have found, as every line of its results states it: its classes, and where it looked."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.geometry.detector_spec import DetectorSpec
+
+Interval = tuple[float, float]
+
+
+class DetectorScope(NamedTuple):
+    """The classes of a detector, and its ranges seen from above.
+
+    `ranges_m` holds (lowest, highest) along x and y, metres, in level axes (x forward, y left); None: every direction.
+    """
+
+    classes: tuple[str, ...]
+    ranges_m: tuple[Interval, Interval] | None
+
+    def holds(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Which boxes (N, 7), metres and radians, level axes, have their center within the ranges: (N,)."""
+        inside = np.ones(len(boxes), bool)
+        for axis, (low, high) in enumerate(self.ranges_m or ()):
+            inside &= (boxes[:, axis] >= low) & (boxes[:, axis] < high)
+        return inside
+
+    def where(self) -> str:
+        """The ranges in words."""
+        if self.ranges_m is None:
+            return "every direction"
+        (x_low, x_high), (y_low, y_high) = self.ranges_m
+        return f"x {x_low:g} to {x_high:g} m and y {y_low:g} to {y_high:g} m"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, which `scope_from_json` reads."""
+        ranges = None if self.ranges_m is None else [list(interval) for interval in self.ranges_m]
+        return {"classes": list(self.classes), "ranges_m": ranges}
+
+
+def detector_scope(spec: DetectorSpec, *, around: bool) -> DetectorScope:
+    """The scope of a detector; `around` says that it looks in every direction, by turned passes."""
+    return DetectorScope(spec.class_names, None if around else (spec.ranges.x_m, spec.ranges.y_m))
+
+
+def scope_from_json(content: Any) -> DetectorScope | None:
+    """The scope that `content` states; None if it states none, as files of other programs do not."""
+    if not isinstance(content, dict) or "ranges_m" not in content:
+        return None
+    classes, ranges_m = content.get("classes"), content["ranges_m"]
+    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+        return None
+    if ranges_m is None:
+        return DetectorScope(tuple(classes), None)
+    try:
+        (x_low, x_high), (y_low, y_high) = ranges_m
+        ranges = (float(x_low), float(x_high)), (float(y_low), float(y_high))
+    except (TypeError, ValueError):
+        return None
+    return DetectorScope(tuple(classes), ranges)
