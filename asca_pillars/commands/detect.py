@@ -153,4 +153,5 @@ def detect(
     detector = open_detector(options, score, scan_input.mounting, around=around)
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
-    detect_scans(named, scan_input, detector, ResultWriter(out, pictures=pictures is not False), console)
+    writer = ResultWriter(out, [name for _, name in named], pictures=pictures is not False)
+    detect_scans(named, scan_input, detector, writer, console)

@@ -104,6 +104,40 @@ def test_what_is_done_is_not_done_again(scans: Path, bundle: Path, alone: bytes,
     assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
 
 
+@pytest.mark.parametrize("kept", ["3 lines", "a part of a line"])
+def test_a_shard_that_was_cut_is_done_again(
+    scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path, kept: str
+) -> None:
+    run(scans, tmp_path / "out", bundle)
+    shard = min((tmp_path / "out" / "shards").glob("*.jsonl"))
+    content = shard.read_bytes()
+    shard.write_bytes(b"".join(content.splitlines(keepends=True)[:3]) if kept == "3 lines" else content[:-40])
+    here.begun.clear()
+    run(scans, tmp_path / "out", bundle)
+    assert [shard.first for shard in here.begun] == [0]
+    assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
+
+
+def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(
+    scans: Path, bundle: Path, here: Here, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(scans, out, bundle)
+    assert (out / archive.UNREADABLE_FILE).stat().st_size
+    detect([scans / "1.bin"], out=out, bundle=bundle, threads=1, pictures=False)
+    assert not (out / archive.UNREADABLE_FILE).exists()
+    assert (out / "shards" / "run.json").is_file()
+
+
+def test_shards_are_not_written_through_a_link(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(scans, out, bundle)
+    (out / "shards").rename(tmp_path / "elsewhere")
+    (out / "shards").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match="shards: is a link"):
+        detect([scans], out=out, bundle=bundle, cluster="made-up:1")
+
+
 def test_an_archive_may_grow(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
     grown = Path(shutil.copytree(scans, tmp_path / "scans"))
     run(grown, tmp_path / "out", bundle)

@@ -222,7 +222,7 @@ def test_results_in_the_folder_of_a_bag_are_no_part_of_it(tmp_path: Path, monkey
 
 
 def test_two_runs_at_once_do_not_share_a_folder(drive: Path, tmp_path: Path) -> None:
-    with Journal(tmp_path, {}, ("Car",)), pytest.raises(OutputError, match="another run writes it"):
+    with Journal(tmp_path, {}, ("Car",)), pytest.raises(OutputError, match="another `asca detect` is at work there"):
         run(drive, tmp_path)
 
 
@@ -259,9 +259,15 @@ def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--columns 7: is for"):
         run(drive, tmp_path, columns=7)
     before = drive.read_bytes()
-    with pytest.raises(OutputError, match=r"drive\.mcap: `asca detect` did not write it"):
+    with pytest.raises(OutputError, match=r"drive\.mcap: would replace .*drive\.mcap, which is read"):
         run(drive, tmp_path, foxglove=drive)
     assert drive.read_bytes() == before
+    other = tmp_path / "other" / "other.mcap"
+    other.parent.mkdir()
+    other.write_bytes(before)
+    with pytest.raises(OutputError, match=r"other\.mcap: `asca detect` did not write it"):
+        run(drive, tmp_path / "none", foxglove=other)
+    assert other.read_bytes() == before
     with pytest.raises(ConfigError, match=r"choose such a name"):
         run(drive, tmp_path, foxglove=tmp_path / "boxes.json")
     with pytest.raises(ConfigError, match=r"score_threshold 1\.2 of class Car must lie"):  # before anything is detected
