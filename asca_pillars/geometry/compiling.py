@@ -71,6 +71,8 @@ def written(dtype: Any, axes: int = 1) -> Any:
 class _CheckedCache(FunctionCache):
     """numba's cache of a function, in files that tell whether they are whole."""
 
+    warned = False  # once a process, of the first function
+
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         locator = self._impl.locator
@@ -81,11 +83,13 @@ class _CheckedCache(FunctionCache):
         try:
             super().save_overload(signature, data)
         except OSError as error:
-            _log.warning(
-                "%s: what was compiled cannot be kept (%s), so that every process compiles for some seconds; make room "
-                "there, or set NUMBA_CACHE_DIR to another folder",
-                *(self.cache_path, error.strerror or error),
-            )
+            if not _CheckedCache.warned:
+                _log.warning(
+                    "%s: what was compiled cannot be kept (%s), so that every process compiles for some seconds; make "
+                    "room there, or set NUMBA_CACHE_DIR to another folder",
+                    *(self.cache_path, error.strerror or error),
+                )
+            _CheckedCache.warned = True
 
 
 class _CheckedFile(IndexDataCacheFile):

@@ -33,6 +33,7 @@ def triple(number):
 @pytest.fixture
 def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiling._CheckedCache, "warned", False)
     path = tmp_path / "made_up_kernels.py"
     path.write_text(KERNELS)
     return path
@@ -91,7 +92,9 @@ def test_a_full_disk_is_named_and_ends_nothing(
     with monkeypatch.context() as full, caplog.at_level(logging.WARNING):
         full.setattr(os, "replace", fail)
         assert hits(source) == [False, False]
-    assert "cache" in caplog.text and "No space left on device" in caplog.text and "NUMBA_CACHE_DIR" in caplog.text
+    (record,) = caplog.records
+    said = record.getMessage()
+    assert "cache" in said and "No space left on device" in said and "NUMBA_CACHE_DIR" in said
     assert hits(source) == [False, False]
     assert hits(source) == [True, True]
 
