@@ -180,15 +180,15 @@ def require_replaceable(folder: str | Path, command: str, marker: str, is_own: R
             )
 
 
-def require_no_link(path: str | Path, below: str | Path = "") -> None:
+def require_no_link(path: str | Path, below: str | Path | None = None) -> None:
     """Refuse a link at `path`, or, with `below`, at any step of that relative path below `path`.
 
     Raises:
         OutputError: names the link.
     """
-    steps = Path(below).parts
-    for count in range(1, len(steps) + 1) if steps else (0,):
-        step = Path(path, *steps[:count])
+    parts = () if below is None else Path(below).parts
+    steps = [Path(path)] if below is None else [Path(path, *parts[: count + 1]) for count in range(len(parts))]
+    for step in steps:
         if step.is_symlink():
             raise OutputError(
                 f"{step}: is a link, and nothing is written through links; remove it, or choose another place"

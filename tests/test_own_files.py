@@ -147,6 +147,7 @@ def test_a_link_is_named_at_its_step(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "b").symlink_to(tmp_path)
     require_no_link(tmp_path, "a")
+    require_no_link(tmp_path / "a" / "b", ".")
     require_no_link(tmp_path / "a" / "b", "c/d")
     with pytest.raises(OutputError, match=r"a/b: is a link"):
         require_no_link(tmp_path, "a/b/c")

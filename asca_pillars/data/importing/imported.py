@@ -18,7 +18,7 @@ from asca_pillars.data.kitti import write_image_set
 from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.files import atomic_path, write_text
-from asca_pillars.own_files import json_lines, require_not_input, require_own, require_own_file, starting_with
+from asca_pillars.own_files import json_lines, require_own, require_own_file, starting_with
 from asca_pillars.schema import to_dict
 
 COMMAND = "asca import"
@@ -92,11 +92,9 @@ def require_own_dataset(out: Path, source: Path | None = None) -> None:
             f"{path}: `{COMMAND}` did not write it, and would replace it and the labels beside it; "
             f"give another OUT, such as {out.parent / out.resolve().name}_imported"
         )
-    for name in (DATASET_FILE, LABELS_FILE):
-        require_not_input(out / name, (source,))
     scans = [folder.relative_to(out) for folder in (out / "scans").glob("*/")]
     require_own(out, COMMAND, {DATASET_FILE: is_own}, folders=("ImageSets", "scans", *scans))
-    require_own_file(out / LABELS_FILE, COMMAND, json_lines("scan", "boxes"))
+    require_own_file(out / LABELS_FILE, COMMAND, json_lines("scan", "boxes"), (source,))
 
 
 def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCounts:
