@@ -15,6 +15,7 @@ from asca_pillars.cluster.shards import Shard
 from asca_pillars.commands import detect_archive as archive
 from asca_pillars.commands import extras
 from asca_pillars.commands.detect import detect
+from asca_pillars.commands.detect_files import UNREADABLE_FILE
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError, BundleError, ClusterError, ConfigError, OutputError, ScanError
 from tests.deploy.conftest import make_scan, write_bundle
@@ -86,7 +87,7 @@ def test_shards_become_what_one_process_writes(
     run(scans, tmp_path / "out", bundle)
     assert [len(shard.items) for shard in here.begun] == [16, 16, 8]
     assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
-    (line,) = (tmp_path / "out" / archive.UNREADABLE_FILE).read_text().splitlines()
+    (line,) = (tmp_path / "out" / UNREADABLE_FILE).read_text().splitlines()
     assert json.loads(line)["scan"] == str(scans / f"{BAD}.bin") and "4 bytes" in json.loads(line)["error"]
     assert len(alone.splitlines()) == SCANS - 1
 
@@ -123,9 +124,9 @@ def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(
 ) -> None:
     out = tmp_path / "out"
     run(scans, out, bundle)
-    assert (out / archive.UNREADABLE_FILE).stat().st_size
+    assert (out / UNREADABLE_FILE).stat().st_size
     detect([scans / "1.bin"], out=out, bundle=bundle, threads=1, pictures=False)
-    assert not (out / archive.UNREADABLE_FILE).exists()
+    assert not (out / UNREADABLE_FILE).exists()
     assert (out / "shards" / "run.json").is_file()
 
 
@@ -217,7 +218,7 @@ def test_a_scan_that_ends_its_worker_is_a_line(
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
     lines = [line for line in alone.decode().splitlines() if json.loads(line)["scan"] != deadly]
     assert (tmp_path / "out" / "detections.jsonl").read_text().splitlines() == lines
-    assert "ended the process" in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+    assert "ended the process" in (tmp_path / "out" / UNREADABLE_FILE).read_text()
     assert len(list((tmp_path / "out" / "shards").glob("*.jsonl"))) == 3, "the halves have become the shard"
 
 
@@ -232,7 +233,7 @@ def test_an_error_that_nobody_foresaw_is_a_line(
     monkeypatch.setattr(f"{archive.__name__}.read_scan", fail)
     with pytest.raises(ScanError, match="2 of 40"):
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
-    assert '{"error": "ZeroDivisionError: a bug"' in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+    assert '{"error": "ZeroDivisionError: a bug"' in (tmp_path / "out" / UNREADABLE_FILE).read_text()
 
 
 def test_a_bad_moment_of_the_mount_is_waited_out(
@@ -251,7 +252,7 @@ def test_a_bad_moment_of_the_mount_is_waited_out(
     with pytest.raises(ScanError, match="2 of 40"):
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
     assert (tries["3.bin"], tries["4.bin"], tries[f"{BAD}.bin"]) == (3, 3, 1)
-    assert "4.bin: cannot be read" in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+    assert "4.bin: cannot be read" in (tmp_path / "out" / UNREADABLE_FILE).read_text()
 
 
 def test_a_machine_that_does_not_see_the_scans_ends_the_run(
