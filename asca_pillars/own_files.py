@@ -62,7 +62,10 @@ def ending_with(text: str) -> Recognizer:
     """Recognizes a text by its end."""
 
     def recognize(path: Path) -> bool:
-        return path.read_bytes().endswith(text.encode())
+        end = text.encode()
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - len(end)))
+            return file.read() == end
 
     return recognize
 
@@ -221,6 +224,8 @@ def _has(content: bytes, keys: Iterable[str], values: Mapping[str, Any]) -> bool
 
 def _entries(folder: Path) -> list[Path]:
     """What is in a folder, without what is being written just now; nothing if there is no folder."""
+    if folder.is_symlink() and not folder.exists():
+        raise OutputError(f"{folder}: is a link to nothing; make the folder that it leads to, or choose another one")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file where a folder is to be written; choose another name")
     return sorted(path for path in folder.glob("*") if not is_temporary(path.name)) if folder.exists() else []

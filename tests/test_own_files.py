@@ -102,6 +102,9 @@ def test_a_folder_to_write_into_is_empty_or_ones_own(tmp_path: Path) -> None:
         require_own(tmp_path, "asca simulate", ABOUT)
     with pytest.raises(OutputError, match="is a file where a folder"):
         require_own(tmp_path / "notes.txt", "asca simulate", ABOUT)
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(OutputError, match="is a link to nothing"):
+        require_own(tmp_path / "link", "asca simulate", ABOUT)
 
 
 def test_another_product_of_ones_own_does_not_give_a_foreign_one_away(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError, TrainingError
 from asca_pillars.files import write_json
+from asca_pillars.locks import recover
 from asca_pillars.own_files import (
     ending_with,
     json_object,
@@ -44,6 +45,7 @@ def claim(out: Path, base: dict[str, Any]) -> None:
         OutputError: `out` holds files of something else.
         TrainingError: the runs there have another base, or the note of it is damaged.
     """
+    recover(out)
     is_log = starting_with(written_by(COMMAND))
     if not any(map(is_log, out.glob("*/seed*/train.log"))):  # which says as much, where a damaged note was deleted
         require_own(out, COMMAND, {"ablation.json": json_object("config", "data")})

@@ -21,6 +21,7 @@ from asca_deploy.shipped import find_bundle
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
 from asca_pillars.commands.detect_files import (
+    COMMAND,
     RUN_FILE,
     UNREADABLE_FILE,
     as_line,
@@ -38,7 +39,7 @@ from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.scan_reader import ReflectanceScale, Scan, read_scan
 from asca_pillars.errors import BundleError, ClusterError, ConfigError, ScanError
 from asca_pillars.files import atomic_path
-from asca_pillars.own_files import json_object
+from asca_pillars.own_files import json_object, require_own
 from asca_pillars.schema import to_dict
 from asca_pillars.system import package_versions
 
@@ -142,7 +143,9 @@ def detect_archive(
     require("cluster")
     if options.provider == "auto":
         raise ConfigError("--provider auto: each machine would choose its own; name one provider with --cluster")
-    claim(out, {f"{SHARDS}/{RUN_SETTINGS}": json_object("shard_size", "settings")})
+    is_run = json_object("shard_size", "settings")
+    claim(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
+    require_own(out / SHARDS, COMMAND, {RUN_SETTINGS: is_run})
     console = Console(markup=False)
     for line in scan_input.said:
         remark(console, line)

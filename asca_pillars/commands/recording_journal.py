@@ -24,6 +24,7 @@ from asca_pillars.own_files import require_no_link
 from asca_pillars.sealed_lines import sealed, unsealed
 
 JOURNAL_FILE = "detections.partial.jsonl"
+_LONGEST_HEAD_BYTES = 1 << 24
 _KEY = "journal of asca detect"  # of the first line, whose text is the key of the others
 
 
@@ -41,7 +42,7 @@ class ScanResult(NamedTuple):
 def is_journal(path: Path) -> bool:
     """Whether it begins as a journal does."""
     with path.open("rb") as file:
-        return unsealed(file.readline(), _KEY) is not None
+        return unsealed(file.readline(_LONGEST_HEAD_BYTES), _KEY) is not None
 
 
 class Journal:

@@ -139,6 +139,17 @@ def test_shards_are_not_written_through_a_link(scans: Path, bundle: Path, here: 
         detect([scans], out=out, bundle=bundle, cluster="made-up:1")
 
 
+def test_a_folder_of_shards_of_somebody_else_is_left_alone(
+    scans: Path, bundle: Path, here: Here, tmp_path: Path
+) -> None:
+    detect([scans / "1.bin"], out=tmp_path, bundle=bundle, threads=1, pictures=False)
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards" / "glass.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"shards: holds glass\.txt and nothing that `asca detect` wrote"):
+        detect([scans], out=tmp_path, bundle=bundle, cluster="made-up:1")
+    assert len(list((tmp_path / "shards").iterdir())) == 1
+
+
 def test_an_archive_may_grow(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
     grown = Path(shutil.copytree(scans, tmp_path / "scans"))
     run(grown, tmp_path / "out", bundle)
