@@ -1,8 +1,13 @@
-"""Locks of files and folders, which end with the process that holds them, however it ends."""
+"""Locks of files and folders, which end with the process that holds them, and what killed writers leave behind.
+
+What is being written has a name of its own beside its target, `.NAME.asca-12345678.SUFFIX`, and is locked (`flock`)
+while its writer lives. That tells what a killed writer left from what another process writes just now.
+"""
 
 import contextlib
-import errno
 import os
+import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,17 +19,14 @@ except ImportError:  # Windows: nothing is locked
     fcntl = None  # type: ignore[assignment]
 
 CAN_LOCK = fcntl is not None
+RETIRED = "-old"
+"""Ends the temporary name of a folder that was moved aside and not yet replaced."""
+_TEMPORARY = re.compile(rf"\.(?P<name>.+)\.asca-[0-9a-f]{{8}}(?P<retired>{RETIRED})?(?:\.[^.]*)?")
 
 
-def try_lock(handle: int) -> bool:
-    """Lock an open file for this process until it closes it; False if another process holds it."""
-    if fcntl is None:
-        return True
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)  # others: no locks there
-    return True
+def is_temporary(name: str) -> bool:
+    """Whether a file or folder has a name that is written under, instead of a final one."""
+    return _TEMPORARY.fullmatch(name) is not None
 
 
 @contextlib.contextmanager
@@ -58,13 +60,43 @@ def only_writer(folder: str | Path, command: str) -> Iterator[None]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
     try:
-        if handle is not None and not try_lock(handle):
-            raise OutputError(f"{folder}: another `{command}` is at work there; let it end, or choose another folder")
-        yield
+        with contextlib.ExitStack() as stack:
+            if fcntl is not None:
+                handle = os.open(folder, os.O_RDONLY)
+                stack.callback(os.close, handle)
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except (BlockingIOError, PermissionError):
+                    raise OutputError(
+                        f"{folder}: another `{command}` is at work there; let it end, or choose another folder"
+                    ) from None
+                except OSError:  # a file system without locks
+                    pass
+            yield
     finally:
-        if handle is not None:
-            os.close(handle)
         with contextlib.suppress(OSError):  # it is not empty
             folder.rmdir()
+
+
+def recover(folder: str | Path) -> None:
+    """Remove what killed writers left in `folder`; put back a folder that one had moved aside and not replaced.
+
+    What a living process writes just now is left alone, and so is everything that has not our temporary names. A
+    command calls it before it writes; a process that shares the folder with other machines must not, for it may not
+    see their locks.
+    """
+    folder = Path(folder)
+    if not CAN_LOCK or not folder.is_dir():
+        return
+    for path in sorted(folder.glob(".*.asca-*")):
+        match = _TEMPORARY.fullmatch(path.name)
+        if match is None or path.is_symlink():
+            continue
+        with contextlib.suppress(OSError), locked(path, wait=False):
+            if not path.is_dir():
+                path.unlink()
+            elif match["retired"] and not (folder / match["name"]).exists():
+                path.replace(folder / match["name"])
+            else:
+                shutil.rmtree(path)

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
-EXPORT = ("asca export", "bundle.json")
-"""The command and the marker that `atomic_directory` and `require_replaceable` take."""
+from asca_pillars.own_files import json_object
+
+EXPORT = ("asca export", "bundle.json", json_object("file"))
+"""Command, marker and its recognizer, as `atomic_directory` and `require_replaceable` take them."""
 
 
 def old_bundle(folder: Path) -> Path:

@@ -11,5 +11,7 @@ def earlier_predictions(out: Path, texts: Path | None = None) -> Path:
     contents = {"000009.txt": ""} if texts is None else {path.name: path.read_text() for path in texts.glob("*.txt")}
     for name, content in contents.items():
         (folder / name).write_text(content)
-    (folder / "made_by.json").write_text(json.dumps({"files": sorted(contents)}))
+    (folder / "made_by.json").write_text(
+        json.dumps({"model": {}, "data": "", "split": "val", "files": sorted(contents)})
+    )
     return folder

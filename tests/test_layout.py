@@ -13,7 +13,8 @@ SHARED_NAMES = {"__init__.py", "conftest.py"}
 LAYERS = (  # what is in one of them imports from those before it
     {"errors", "telemetry"},
     {"locks"},
-    {"files", "processes", "schema", "strict", "system", "yaml_text"},
+    {"own_files"},
+    {"files", "processes", "schema", "sealed_lines", "strict", "system", "yaml_text"},
     {"cluster", "geometry"},
     {"pillars", "tables"},
     {"points"},

@@ -20,6 +20,7 @@ from rich.progress import track
 from asca_pillars.ablation.family import Row
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import write_json
+from asca_pillars.own_files import require_no_link, written_by
 from asca_pillars.system import default_threads
 
 
@@ -121,7 +122,11 @@ def _asca(run: Run, arguments: Sequence[str], threads: int) -> None:
     """Run one command as a user would, its output in the run's folder."""
     run.folder.mkdir(parents=True, exist_ok=True)
     log = run.folder / f"{arguments[0]}.log"
+    require_no_link(log)
     with log.open("a", encoding="utf-8") as file:
+        if not file.tell():
+            file.write(f"{written_by('asca ablate')}\n")
+            file.flush()
         done = subprocess.run(
             [sys.executable, "-m", "asca_pillars.cli", *arguments],
             stdout=file,

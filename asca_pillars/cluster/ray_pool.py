@@ -11,7 +11,6 @@ from typing import Any, Generic
 from asca_pillars.cluster.schedule import Outcome, Result
 from asca_pillars.cluster.shards import Shard
 from asca_pillars.errors import ClusterError
-from asca_pillars.files import share_folders
 from asca_pillars.system import default_threads, package_versions
 
 LOCAL = "local"
@@ -125,7 +124,6 @@ def _on_worker(job: Callable[[Shard], Result], shard: Shard, seen: Path, version
         raise ClusterError(f"{host}: has asca-pillars {own}, the command {version}; install one version everywhere")
     if not seen.is_file():
         raise ClusterError(f"{host}: does not see {seen}; write to a folder that every machine mounts at that place")
-    share_folders()
     return job(shard)
 
 

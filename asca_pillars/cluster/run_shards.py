@@ -12,7 +12,7 @@ from asca_pillars.cluster.ray_pool import RayPool, connected
 from asca_pillars.cluster.schedule import Outcome, Result, work_off
 from asca_pillars.cluster.shards import Shard, cut
 from asca_pillars.errors import ClusterError
-from asca_pillars.files import recover
+from asca_pillars.locks import recover
 
 
 def run_shards(
@@ -46,7 +46,7 @@ def run_shards(
     console = Console(markup=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     for folder in folders:
-        recover(folder, again=True)
+        recover(folder)
     try:
         with connected(address) as cluster, Progress(*columns, console=console, disable=not progress) as bar:
             console.print(cluster, highlight=False)
@@ -63,7 +63,7 @@ def run_shards(
                 yield outcome
     finally:
         for folder in folders:
-            recover(folder, again=True)
+            recover(folder)
 
 
 def run_each(

@@ -4,20 +4,21 @@
     000000256-1f3a9c04d2b7.jsonl     a line for each item of a shard, the first of which is number 256
 
 A shard's name is made of the number of its first item and of a digest of its items. A file that is there is therefore
-the result of these items and no others, also where the list of items has changed since.
+the result of these items and no others, also where the list of items has changed since. Each line has a digest
+(`sealed_lines`), and there are as many as items: a file that was cut or damaged is no result.
 """
 
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from asca_pillars.errors import OutputError
-from asca_pillars.files import atomic_path, is_hidden, write_json
+from asca_pillars.files import atomic_path, write_json
+from asca_pillars.sealed_lines import sealed, unsealed
 
 RUN_SETTINGS = "run.json"
 _SUFFIX = ".jsonl"
@@ -82,27 +83,21 @@ class ShardFolder:
                 )
         return size
 
-    def done(self) -> set[str]:
-        """Names of the shards whose results are there."""
+    def done(self, shards: Iterable[Shard]) -> set[str]:
+        """Names of those shards whose results are there and whole; every file is read."""
         # One listing: a file that was looked for and not found may stay unseen on a network mount for a minute.
         with os.scandir(self.path) as entries:
-            return {
-                entry.name.removesuffix(_SUFFIX)
-                for entry in entries
-                if entry.name.endswith(_SUFFIX) and not is_hidden(Path(entry.name))
-            }
+            there = {entry.name for entry in entries}
+        return {shard.name for shard in shards if self._file(shard).name in there and self._is_whole(shard)}
 
     def write(self, shard: Shard, lines: Iterable[str]) -> None:
-        """Write a shard's results, one line each with its end; they appear when all are written."""
-        with atomic_path(self._file(shard)) as temporary, temporary.open("w", encoding="utf-8") as file:
-            file.writelines(lines)
+        """Write a shard's results, a line of JSON with its end for each item; they appear when all are written."""
+        with atomic_path(self._file(shard)) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+            file.writelines(sealed(line[:-1], _key(shard, number)) for number, line in enumerate(lines))
 
     def join(self, shard: Shard, parts: Sequence[Shard]) -> None:
         """Make the results of a shard from those of its parts, which are removed."""
-        with atomic_path(self._file(shard)) as temporary, temporary.open("wb") as file:
-            for part in sorted(parts):
-                with self._file(part).open("rb") as source:
-                    shutil.copyfileobj(source, file)
+        self.write(shard, self.lines(sorted(parts)))
         for part in parts:
             self._file(part).unlink()
 
@@ -110,17 +105,50 @@ class ShardFolder:
         """The results of the shards, in their order.
 
         Raises:
-            OutputError: one is not there.
+            OutputError: one is not there, or damaged.
         """
         for shard in shards:
             try:
-                with self._file(shard).open(encoding="utf-8") as file:
-                    yield from file
+                yield from self._lines(shard)
+            except _DamagedError:
+                raise OutputError(
+                    f"{self._file(shard)}: is damaged; give the same command again, and its items are done again"
+                ) from None
             except FileNotFoundError:
                 raise OutputError(
                     f"{self._file(shard)}: a worker has written it, and it is not to be seen here; give a folder that "
                     "is the same on every machine, then the same command again"
                 ) from None
 
+    def _is_whole(self, shard: Shard) -> bool:
+        try:
+            for _ in self._lines(shard):
+                pass
+        except (_DamagedError, OSError):
+            return False
+        return True
+
+    def _lines(self, shard: Shard) -> Iterator[str]:
+        """The lines of one shard; _DamagedError at the first that is not what was written, or if some are missing."""
+        count = 0
+        with self._file(shard).open("rb") as file:
+            for line in file:
+                text = unsealed(line, _key(shard, count))
+                if text is None:
+                    raise _DamagedError
+                yield text + "\n"
+                count += 1
+        if count != len(shard.items):
+            raise _DamagedError
+
     def _file(self, shard: Shard) -> Path:
         return self.path / f"{shard.name}{_SUFFIX}"
+
+
+class _DamagedError(Exception):
+    """The file of a shard is not what was written."""
+
+
+def _key(shard: Shard, number: int) -> str:
+    """What the digest of a line is under: it belongs to one item of one shard."""
+    return f"{shard.name} {number}"

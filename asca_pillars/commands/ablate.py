@@ -48,6 +48,8 @@ def ablate(
     from asca_pillars.ablation.ablation_runs import finish_runs, runs
     from asca_pillars.ablation.ablation_table import read_results, tables
     from asca_pillars.commands.ablate_steps import (
+        COMMAND,
+        RESULTS_FILE,
         check,
         claim,
         family_of,
@@ -59,7 +61,8 @@ def ablate(
     from asca_pillars.commands.prepare import prepare
     from asca_pillars.config import load_config
     from asca_pillars.data.kitti import KittiSplit
-    from asca_pillars.files import atomic_path
+    from asca_pillars.files import write_text
+    from asca_pillars.own_files import page_end
     from asca_pillars.schema import to_dict
     from asca_pillars.system import default_threads
 
@@ -78,8 +81,7 @@ def ablate(
     console = Console(markup=False)
     speeds = time_variants(todo, family, KittiSplit(data, base.data.val_set), console)
     text = f"{setup(todo, config, data, base.data, jobs)}\n{tables(family, read_results(todo), speeds)}"
-    path = out / "results.md"
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    path = out / RESULTS_FILE
+    write_text(path, text + page_end(COMMAND))
     console.print(Markdown(text))
     console.print(f"Written: {path}")

@@ -19,9 +19,22 @@ from asca_pillars.config import Config, DataConfig, load_config
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError, DatasetError, TrainingError
-from asca_pillars.files import require_own, write_json
+from asca_pillars.files import write_json
+from asca_pillars.locks import recover
+from asca_pillars.own_files import (
+    ending_with,
+    json_object,
+    page_end,
+    require_no_link,
+    require_own,
+    require_own_file,
+    starting_with,
+    written_by,
+)
 from asca_pillars.system import command_line, cpu_model, package_versions
 
+COMMAND = "asca ablate"
+RESULTS_FILE = "results.md"
 TIMED_ROUNDS = 10
 
 
@@ -32,8 +45,13 @@ def claim(out: Path, base: dict[str, Any]) -> None:
         OutputError: `out` holds files of something else.
         TrainingError: the runs there have another base, or the note of it is damaged.
     """
-    if not any(out.glob("*/seed*/train.log")):  # which says as much, where a damaged note was deleted
-        require_own(out, "asca ablate", "ablation.json", text='"config"')
+    recover(out)
+    is_log = starting_with(written_by(COMMAND))
+    if not any(map(is_log, out.glob("*/seed*/train.log"))):  # which says as much, where a damaged note was deleted
+        require_own(out, COMMAND, {"ablation.json": json_object("config", "data")})
+    require_own_file(out / RESULTS_FILE, COMMAND, ending_with(page_end(COMMAND)))
+    for folder in out.glob("*/seed*"):
+        require_no_link(out, folder.relative_to(out))
     path = out / "ablation.json"
     if not path.exists():
         write_json(path, base)

@@ -90,6 +90,7 @@ def bench(
     from asca_pillars.data.scans.find_scans import name_scans
     from asca_pillars.errors import ConfigError, ScanError
     from asca_pillars.files import write_json
+    from asca_pillars.own_files import json_object, require_own_file
 
     # A pipe has no width, and the tables are wider than the 80 columns that rich takes then.
     piped = not sys.stdout.isatty() and "COLUMNS" not in os.environ
@@ -113,10 +114,12 @@ def bench(
     bundles = named_bundles([bundle, *(compare or ())])
     for folder in bundles.values():
         load_bundle(folder)  # a damaged one is named now and not after minutes
-    require_writable(json)
+    report_json = "asca bench", json_object("fps", "stages_ms", "runs_on", "graphs_sha256")
+    require_writable(json, *report_json)
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     detector = open_detector(options, mounting=scan_input.mounting, around=around)
     parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold)
     result = measure_parts(detector, points, rounds, parts, bundles, console)
     if json is not None:
+        require_own_file(json, *report_json)
         write_json(json, result)

@@ -155,5 +155,5 @@ def detect(
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     scope = detector_scope(detector.spec, around=around)
-    writer = ResultWriter(out, pictures=pictures is not False, scope=scope)
+    writer = ResultWriter(out, [name for _, name in named], pictures=pictures is not False, scope=scope)
     detect_scans(named, scan_input, detector, writer, console)

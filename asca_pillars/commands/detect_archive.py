@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
+from rich.progress import track
 
 from asca_deploy import Detector
 from asca_deploy.bundle import MANIFEST
@@ -19,7 +20,15 @@ from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_bundle
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
-from asca_pillars.commands.detect_files import RUN_FILE, RUN_MARK, as_line, scan_content
+from asca_pillars.commands.detect_files import (
+    COMMAND,
+    RUN_FILE,
+    UNREADABLE_FILE,
+    as_line,
+    claim,
+    remove_companions,
+    scan_content,
+)
 from asca_pillars.commands.detect_tables import remark
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.models import open_detector
@@ -30,12 +39,12 @@ from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.data.scans.scan_reader import ReflectanceScale, Scan, read_scan
 from asca_pillars.errors import BundleError, ClusterError, ConfigError, ScanError
-from asca_pillars.files import atomic_path, require_own
+from asca_pillars.files import atomic_path
+from asca_pillars.own_files import json_object, require_own
 from asca_pillars.schema import to_dict
 from asca_pillars.system import package_versions
 
 SHARDS = "shards"
-UNREADABLE_FILE = "unreadable.jsonl"
 _SHARD_SCANS = (16, 256)
 """Fewest and most. A shard of the most takes some ten seconds, so that little is done twice; the fewest make the cost
 of a shard small beside that of its scans."""
@@ -136,8 +145,9 @@ def detect_archive(
     require("cluster")
     if options.provider == "auto":
         raise ConfigError("--provider auto: each machine would choose its own; name one provider with --cluster")
-    if not (out / SHARDS / RUN_SETTINGS).is_file():
-        require_own(out, "asca detect", RUN_FILE, text=RUN_MARK)
+    is_run = json_object("shard_size", "settings")
+    claim(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
+    require_own(out / SHARDS, COMMAND, {RUN_SETTINGS: is_run})
     console = Console(markup=False)
     for line in scan_input.said:
         remark(console, line)
@@ -146,7 +156,7 @@ def detect_archive(
     wanted = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
     size = folder.claim(_results_depend_on(job, scans), wanted)
     shards = cut([(str(path), scan_input.scale(path)) for path in scans], size)
-    there = folder.done()
+    there = folder.done(track(shards, "Checking what is done", console=console, transient=True))
     todo = [shard for shard in shards if shard.name not in there]
     done = len(scans) - sum(len(shard.items) for shard in todo)
     if done:
@@ -180,6 +190,7 @@ def merge(lines: Iterable[str], out: Path) -> Counts:
             else:
                 detected += 1
                 results.write(line)
+    remove_companions(out, [UNREADABLE_FILE])
     return Counts(detected, unreadable)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import count
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -19,12 +20,12 @@ from asca_deploy import Detector, find_bundle
 from asca_deploy.manifest import load_bundle
 from asca_deploy.tracker import Tracker
 from asca_pillars.commands import detect_tables as show
-from asca_pillars.commands.detect_files import RUN_FILE, RUN_MARK
+from asca_pillars.commands.detect_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
 from asca_pillars.commands.extras import require
-from asca_pillars.commands.foxglove_file import FoxgloveFile, require_own_file
+from asca_pillars.commands.foxglove_file import FoxgloveFile, is_own_mcap
 from asca_pillars.commands.models import open_detector
 from asca_pillars.commands.options import RuntimeOptions
-from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
+from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult, is_journal
 from asca_pillars.commands.recording_results import (
     Found,
     JsonLines,
@@ -34,8 +35,9 @@ from asca_pillars.commands.recording_results import (
     said_of_stamps,
     tracked,
 )
-from asca_pillars.commands.rerun_file import RerunFile, require_own_rrd
+from asca_pillars.commands.rerun_file import RerunFile, is_own_rrd
 from asca_pillars.commands.scan_input import said_of_scale
+from asca_pillars.commands.writable_file import require_suffix, require_writable
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.data.mounting import Mounting
@@ -44,11 +46,9 @@ from asca_pillars.data.recordings.open_recording import open_recording, recordin
 from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.data.scan_settings import SAMPLE_SCANS, ScanSettings
 from asca_pillars.errors import ConfigError, ScanError
-from asca_pillars.files import atomic_path, require_own
+from asca_pillars.files import atomic_path
 from asca_pillars.schema import to_dict
 
-KITTI_FILE = "tracks.txt"
-ABOUT_FILE = "recording.json"
 WEAK_SHARE = 0.7
 """Detections from this share of the lowest threshold on carry tracks on that better ones began."""
 
@@ -78,11 +78,14 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     require("recordings")
     if task.rerun is not None:
         require("view")
-        require_own_rrd(task.rerun)
+        require_suffix("--rerun", task.rerun, ".rrd")
     if task.foxglove is not None:
-        require_own_file(task.foxglove)
+        require_suffix("--foxglove", task.foxglove, ".mcap")
+    inputs = (task.path, task.calib)
+    require_writable(task.foxglove, COMMAND, is_own_mcap, inputs)
+    require_writable(task.rerun, COMMAND, is_own_rrd, inputs)
     calibration = None if task.calib is None else read_calibration(task.calib)
-    _claim(task.out)
+    claim(task.out, {JOURNAL_FILE: is_journal})
     recording = open_recording(task.path)
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:
@@ -121,19 +124,13 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
             _check_times(times_ns, task, topic.name, poses, console)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
         scope = detector_scope(detector.spec, around=task.around)
-        count, classes = _write(task, results, scans, calibration, scope, about)
+        written, classes = _write(task, results, scans, calibration, scope, about)
         journal.remove()
     boxes = ", ".join(f"{classes[name]} {name}" for name in detector.spec.class_names)
-    console.print(f"{count} scans, in all {boxes}", highlight=False)
+    console.print(f"{written} scans, in all {boxes}", highlight=False)
     _tell(task, run, seconds, console)
     if told := [*sorted(filter(None, damages)), *run.skipped()]:
         raise ScanError("; ".join(told))
-
-
-def _claim(out: Path) -> None:
-    """Make sure that nothing but results and journals of ours is in `out`; OutputError names what is."""
-    if not (out / JOURNAL_FILE).is_file():
-        require_own(out, "asca detect", RUN_FILE, text=RUN_MARK)
 
 
 class _Run:
@@ -174,7 +171,10 @@ class _Run:
         return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
-        for one in self._scans.read(self._journal.done):
+        first = next(number for number in count() if number not in self._journal)
+        for one in self._scans.read(first):
+            if one.number in self._journal:
+                continue
             self._coming.append(one)
             if one.scan is not None:
                 yield one.scan.points
@@ -269,15 +269,16 @@ def _write(
             rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
             handles.callback(rerun.finish)
             files.append(rerun)
-        count = 0
+        scans_written = 0
         classes: Counter[str] = Counter()
         for found in results:
-            count += 1
+            scans_written += 1
             classes.update(found.detections.names)
             for file in files:
                 file.write(found)
         handles.close()  # before the names are changed
-    return count, classes
+    remove_companions(task.out, [ABOUT_FILE, *([] if calibration is None else [KITTI_FILE])])
+    return scans_written, classes
 
 
 def _tell(task: RecordingTask, run: _Run, seconds: float, console: Console) -> None:

@@ -118,7 +118,7 @@ def evaluate(
         box_task = BoxTask(protocol, data, split, out, json, score, min_score, around)
         evaluate_boxes(box_task, options, predictions, console)
         return
-    claim(out, json)
+    claim("report" if protocol == "kitti" else protocol, out, json, predictions, (model, data, labels))
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:
         assert frames_of is not None, "checked with the arguments"

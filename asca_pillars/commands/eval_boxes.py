@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_files import COMMAND, MADE_BY, claim, write_report
+from asca_pillars.commands.eval_files import MADE_BY, PREDICTIONS_FOLDER, claim, write_report
 from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
@@ -41,7 +41,7 @@ class BoxTask:
 
 def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | None, console: Console) -> None:
     """Evaluate by IoU or by distance; print and write the tables, the JSON, and the model's predictions."""
-    claim(task.out, task.json)
+    claim(task.protocol, task.out, task.json, predictions, (options.bundle, task.data))
     split = open_split(task.data, task.split)
     about: dict[str, Any] = {"data": str(task.data), "split": task.split}
     if task.around and isinstance(split, BoxSplit) and split.has_camera:
@@ -69,7 +69,7 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
 
 def _run(model: Model, split: LabeledSplit, task: BoxTask, console: Console) -> BoxFrames:
     """Run the model and write what it finds: what is scored is read from there, so that it can be scored again."""
-    with atomic_directory(task.out / "predictions", COMMAND, MADE_BY) as folder:
+    with atomic_directory(task.out / "predictions", *PREDICTIONS_FOLDER) as folder:
         camera_view = split.has_camera and model.camera_view
         write_box_predictions(
             folder / PREDICTIONS,

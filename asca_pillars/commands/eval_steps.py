@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_files import COMMAND, MADE_BY, write_report
+from asca_pillars.commands.eval_files import COMMAND, CURVES, GALLERY_FOLDER, MADE_BY, PREDICTIONS_FOLDER, write_report
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
@@ -24,6 +24,7 @@ from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
 from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
 from asca_pillars.files import atomic_directory, remove_directory, write_json
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.own_files import is_own_picture, require_own_file
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.system import describe_environment
 
@@ -115,7 +116,7 @@ def run_model(
 ) -> Task:
     """Write the model's predictions to `out`: what is scored is read from there, so that it can be scored again."""
     about = {"model": model.about, "data": str(split.root), "split": split.name}
-    with atomic_directory(out / "predictions", COMMAND, MADE_BY) as folder:
+    with atomic_directory(out / "predictions", *PREDICTIONS_FOLDER) as folder:
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
         write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
     warn_of_unlike_scans(model, len(split.frame_ids), console)
@@ -146,12 +147,13 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     report = KittiReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     page = ReportPage(report.title, kitti_tables(report), kitti_notes(report))
     write_report("report", page, kitti_json(report), out, json_path, task.predictions, console)
-    remove_directory(out / "gallery", COMMAND, gallery.INDEX)
+    remove_directory(out / "gallery", *GALLERY_FOLDER)
+    require_own_file(out / CURVES, COMMAND, is_own_picture)
     if missing_modules("eval"):
-        (out / "curves.png").unlink(missing_ok=True)
+        (out / CURVES).unlink(missing_ok=True)
         console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
     else:
-        write_curves(out / "curves.png", ap.overall, report.title)
+        write_curves(out / CURVES, ap.overall, report.title)
 
 
 def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:
@@ -162,5 +164,5 @@ def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None,
     judged = matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
     worst = gallery.worst_frames(judged, count)
     folders = task.split, task.labels, task.predictions
-    with atomic_directory(out / "gallery", COMMAND, gallery.INDEX) as folder:
+    with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
         gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)

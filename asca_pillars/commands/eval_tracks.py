@@ -29,7 +29,7 @@ def evaluate_tracks(
     labels = open_split(data, split)
     if not isinstance(labels, BoxSplit):
         raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")
-    claim(out, json_path)
+    claim("tracking", out, json_path, predictions, (data,))
     about = {"data": str(data), "split": split, "predictions": str(predictions), "environment": describe_environment()}
     report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
     page = ReportPage(report.subject, tracking_tables(report), tracking_notes(report))

@@ -111,7 +111,7 @@ def export(
     import numpy as np
     from rich.console import Console
 
-    from asca_deploy.bundle import MANIFEST, Bundle
+    from asca_deploy.bundle import BUNDLE_FOLDER, Bundle
     from asca_export.exporter import export_bundle, require_maskable
     from asca_export.pv_rcnn_exporter import export_pv_rcnn_bundle
     from asca_export.refine_exporter import export_refine_bundle
@@ -127,10 +127,11 @@ def export(
         read_or_simulate,
     )
     from asca_pillars.errors import ConfigError
-    from asca_pillars.files import require_replaceable
+    from asca_pillars.own_files import require_not_input, require_replaceable
 
     console = Console(markup=False)
-    require_replaceable(out, "asca export", MANIFEST)  # before minutes of work
+    require_replaceable(out, *BUNDLE_FOLDER)  # before minutes of work
+    require_not_input(out, (scans, calibrate))
     source = open_source(checkpoint)
     loaded = source.checkpoint
     scores = source.score_thresholds | dict(class_score(text) for text in score or ())
@@ -140,6 +141,7 @@ def export(
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
     kind = loaded.config.model.kind
+    require_not_input(out, (getattr(model, "first_stage", None),))
     if dense_neck:
         require_maskable(loaded.config.model, int8=int8)
     kinds: dict[str, Callable[..., Bundle]] = {

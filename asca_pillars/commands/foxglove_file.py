@@ -12,8 +12,6 @@ from typing import IO, Any
 import numpy as np
 
 from asca_pillars.commands.recording_results import Found
-from asca_pillars.commands.writable_file import require_writable
-from asca_pillars.errors import ConfigError, OutputError
 
 TOPIC = "/asca/boxes"
 LIBRARY = "asca-pillars boxes"
@@ -72,16 +70,11 @@ SCHEMA = _object(
 )
 
 
-def require_own_file(path: Path) -> None:
-    """Make sure that no recording is replaced by boxes: OutputError unless `path` is free or an earlier output."""
-    if path.suffix.lower() != ".mcap":
-        raise ConfigError(f"--foxglove {path}: Foxglove opens .mcap files; choose such a name")
-    if path.is_file():
-        with path.open("rb") as file:
-            start = file.read(100)  # magic, then a header with the name of what wrote the file
-        if LIBRARY.encode() not in start:
-            raise OutputError(f"{path}: `asca detect` did not write it and would replace it; choose another name")
-    require_writable(path)
+def is_own_mcap(path: Path) -> bool:
+    """Whether it is an MCAP that a `FoxgloveFile` wrote, and no recording."""
+    with path.open("rb") as file:
+        start = file.read(100)  # magic, then a header with the name of what wrote the file
+    return start.startswith(b"\x89MCAP") and LIBRARY.encode() in start
 
 
 class FoxgloveFile:

@@ -74,7 +74,7 @@ def import_dataset(
         raise ConfigError(f"{source}: no such file or folder; check the path")
     if wrong := [text for text in rename or () if not all(text.partition("="))]:
         raise ConfigError(f"--rename {wrong[0]}: write OLD=NEW, such as --rename REGULAR_VEHICLE=Car")
-    require_own_dataset(out)
+    require_own_dataset(out, source)
     if source_format == "argoverse2":
         require("import")
     importers: dict[str, Importer] = {

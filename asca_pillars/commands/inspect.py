@@ -67,8 +67,10 @@ def inspect(
     from asca_pillars.data.open_split import open_split
     from asca_pillars.errors import ConfigError, DatasetError
     from asca_pillars.files import write_json
+    from asca_pillars.own_files import json_object, require_own_file
 
-    require_writable(json)
+    report_json = "asca inspect --json", json_object("config", "frames_in_split", "states_mounting", "findings")
+    require_writable(json, *report_json)
     if draw is None and out is not None:
         raise ConfigError(f"--out {out} is for the pictures of --draw; give --draw COUNT, too")
     pictures = Path("inspection") if out is None else out
@@ -94,6 +96,7 @@ def inspect(
     if json is not None:
         report = {"config": settings.name} | dataclasses.asdict(inspection)
         report |= {"findings": [finding._asdict() for finding in found]}
+        require_own_file(json, *report_json)
         write_json(json, report)
     console.print(
         f"{data}, split {inspection.split}, against {settings.name}: {inspection.frames} of "

@@ -10,7 +10,7 @@ from asca_pillars.data.inspection.findings import FEWEST_BOXES
 from asca_pillars.data.inspection.proposal import differences, propose
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import OutputError
-from asca_pillars.files import atomic_path
+from asca_pillars.files import write_text
 
 
 def propose_config(split: LabeledSplit, config: Config, path: Path, frames: int, console: Console) -> Config:
@@ -29,8 +29,7 @@ def propose_config(split: LabeledSplit, config: Config, path: Path, frames: int,
         rare = ", ".join(f"{name} {count}" for name, count in proposal.rare.items())
         notes.append(f"No classes, for fewer than {FEWEST_BOXES} boxes with points: {rare}.")
     text = "".join(f"# {note}\n" for note in notes) + yaml.safe_dump(differences(proposal.config), sort_keys=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, text)
     console.print(text, soft_wrap=True)
     console.print(f"Written to {path}. Next: asca train {path} --data {split.root} --out runs/own", soft_wrap=True)
     return proposal.config

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.commands.recording_results import Found
-from asca_pillars.commands.writable_file import require_writable
 from asca_pillars.data.recordings.recorded_scans import RecordedScan
-from asca_pillars.errors import ConfigError, OutputError
 
 MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
 TIMELINE = "time"
@@ -20,16 +18,11 @@ _HEAD_BYTES = 4096  # of a file, among which the application's name is
 _FLUSH_S = 60.0
 
 
-def require_own_rrd(path: Path) -> None:
-    """Make sure that no recording of others is replaced: OutputError unless `path` is free or an earlier output."""
-    if path.suffix.lower() != ".rrd":
-        raise ConfigError(f"--rerun {path}: rerun opens .rrd files; choose such a name")
-    if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-        if APPLICATION.encode() not in head:
-            raise OutputError(f"{path}: `asca detect` did not write it and would replace it; choose another name")
-    require_writable(path)
+def is_own_rrd(path: Path) -> bool:
+    """Whether it is a file that a `RerunFile` wrote, and no recording of others."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    return head.startswith(b"RRF") and APPLICATION.encode() in head
 
 
 class RerunFile:

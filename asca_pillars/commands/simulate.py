@@ -112,7 +112,7 @@ def simulate(
     from asca_pillars.commands.options import RuntimeOptions
     from asca_pillars.data.kitti import KittiSplit
     from asca_pillars.errors import ConfigError
-    from asca_pillars.files import require_own
+    from asca_pillars.sim.simulation import require_own_frames
     from asca_pillars.sim.simulation import simulate as write_frames
     from asca_pillars.sim.simulation_configs import load_simulation_config
 
@@ -131,17 +131,17 @@ def simulate(
             raise ConfigError(
                 "--sequences: leave --frames, --report, --like and --cluster out; they are for single scans"
             )
-        require_own(out, "asca simulate", "simulation.json", text='"length"')
-        from asca_pillars.sim.sequences.sequence_files import simulate_sequences
+        from asca_pillars.sim.sequences.sequence_files import require_own_sequences, simulate_sequences
 
         length = length or LENGTH
+        require_own_sequences(out)
         simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share)
         console.print(f"{sequences} sequences of {length} scans below {out}; look at one: asca detect {out}/scans/0000")
         return
     there = any((out / "training" / "velodyne").glob("*.bin"))
     if frames is not None or not (there and (report or like is not None)):
         frames = frames or FRAMES
-        require_own(out, "asca simulate", "simulation.json", text='"seed"')
+        require_own_frames(out)
         write_frames(out, frames, seed, workers, settings, val_share, cluster=cluster)
         console.print(f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin")
     if report:

@@ -32,11 +32,11 @@ def train(
     from rich.console import Console
 
     from asca_pillars.config import load_config
-    from asca_pillars.files import require_own
+    from asca_pillars.training.run_files import require_own_run
 
     settings = load_config(config, override or ())
     require("train")
-    require_own(out, "asca train", "config.yaml", "environment.json", "train.log")  # the log is that of `asca ablate`
+    require_own_run(out, init)
     console = Console(markup=False)
     with console.status("Loading PyTorch"):
         from asca_pillars.training.callbacks import TrainingInterruptedError

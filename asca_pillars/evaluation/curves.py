@@ -7,6 +7,7 @@ import numpy as np
 
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, Curve, KittiResults
 from asca_pillars.files import atomic_path
+from asca_pillars.own_files import PICTURE_SOFTWARE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +49,7 @@ def write_curves(path: str | Path, results: KittiResults, title: str) -> None:
         plot.set_ylabel("precision (%)")
     figure.suptitle(title, wrap=True)
     with atomic_path(path) as temporary:
-        FigureCanvasAgg(figure).print_png(temporary)
+        FigureCanvasAgg(figure).print_png(temporary, metadata={"Software": PICTURE_SOFTWARE})
 
 
 def _draw(plot: "Axes", curves: list[Curve]) -> None:

@@ -13,12 +13,14 @@ from rich.progress import track
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
-from asca_pillars.files import atomic_path
+from asca_pillars.files import write_text
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.own_files import page_end
 from asca_pillars.pictures.drawing import Color, Image
 from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, read_image, write_png
 
 INDEX = "index.md"
+INDEX_END = page_end("asca eval")
 _INTRODUCTION = """# {title}: worst frames
 
 The frames with most misses and false detections at the fixed score, by KITTI's moderate difficulty. A false detection
@@ -83,8 +85,7 @@ def write_gallery(
         name = f"{rank:03d}_{frame.frame_id}.png"
         write_png(Path(folder) / name, _draw(frame, split, Path(labels), Path(predictions), ranges))
         rows.append(f"| [{frame.frame_id}]({name}) | {frame.missed.sum()} | {frame.false_positive.sum()} |")
-    with atomic_path(Path(folder) / INDEX) as temporary:
-        temporary.write_text("\n".join([*rows, ""]), encoding="utf-8")
+    write_text(Path(folder) / INDEX, "\n".join([*rows, ""]) + INDEX_END)
 
 
 def _draw(frame: ScoreMatches, split: KittiSplit, labels: Path, predictions: Path, ranges: Ranges) -> Image:

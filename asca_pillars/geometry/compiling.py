@@ -1,31 +1,59 @@
-"""How numba compiles the loops of the `*_kernels.py` files.
+"""How numba compiles the loops of the `*_kernels.py` files and of the simulator.
 
-The compiled functions take memory made by NumPy and have their signatures written out: that takes a quarter off the
-time to compile, and all of it is spent when they are imported, once per machine (numba's cache keeps the result).
-`nogil` lets other threads run meanwhile; nothing is `parallel`, because the network owns the cores.
+The compiled functions of kernels take memory made by NumPy and have their signatures written out: that takes a quarter
+off the time to compile, and all of it is spent when they are imported, once per machine (numba's cache keeps the
+result). `nogil` lets other threads run meanwhile; nothing is `parallel`, because the network owns the cores.
+
+numba loads what lies in its cache as it is, machine code as well: an empty file ends the process with an EOFError, a
+flipped bit with SIGABRT. Here each file of the cache carries a digest. One that is damaged is compiled anew.
 """
 
-from collections.abc import Callable
+import contextlib
+import hashlib
+import io
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numba
 from numba import types
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 # NumPy's division, which does not look out for zeros; no entry for C programs.
 _PLAIN = {"error_model": "numpy", "no_cfunc_wrapper": True}
+_DIGEST_BYTES = 32
+_log = logging.getLogger(__name__)
 
 inner = numba.njit(no_cpython_wrapper=True, **_PLAIN)
 """Decorates what is called by compiled functions of the same file alone."""
 
 
 def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: compiled for arguments of these types, cached where a folder for it can be written."""
+    """Decorator: compiled for arguments of these types when it is imported, cached as by `cached`."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        try:
-            return numba.njit(arguments, cache=True, nogil=True, **_PLAIN)(function)
-        except RuntimeError:  # no such folder: each process compiles for two seconds, and is then as fast as others
-            return numba.njit(arguments, nogil=True, **_PLAIN)(function)
+        kept = cached(nogil=True, **_PLAIN)(function)
+        if kept is not function:
+            kept.compile(arguments)  # type: ignore[attr-defined]  # a numba dispatcher
+            kept.disable_compile()  # type: ignore[attr-defined]
+        return kept
+
+    return decorate
+
+
+def cached(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator: `numba.njit` with these options, whose results are kept where a folder for them can be written.
+
+    Where there is none, each process compiles for itself, some seconds, and is then as fast as others.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        dispatcher = numba.njit(**options)(function)
+        if dispatcher is not function:  # as it is with NUMBA_DISABLE_JIT
+            with contextlib.suppress(RuntimeError):  # no such folder
+                dispatcher._cache = _CheckedCache(function)
+        return dispatcher
 
     return decorate
 
@@ -38,3 +66,55 @@ def given(dtype: Any, axes: int = 1) -> Any:
 def written(dtype: Any, axes: int = 1) -> Any:
     """Type of an array that is written: results, or room to work in."""
     return types.Array(dtype, axes, "C")
+
+
+class _CheckedCache(FunctionCache):
+    """numba's cache of a function, in files that tell whether they are whole."""
+
+    warned = False  # once a process, of the first function
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        locator = self._impl.locator
+        self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, locator.get_source_stamp())
+
+    def save_overload(self, signature: Any, data: Any) -> None:
+        """Keep what was compiled, if it can be written; this process goes on with it in any case."""
+        try:
+            super().save_overload(signature, data)
+        except OSError as error:
+            if not _CheckedCache.warned:
+                _log.warning(
+                    "%s: what was compiled cannot be kept (%s), so that every process compiles for some seconds; make "
+                    "room there, or set NUMBA_CACHE_DIR to another folder",
+                    *(self.cache_path, error.strerror or error),
+                )
+            _CheckedCache.warned = True
+
+
+class _CheckedFile(IndexDataCacheFile):
+    """Index and data of a cached function, each with a digest at its end, which numba's own reading passes over."""
+
+    def _load_index(self) -> Any:
+        return super()._load_index() if _is_whole(Path(self._index_path)) else {}
+
+    def _load_data(self, name: str) -> Any:
+        path = Path(self._data_path(name))
+        if not _is_whole(path):
+            raise FileNotFoundError(path)  # which means to numba that it is to be compiled
+        return super()._load_data(name)
+
+    @contextlib.contextmanager
+    def _open_for_write(self, path: str) -> Iterator[io.BytesIO]:
+        with super()._open_for_write(path) as file:
+            content = io.BytesIO()
+            yield content
+            file.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return False
+    return hashlib.sha256(content[:-_DIGEST_BYTES]).digest() == content[-_DIGEST_BYTES:]

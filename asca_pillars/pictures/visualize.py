@@ -1,6 +1,7 @@
 """Pictures of scans and boxes, from above and over the camera image: uint8 BGR, as OpenCV has them."""
 
 import math
+import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.own_files import PICTURE_SOFTWARE
 from asca_pillars.pictures.drawing import BACKGROUND, OVERSAMPLING, SUBPIXEL_BITS, Color, Image, Texts, View, subpixels
 
 _CLASS_COLORS: dict[str, Color] = {
@@ -27,6 +29,7 @@ _OTHER_COLORS: tuple[Color, ...] = ((255, 200, 70), (255, 120, 200), (90, 230, 2
 _RING, _GRAY, _WHITE = (74, 62, 54), (190, 180, 172), (255, 255, 255)
 _POINT_PX = 3
 _LEGEND_PX, _LEGEND_ROW_PX = 200, 22  # width kept free for it, and height of a row
+_PNG_HEADER_BYTES = 33  # signature and IHDR, which other chunks may follow
 _RING_TEXT_DEG = (-40, -30, 40, 30, 0, -135, 135, 180)
 
 
@@ -48,8 +51,11 @@ def write_png(path: str | Path, image: Image) -> None:
 
 
 def png_bytes(image: Image) -> bytes:
-    """An image (H, W, 3), blue, green, red, as the bytes of a PNG file."""
-    return cv2.imencode(".png", image)[1].tobytes()
+    """An image (H, W, 3), blue, green, red, as the bytes of a PNG file that says in its field Software who wrote it."""
+    content = cv2.imencode(".png", image)[1].tobytes()
+    text = b"tEXtSoftware\0" + PICTURE_SOFTWARE.encode()
+    chunk = struct.pack(f">I{len(text)}sI", len(text) - 4, text, zlib.crc32(text))
+    return content[:_PNG_HEADER_BYTES] + chunk + content[_PNG_HEADER_BYTES:]
 
 
 class Picture(np.ndarray[Any, np.dtype[np.uint8]]):

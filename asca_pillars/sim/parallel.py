@@ -1,15 +1,17 @@
 """Simulating frame after frame in several processes, into a folder that says what it holds."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from asca_pillars.errors import ConfigError, DatasetError
-from asca_pillars.files import atomic_path
+from asca_pillars.files import write_text
+from asca_pillars.own_files import json_object, require_own, require_own_file
 from asca_pillars.processes import in_processes
 
 ABOUT_FILE = "simulation.json"
+COMMAND = "asca simulate"
 Item = TypeVar("Item")
 
 
@@ -34,6 +36,22 @@ def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *,
         pass
 
 
+def require_own_simulation(root: Path, about_keys: Sequence[str], folders: Iterable[str | Path]) -> None:
+    """Make sure that `asca simulate` may write into `root`: it is absent, empty, or holds an earlier simulation.
+
+    Args:
+        root: the folder.
+        about_keys: of its simulation.json.
+        folders: below `root`, that frames are written into.
+
+    Raises:
+        OutputError: something else is there, such as a list that was edited, or a link.
+    """
+    require_own(root, COMMAND, {ABOUT_FILE: json_object(*about_keys)}, folders=("ImageSets", *folders))
+    for name in ("train", "val"):
+        require_own_file(root / "ImageSets" / f"{name}.txt", COMMAND, _names_successive_frames)
+
+
 def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
     """Note in simulation.json what the frames of a folder depend on; refuse a folder of other frames.
 
@@ -50,7 +68,18 @@ def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
     if not path.exists():
         if any(scans.rglob("*.bin")):
             raise DatasetError(f"{scans}: holds scans that were not simulated; choose another folder")
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text)
     elif path.read_text(encoding="utf-8") != text:
         raise DatasetError(f"{path}: the frames there have another seed or configuration; choose another folder")
+
+
+def _names_successive_frames(path: Path) -> bool:
+    """Whether a list is one that is written here, of frames (000007) or of the scans of sequences (0002/000031)."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        rows = [[int(part) for part in line.split("/")] for line in lines]
+    except ValueError:
+        return False
+    length = 1 + max(sum(row[1:]) for row in rows)
+    numbers = [row[0] * length + sum(row[1:]) for row in rows]
+    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))

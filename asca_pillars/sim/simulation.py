@@ -22,7 +22,14 @@ from asca_pillars.data.kitti import (
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
-from asca_pillars.sim.parallel import ABOUT_FILE, check_wishes, claim_simulation, for_each, held_out
+from asca_pillars.sim.parallel import (
+    ABOUT_FILE,
+    check_wishes,
+    claim_simulation,
+    for_each,
+    held_out,
+    require_own_simulation,
+)
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.image_border import outside_image
@@ -169,6 +176,12 @@ def simulate(
     write_image_set(root, "train", names[:first_val])
     write_image_set(root, "val", names[first_val:])
     return root
+
+
+def require_own_frames(out: Path) -> None:
+    """Make sure that `simulate` may write into `out`; OutputError names what is not ours to replace."""
+    folders = [f"training/{name}" for name in ("velodyne", "label_2", "calib")]
+    require_own_simulation(out, ("seed", "scene", "lidar", "field_of_view"), folders)
 
 
 def frame_id(index: int) -> str:

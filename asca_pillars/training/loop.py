@@ -20,8 +20,7 @@ from asca_deploy.bundle import WEIGHTS
 from asca_pillars.config import Config, ModelConfig, TrainConfig
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import TrainingError
-from asca_pillars.files import recover
-from asca_pillars.locks import only_writer
+from asca_pillars.locks import only_writer, recover
 from asca_pillars.models.checkpoint import save_weights
 from asca_pillars.models.second_stage.open_first_stage import with_first_stage
 from asca_pillars.pillar_config import PillarModel
@@ -38,6 +37,7 @@ from asca_pillars.training.checkpoints import (
 from asca_pillars.training.initial_weights import initial_weights
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule
+from asca_pillars.training.run_files import COMMAND
 from asca_pillars.training.run_folder import Seen, claim, measure_input, recorded_precision
 
 SANITY_STEPS = 2  # validation batches that run before the first training step
@@ -82,7 +82,7 @@ def train(
             weights.
     """
     # The processes of one run share its folder: the first holds it.
-    with only_writer(out, "asca train") if getattr(rank_zero_only, "rank", 0) == 0 else nullcontext():
+    with only_writer(out, COMMAND) if getattr(rank_zero_only, "rank", 0) == 0 else nullcontext():
         return _train(config, data_root, Path(out), devices, num_nodes, init)
 
 
@@ -95,7 +95,7 @@ def _train(
     # What the run records of itself must hold for its checkpoint: without a camera it has seen whole scans.
     view = config.data.camera_view and open_split(data_root).has_camera
     config = replace(config, data=replace(config.data, camera_view=view))
-    recover(checkpoints, again=True)  # another process may have been killed there since
+    recover(checkpoints)
     resumed, damage = checkpoint_to_resume(checkpoints, config.model)
     goes_on = resumed is not None
     config = replace(config, train=_with_settled_precision(config.train, out, resumes=goes_on))

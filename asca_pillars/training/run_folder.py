@@ -16,14 +16,23 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.errors import TrainingError
-from asca_pillars.files import atomic_path, write_json
+from asca_pillars.files import write_json, write_text
 from asca_pillars.models.checkpoint import weights_sha256
+from asca_pillars.own_files import require_own_file
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import read_settings
 from asca_pillars.system import describe_environment
+from asca_pillars.training.run_files import (
+    COMMAND,
+    CONFIG_FILE,
+    ENVIRONMENT_FILE,
+    EXPECTED_INPUT_FILE,
+    FRAMES_FILE,
+    YAML_HEAD,
+    is_own_config,
+    is_own_expected_input,
+)
 
-FRAMES_FILE = "frames.json"
-EXPECTED_INPUT_FILE = "expected_input.yaml"
 EXPECTED_INPUT_FRAMES = 200
 # Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.
 NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
@@ -65,8 +74,10 @@ def claim(out: Path, config: Config, seen: Seen) -> None:
     Raises:
         TrainingError: the run there is another one, or drew from other frames, or in more or fewer processes, or
             started from other weights.
+        OutputError: a configuration there is not that of a run.
     """
-    path, frames_path = out / "config.yaml", out / FRAMES_FILE
+    path, frames_path = out / CONFIG_FILE, out / FRAMES_FILE
+    require_own_file(path, COMMAND, is_own_config)
     found = read_settings(Seen, frames_path, (), {}) if frames_path.exists() else None
     refusal = _why_another(path, config) if path.exists() else None
     refusal = refusal or (found and _why_other_frames(frames_path, found, seen))
@@ -75,15 +86,14 @@ def claim(out: Path, config: Config, seen: Seen) -> None:
     if seen.initial_sha256 is None and found is not None:
         seen = seen._replace(initial_sha256=found.initial_sha256)
     if refusal or not path.exists():
-        write_json(out / "environment.json", describe_environment())
-    with atomic_path(path) as temporary:
-        temporary.write_text(yaml.safe_dump(to_dict(config), sort_keys=False), encoding="utf-8")
+        write_json(out / ENVIRONMENT_FILE, describe_environment())
+    write_text(path, YAML_HEAD + yaml.safe_dump(to_dict(config), sort_keys=False))
     write_json(frames_path, seen._asdict())
 
 
 def recorded_precision(out: Path) -> Precision:
     """Which `train.precision` the run in `out` was started with; `auto` where that is not written down."""
-    path = out / "config.yaml"
+    path = out / CONFIG_FILE
     return load_config(path).train.precision if path.exists() else "auto"
 
 
@@ -106,8 +116,8 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool) -> ExpectedI
         measured = measure_expected_input(scans, frames.camera_view)
     except ValueError:
         raise TrainingError(f"{frames.split.root}: no scan of list `{frames.split.name}` has a point to see") from None
-    with atomic_path(path) as temporary:
-        temporary.write_text(yaml.safe_dump(to_dict(measured)), encoding="utf-8")
+    require_own_file(path, COMMAND, is_own_expected_input)
+    write_text(path, YAML_HEAD + yaml.safe_dump(to_dict(measured)))
     return measured
 
 

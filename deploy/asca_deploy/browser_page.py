@@ -12,11 +12,15 @@ from pathlib import Path
 
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle
+from asca_deploy.manifest_file import read_manifest
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import BundleError, ConfigError
 from asca_pillars.files import atomic_directory, write_json
+from asca_pillars.own_files import json_object, require_not_input, require_replaceable
 
 PAGE = "page.json"
+PAGE_FOLDER = ("asca export --browser", PAGE, json_object("bundle", "scan", "onnxruntime_web", "files"))
+"""Command, marker and its recognizer, as `atomic_directory` takes them."""
 SAMPLE = "sample.bin"
 START = "Open it from a file server: python -m http.server --directory {out}"
 ORT_FILES = ("ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm")
@@ -39,8 +43,10 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
     Raises:
         BundleError: the bundle is damaged, or of a kind that the page does not run.
         ConfigError: the package is not one.
-        OutputError: `out` holds something else.
+        OutputError: `out` holds something else, or what is read.
     """
+    require_replaceable(out, *PAGE_FOLDER)
+    require_not_input(out, (bundle, scan, ort_web))
     manifest = load_pillar_bundle(bundle)
     if manifest.kind != "pillar" or manifest.spec.grid.pools:
         raise BundleError(
@@ -53,11 +59,15 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
         )
     version, read = _open_package(ort_web)
     points = read_scan(scan).points
-    with atomic_directory(out, "asca export --browser", PAGE) as folder:
+    with atomic_directory(out, *PAGE_FOLDER) as folder:
         for file in _modules():
             (folder / file.name).write_bytes(file.read_bytes())
-        for name in (MANIFEST, *(graph.file for graph in manifest.graphs.values())):
-            (folder / name).write_bytes((bundle / name).read_bytes())
+        # Under names of ours, whatever the bundle calls its graphs: they lie beside the page's scripts.
+        described = read_manifest(bundle / MANIFEST)
+        for name, graph in manifest.graphs.items():
+            described["graphs"][name]["file"] = f"{name}.onnx"
+            (folder / f"{name}.onnx").write_bytes((bundle / graph.file).read_bytes())
+        write_json(folder / MANIFEST, described)
         for name in ORT_FILES:
             (folder / name).write_bytes(read(f"dist/{name}"))
         write_scan(folder / SAMPLE, points)

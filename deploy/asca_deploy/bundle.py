@@ -15,6 +15,7 @@ from typing import Literal
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.own_files import json_object
 from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.points.first_stage import FirstStageSettings
 from asca_pillars.points.refine_geometry import RefineSettings
@@ -26,6 +27,8 @@ from asca_pillars.tables.voxel_spec import VoxelSpec
 
 SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
+BUNDLE_FOLDER = ("asca export", MANIFEST, json_object("schema_version", "graphs", "spec"))
+"""Command, marker and its recognizer, as `atomic_directory` takes them."""
 WEIGHTS: Literal["weights.ckpt"] = "weights.ckpt"
 ENCODER = "encoder"
 BACKBONE = "backbone"

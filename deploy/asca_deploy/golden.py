@@ -24,6 +24,7 @@ from asca_pillars.errors import BundleError
 from asca_pillars.files import atomic_directory, write_json
 from asca_pillars.geometry.decode import HeadMaps, decode_candidates, sigmoid, suppress
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.own_files import json_object, require_not_input, require_replaceable
 from asca_pillars.points.first_stage import FirstPass, proposed_from
 from asca_pillars.points.refine_geometry import refine_scan
 from asca_pillars.points.refined_detections import reported_detections
@@ -31,6 +32,8 @@ from asca_pillars.system import cpu_model, package_versions
 from asca_pillars.tables.neck_tables import table_inputs
 
 GOLDEN = "golden.json"
+GOLDEN_FOLDER = ("asca export --golden", GOLDEN, json_object("schema_version", "bundle", "scan", "stages"))
+"""Command, marker and its recognizer, as `atomic_directory` takes them."""
 SCHEMA_VERSION = 1
 
 Stages: TypeAlias = Mapping[str, Mapping[str, NDArray[Any]]]
@@ -50,14 +53,16 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
     Raises:
         BundleError: the bundle cannot be used.
         ScanError: the scan cannot be read.
-        OutputError: `out` holds something else.
+        OutputError: `out` holds something else, the bundle or the scan.
     """
+    require_replaceable(out, *GOLDEN_FOLDER)
+    require_not_input(out, (bundle, scan))
     detector = Detector(bundle, threads=1)
     described = detector.bundle
     if not (isinstance(described, PillarBundle) and isinstance(detector.pipeline, PillarPipeline | RefinePipeline)):
         raise BundleError(f"{bundle}: golden vectors are written of pillar detectors, and this is {described.kind}")
     stages = golden_stages(detector.pipeline, read_scan(scan).points)
-    with atomic_directory(out, "asca export --golden", GOLDEN) as folder:
+    with atomic_directory(out, *GOLDEN_FOLDER) as folder:
         for stage, arrays in stages.items():
             for name, array in arrays.items():
                 np.save(folder / _file(stage, name), np.ascontiguousarray(array), allow_pickle=False)

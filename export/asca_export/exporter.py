@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import (
     BACKBONE,
+    BUNDLE_FOLDER,
     ENCODER,
-    MANIFEST,
     WEIGHTS,
     Bundle,
     CanvasFormat,
@@ -90,7 +90,7 @@ def export_bundle(
     if calibration is not None:
         calibration_scans(calibration, scans, config.model.spec)  # too few are told before the work, not after it
     progress("Exporting and proving parity")
-    with atomic_directory(out, "asca export", MANIFEST) as folder:
+    with atomic_directory(out, *BUNDLE_FOLDER) as folder:
         gmac = _export_graphs(detector, folder, scans, dense_neck=dense_neck)
         network = config.model.network
         neck, cells = ("dense", None) if dense_neck else (network.neck, detector.preparation.active_cells)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, MANIFEST, Parity, PvRcnnBundle, PvRcnnSection
+from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, Parity, PvRcnnBundle, PvRcnnSection
 from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
 from asca_export import graphs
 from asca_export.exporter import LICENSE, provenance, require_parity_scans, write_proven
@@ -53,7 +53,7 @@ def export_pv_rcnn_bundle(
         require_quantizable(model)
         calibration_scans(calibration, scans, model.spec)  # too few are told before the work, not after it
     progress("Exporting and proving parity")
-    with atomic_directory(out, "asca export", MANIFEST) as folder:
+    with atomic_directory(out, *BUNDLE_FOLDER) as folder:
         draft = PvRcnnBundle(
             name=config.name,
             kind="pv_rcnn",

@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, ENCODER, MANIFEST, REFINE, Parity, PillarBundle, RefineSection
+from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, REFINE, Parity, PillarBundle, RefineSection
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.refine_pipeline import RefinePipeline
@@ -62,7 +62,7 @@ def export_refine_bundle(
     stage = open_first_stage(model.first_stage)
     if calibration is not None:  # too few are told before the work, not after it
         calibration = calibration_scans(calibration, scans, model.spec).used
-    with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, "asca export", MANIFEST) as folder:
+    with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, *BUNDLE_FOLDER) as folder:
         first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, progress)
         proposing = load_pillar_bundle(first)
         _copy_first_stage(first, proposing, folder)

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from asca_deploy.bundle import MANIFEST, WEIGHTS
+from asca_deploy.bundle import BUNDLE_FOLDER, WEIGHTS
 from asca_deploy.manifest import load_pillar_bundle, write_bundle_manifest
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
@@ -39,7 +39,7 @@ def main(
     source = find_bundle(bundle)
     loaded = load_pillar_bundle(source)
     expected = measure_expected_input((read_scan(path).points for path in find_scans(scans)), camera_view)
-    with atomic_directory(out, "asca export", MANIFEST) as folder:
+    with atomic_directory(out, *BUNDLE_FOLDER) as folder:
         for name, graph in loaded.graphs.items():
             shutil.copyfile(source / graph.file, graphs.graph_path(folder, name))
         if loaded.provenance.weights_file:

@@ -18,6 +18,7 @@ from asca_pillars.commands import ablate_steps
 from asca_pillars.commands.ablate import ablate
 from asca_pillars.config import load_config, pillar_spec
 from asca_pillars.errors import AscaError, ConfigError, TrainingError
+from asca_pillars.own_files import written_by
 from asca_pillars.schema import to_dict
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
@@ -173,7 +174,7 @@ def test_a_damaged_note_of_the_base_is_one_line_and_can_be_deleted(tmp_path: Pat
     base = {"config": {"name": "small"}, "data": "data/sim"}
     ablate_steps.claim(tmp_path, base)
     (tmp_path / "none" / "seed0").mkdir(parents=True)
-    (tmp_path / "none" / "seed0" / "train.log").write_text("")
+    (tmp_path / "none" / "seed0" / "train.log").write_text(written_by("asca ablate") + "\n")
     note = tmp_path / "ablation.json"
     note.write_text(note.read_text()[:-5])
     with pytest.raises(TrainingError, match=r"ablation\.json: not what `asca ablate` wrote, or damaged .*; delete it"):

@@ -1,6 +1,7 @@
 """Shards: their names, their files, and whose run they belong to."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,10 +40,10 @@ def test_results_appear_when_all_are_written(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         folder.write(shard, stop_after_one())
-    assert folder.done() == set() and not list(tmp_path.iterdir())
+    assert folder.done([shard]) == set() and not list(tmp_path.iterdir())
     folder.write(shard, ["a\n", "b\n"])
     (tmp_path / ".000000002-0.asca-00000000.jsonl").write_text("half of a li")  # what a killed writer leaves
-    assert folder.done() == {shard.name}
+    assert folder.done([shard]) == {shard.name}
 
 
 def test_parts_become_the_shard(tmp_path: Path) -> None:
@@ -51,8 +52,45 @@ def test_parts_become_the_shard(tmp_path: Path) -> None:
     for part in (second, first):
         folder.write(part, [f"{item}\n" for item in part.items])
     folder.join(shard, [second, first])
-    assert folder.done() == {shard.name}
+    assert folder.done([shard]) == {shard.name}
     assert list(folder.lines([shard])) == ["a\n", "b\n", "c\n"]
+
+
+def flipped(content: bytes) -> bytes:
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"".join(content.splitlines(keepends=True)[:1]),  # whole lines, too few
+        lambda content: b"".join(content.splitlines(keepends=True)[::-1]),
+        lambda content: content + content.splitlines(keepends=True)[-1],
+        lambda content: content[:-3],  # within a line
+        lambda content: content[:-1],
+        lambda content: b"",
+        flipped,
+        lambda content: b'{"scan": "a", "boxes": []}\n' * 3,  # as earlier versions wrote them
+    ],
+)
+def test_a_damaged_result_is_done_again_and_not_merged(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    folder, shards = ShardFolder(tmp_path), cut(["a", "b", "c", "d"], 3)
+    for shard in shards:
+        folder.write(shard, [json.dumps({"scan": item}) + "\n" for item in shard.items])
+    assert folder.done(shards) == {shard.name for shard in shards}
+    path = tmp_path / f"{shards[0].name}.jsonl"
+    path.write_bytes(damage(path.read_bytes()))
+    assert folder.done(shards) == {shards[1].name}
+    with pytest.raises(OutputError, match=r"000000000-\w+\.jsonl: is damaged; give the same command again"):
+        list(folder.lines(shards))
+
+
+def test_a_result_under_the_name_of_another_is_none(tmp_path: Path) -> None:
+    folder, shards = ShardFolder(tmp_path), cut(["a", "b", "c", "d"], 2)
+    folder.write(shards[0], ["1\n", "2\n"])
+    (tmp_path / f"{shards[0].name}.jsonl").rename(tmp_path / f"{shards[1].name}.jsonl")
+    assert folder.done(shards) == set()
 
 
 def test_a_result_that_is_not_there_is_named(tmp_path: Path) -> None:

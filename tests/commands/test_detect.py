@@ -98,6 +98,67 @@ def test_a_run_that_was_broken_off_can_be_given_again(tmp_path: Path, monkeypatc
     assert len((tmp_path / "out" / "detections.jsonl").read_text().splitlines()) == 2
 
 
+@pytest.mark.parametrize("name", ["1.json", "1.txt", "1_bev.png", "1_image.png", "recording.json", "tracks.txt"])
+def test_a_file_of_somebody_else_in_an_earlier_run_s_folder_is_kept(tmp_path: Path, name: str) -> None:
+    for scan in ("0.bin", "1.bin"):
+        write_scan(tmp_path / "scans" / scan, POINTS)
+    out = tmp_path / "out"
+    detect([tmp_path / "scans" / "0.bin"], out=out, threads=1, pictures=False)
+    (out / name).write_text('{"scan": "1.bin", "boxes": []}')
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(OutputError, match=f"{name}: `asca detect` did not write it and would replace it"):
+        detect([tmp_path / "scans"], out=out, threads=1)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "refused before anything is written"
+
+
+@pytest.mark.parametrize("name", ["detections.jsonl", "below/1.json", "below/1_bev.png", "below"])
+def test_results_are_not_written_through_links(tmp_path: Path, name: str) -> None:
+    write_scan(tmp_path / "scans" / "below" / "1.bin", POINTS)
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    detect([tmp_path / "scans"], out=out, threads=1)
+    (out / name).rename(elsewhere)
+    (out / name).symlink_to(elsewhere)
+    before = [path.read_bytes() for path in (elsewhere, *elsewhere.rglob("*")) if path.is_file()]
+    with pytest.raises(OutputError, match=f"{name}: is a link"):
+        detect([tmp_path / "scans"], out=out, threads=1)
+    assert [path.read_bytes() for path in (elsewhere, *elsewhere.rglob("*")) if path.is_file()] == before
+
+
+def test_a_folder_may_be_given_as_a_link(tmp_path: Path) -> None:
+    write_scan(tmp_path / "1.bin", POINTS)
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "disk")
+    for _ in range(2):
+        detect([tmp_path / "1.bin"], out=tmp_path / "out", threads=1, pictures=False)
+    assert {path.name for path in (tmp_path / "disk").iterdir()} == {"1.json", "detections.jsonl"}
+
+
+def test_pictures_of_other_boxes_do_not_stay(tmp_path: Path) -> None:
+    split = KittiSplit(write_dataset(tmp_path / "kitti", 2))
+    for frame_id in split.frame_ids:
+        write_scan(split.scan_path(frame_id), read_scan(sample_scan_path()).points[::4])
+    scans, out = split.scan_path("000000").parent, tmp_path / "out"
+    detect([scans], out=out, threads=1)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert before.keys() >= {"000000.txt", "000000_bev.png", "000001_bev.png"}
+    detect([scans], out=out, threads=1, pictures=False)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "they are of the same boxes"
+    detect([split.scan_path("000001")], out=out, threads=1, pictures=False, score=0.99)
+    left = {path.name for path in out.iterdir()}
+    assert left == before.keys() - {"000001_bev.png"}, "other scans' stay"
+    split.calib_path("000001").unlink()
+    detect([split.scan_path("000001")], out=out, threads=1, pictures=False)
+    assert {path.name for path in out.iterdir()} == left - {"000001.txt"}
+
+
+def test_scans_may_have_the_names_of_other_results(tmp_path: Path) -> None:
+    for name in ("recording.bin", "tracks.bin", "unreadable.bin"):
+        write_scan(tmp_path / "scans" / name, POINTS)
+    for _ in range(2):
+        detect([tmp_path / "scans"], out=tmp_path / "out", threads=1, pictures=False)
+    assert json.loads((tmp_path / "out" / "recording.json").read_text())["scan"].endswith("recording.bin")
+
+
 def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
     for name in ("1.bin", "2.bin"):
         (tmp_path / name).write_bytes(b"torn")

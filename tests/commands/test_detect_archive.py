@@ -15,6 +15,7 @@ from asca_pillars.cluster.shards import Shard
 from asca_pillars.commands import detect_archive as archive
 from asca_pillars.commands import extras
 from asca_pillars.commands.detect import detect
+from asca_pillars.commands.detect_files import UNREADABLE_FILE
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError, BundleError, ClusterError, ConfigError, OutputError, ScanError
 from tests.deploy.conftest import make_scan, write_bundle
@@ -86,7 +87,7 @@ def test_shards_become_what_one_process_writes(
     run(scans, tmp_path / "out", bundle)
     assert [len(shard.items) for shard in here.begun] == [16, 16, 8]
     assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
-    (line,) = (tmp_path / "out" / archive.UNREADABLE_FILE).read_text().splitlines()
+    (line,) = (tmp_path / "out" / UNREADABLE_FILE).read_text().splitlines()
     assert json.loads(line)["scan"] == str(scans / f"{BAD}.bin") and "4 bytes" in json.loads(line)["error"]
     assert len(alone.splitlines()) == SCANS - 1
 
@@ -102,6 +103,51 @@ def test_what_is_done_is_not_done_again(scans: Path, bundle: Path, alone: bytes,
     run(scans, tmp_path / "out", bundle)
     assert len(here.begun) == 1
     assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
+
+
+@pytest.mark.parametrize("kept", ["3 lines", "a part of a line"])
+def test_a_shard_that_was_cut_is_done_again(
+    scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path, kept: str
+) -> None:
+    run(scans, tmp_path / "out", bundle)
+    shard = min((tmp_path / "out" / "shards").glob("*.jsonl"))
+    content = shard.read_bytes()
+    shard.write_bytes(b"".join(content.splitlines(keepends=True)[:3]) if kept == "3 lines" else content[:-40])
+    here.begun.clear()
+    run(scans, tmp_path / "out", bundle)
+    assert [shard.first for shard in here.begun] == [0]
+    assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
+
+
+def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(
+    scans: Path, bundle: Path, here: Here, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(scans, out, bundle)
+    assert (out / UNREADABLE_FILE).stat().st_size
+    detect([scans / "1.bin"], out=out, bundle=bundle, threads=1, pictures=False)
+    assert not (out / UNREADABLE_FILE).exists()
+    assert (out / "shards" / "run.json").is_file()
+
+
+def test_shards_are_not_written_through_a_link(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(scans, out, bundle)
+    (out / "shards").rename(tmp_path / "elsewhere")
+    (out / "shards").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match="shards: is a link"):
+        detect([scans], out=out, bundle=bundle, cluster="made-up:1")
+
+
+def test_a_folder_of_shards_of_somebody_else_is_left_alone(
+    scans: Path, bundle: Path, here: Here, tmp_path: Path
+) -> None:
+    detect([scans / "1.bin"], out=tmp_path, bundle=bundle, threads=1, pictures=False)
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards" / "glass.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"shards: holds glass\.txt and nothing that `asca detect` wrote"):
+        detect([scans], out=tmp_path, bundle=bundle, cluster="made-up:1")
+    assert len(list((tmp_path / "shards").iterdir())) == 1
 
 
 def test_an_archive_may_grow(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
@@ -183,7 +229,7 @@ def test_a_scan_that_ends_its_worker_is_a_line(
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
     lines = [line for line in alone.decode().splitlines() if json.loads(line)["scan"] != deadly]
     assert (tmp_path / "out" / "detections.jsonl").read_text().splitlines() == lines
-    assert "ended the process" in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+    assert "ended the process" in (tmp_path / "out" / UNREADABLE_FILE).read_text()
     assert len(list((tmp_path / "out" / "shards").glob("*.jsonl"))) == 3, "the halves have become the shard"
 
 
@@ -198,7 +244,7 @@ def test_an_error_that_nobody_foresaw_is_a_line(
     monkeypatch.setattr(f"{archive.__name__}.read_scan", fail)
     with pytest.raises(ScanError, match="2 of 40"):
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
-    assert '{"error": "ZeroDivisionError: a bug"' in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+    assert '{"error": "ZeroDivisionError: a bug"' in (tmp_path / "out" / UNREADABLE_FILE).read_text()
 
 
 def test_a_bad_moment_of_the_mount_is_waited_out(
@@ -217,7 +263,7 @@ def test_a_bad_moment_of_the_mount_is_waited_out(
     with pytest.raises(ScanError, match="2 of 40"):
         detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
     assert (tries["3.bin"], tries["4.bin"], tries[f"{BAD}.bin"]) == (3, 3, 1)
-    assert "4.bin: cannot be read" in (tmp_path / "out" / archive.UNREADABLE_FILE).read_text()
+    assert "4.bin: cannot be read" in (tmp_path / "out" / UNREADABLE_FILE).read_text()
 
 
 def test_a_machine_that_does_not_see_the_scans_ends_the_run(

@@ -1,12 +1,13 @@
 """`asca detect` of recordings: what is written, that a kill changes nothing, and how it refuses."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from asca_deploy.manifest import load_bundle
 from asca_pillars.commands import detect_recording as steps
 from asca_pillars.commands import extras
 from asca_pillars.commands.detect import detect
-from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal
+from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
 from asca_pillars.data.boxes.box_records import read_frames
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import AscaError, ConfigError, OutputError, ScanError
@@ -158,6 +159,116 @@ def test_a_killed_run_goes_on_and_ends_the_same(
     assert outputs(killed) == outputs(undisturbed)
 
 
+def _dies(*_: object) -> Iterator[None]:
+    raise KeyboardInterrupt
+
+
+@pytest.fixture
+def journal(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of all scans, in tmp_path/killed."""
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(steps, "tracked", _dies)
+        run(drive, tmp_path / "killed", track=True, foxglove=tmp_path / "killed" / "boxes.mcap")
+    return tmp_path / "killed" / JOURNAL_FILE
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda line: line.replace(b'"boxes": [[', b'"boxes": [[1', 1),  # still JSON, of 7 numbers
+        lambda line: line.replace(b'"labels": [', b'"labels": [9, ', 1),
+        lambda line: line.replace(b'"number": 2', b'"number": 3', 1),
+        lambda line: b'["0123456789abcdef", {"number": 2}]\n',
+        lambda line: b'{"number": 2, "time_ns": 0, "frame_id": "", "trouble": "made up"}\n',
+        lambda line: b"\x00" * 20 + b"\n",
+        lambda line: line[:-1],  # two lines in one
+        lambda line: b"",
+    ],
+)
+def test_damaged_lines_of_a_journal_are_done_again(
+    drive: Path,
+    undisturbed: Path,
+    journal: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[bytes], bytes],
+) -> None:
+    lines = journal.read_bytes().splitlines(keepends=True)
+    lines[3] = change(lines[3])
+    journal.write_bytes(b"".join(lines))
+    detected: list[int] = []
+    add = Journal.add
+    monkeypatch.setattr(Journal, "add", lambda self, result: detected.append(result.number) or add(self, result))
+    run(drive, journal.parent, track=True, foxglove=journal.parent / "boxes.mcap")
+    assert detected in ([2], [2, 3]), "and no others"
+    assert outputs(journal.parent) == outputs(undisturbed)
+
+
+def test_a_journal_of_other_scans_is_not_mixed_in(drive: Path, undisturbed: Path, journal: Path) -> None:
+    """Whole lines, of a run with another score."""
+    other = Journal(journal.parent / "other", {"score": 0.9}, ("Car",))
+    with other:
+        for number in range(SCANS):
+            other.add(ScanResult(number, number, "other", None, "made up"))
+    theirs = other.path.read_bytes().splitlines(keepends=True)
+    ours = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join([*ours[:3], *theirs[3:]]))
+    shutil.rmtree(journal.parent / "other")
+    run(drive, journal.parent, track=True, foxglove=journal.parent / "boxes.mcap")
+    assert outputs(journal.parent) == outputs(undisturbed)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"my notes\n", b'{"recording": "mine"}\n{"number": 0}\n', b'["0123456789abcdef", {}]\n', b"\x00" * 99],
+)
+@pytest.mark.parametrize("beside", ["thesis.txt", "detections.jsonl"])
+def test_what_is_no_journal_is_neither_cut_nor_removed(
+    drive: Path, tmp_path: Path, undisturbed: Path, content: bytes, beside: str
+) -> None:
+    """Beside an earlier run, too; and it makes nobody's folder ours."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / JOURNAL_FILE).write_bytes(content)
+    (out / beside).write_bytes((undisturbed / "detections.jsonl").read_bytes())
+    with pytest.raises(OutputError):
+        run(drive, out)
+    assert (out / JOURNAL_FILE).read_bytes() == content and len(list(out.iterdir())) == 2
+
+
+def test_a_journal_is_not_written_through_a_link(drive: Path, journal: Path) -> None:
+    elsewhere = journal.rename(journal.parent.parent / "elsewhere")
+    journal.symlink_to(elsewhere)
+    before = elsewhere.read_bytes()
+    with pytest.raises(OutputError, match=f"{JOURNAL_FILE}: is a link"):
+        run(drive, journal.parent)
+    assert elsewhere.read_bytes() == before and journal.is_symlink()
+
+
+@pytest.mark.parametrize("name", ["recording.json", "detections.jsonl", "tracks.txt"])
+def test_results_are_not_written_through_links(drive: Path, tmp_path: Path, name: str) -> None:
+    calib = KittiSplit(write_dataset(tmp_path / "kitti", 1)).calib_path("000000")
+    run(drive, tmp_path / "out", calib=calib)
+    elsewhere = (tmp_path / "out" / name).rename(tmp_path / "elsewhere")
+    (tmp_path / "out" / name).symlink_to(elsewhere)
+    before = elsewhere.read_bytes()
+    with pytest.raises(OutputError, match=f"{name}: is a link"):
+        run(drive, tmp_path / "out", calib=calib)
+    assert elsewhere.read_bytes() == before
+
+
+def test_what_tells_of_a_recording_does_not_stay_beside_other_scans(drive: Path, tmp_path: Path) -> None:
+    calib = KittiSplit(write_dataset(tmp_path / "kitti", 1)).calib_path("000000")
+    out = tmp_path / "out"
+    for scans in (drive, sample_scan_path()):
+        run(drive, out, calib=calib)
+        (out / "notes.txt").write_text("mine")
+        assert (out / "tracks.txt").is_file() and (out / "recording.json").is_file()
+        detect([scans], out=out, threads=1)
+        assert not (out / "tracks.txt").exists(), "nobody asked for it again"
+        assert (out / "recording.json").exists() == (scans == drive)
+        assert (out / "notes.txt").is_file()
+
+
 HELD_UP = """
 import time
 from asca_pillars.cli import main
@@ -186,10 +297,6 @@ def test_after_sigkill(drive: Path, undisturbed: Path, tmp_path: Path) -> None:
     resumed = run_here(*command)
     assert resumed.returncode == 0 and "going on after the" in resumed.stdout
     assert outputs(out) == outputs(undisturbed)
-
-
-def _dies(*_: object) -> Iterator[None]:
-    raise KeyboardInterrupt
 
 
 def test_a_journal_of_other_settings_is_not_gone_on_with(
@@ -229,7 +336,7 @@ def test_results_in_the_folder_of_a_bag_are_no_part_of_it(tmp_path: Path, monkey
 
 
 def test_two_runs_at_once_do_not_share_a_folder(drive: Path, tmp_path: Path) -> None:
-    with Journal(tmp_path, {}, ("Car",)), pytest.raises(OutputError, match="another run writes it"):
+    with Journal(tmp_path, {}, ("Car",)), pytest.raises(OutputError, match="another `asca detect` is at work there"):
         run(drive, tmp_path)
 
 
@@ -266,9 +373,15 @@ def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--columns 7: is for"):
         run(drive, tmp_path, columns=7)
     before = drive.read_bytes()
-    with pytest.raises(OutputError, match=r"drive\.mcap: `asca detect` did not write it"):
+    with pytest.raises(OutputError, match=r"drive\.mcap: would replace .*drive\.mcap, which is read"):
         run(drive, tmp_path, foxglove=drive)
     assert drive.read_bytes() == before
+    other = tmp_path / "other" / "other.mcap"
+    other.parent.mkdir()
+    other.write_bytes(before)
+    with pytest.raises(OutputError, match=r"other\.mcap: `asca detect` did not write it"):
+        run(drive, tmp_path / "none", foxglove=other)
+    assert other.read_bytes() == before
     with pytest.raises(ConfigError, match=r"choose such a name"):
         run(drive, tmp_path, foxglove=tmp_path / "boxes.json")
     with pytest.raises(ConfigError, match=r"score_threshold 1\.2 of class Car must lie"):  # before anything is detected

@@ -12,7 +12,7 @@ pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recording
 
 from asca_pillars.commands import detect_recording as steps
 from asca_pillars.commands.recording_journal import JOURNAL_FILE
-from asca_pillars.commands.rerun_file import require_own_rrd
+from asca_pillars.commands.rerun_file import is_own_rrd
 from asca_pillars.errors import ConfigError, OutputError
 from tests.commands.short_drive import SCANS
 from tests.commands.test_detect_recording import run
@@ -30,19 +30,22 @@ def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
             boxes |= dict(zip(times, labels, strict=True))
         if chunk.entity_path == "/scan":
             points += sum(map(len, batch["Points3D:positions"].to_pylist()))
-    (tmp_path / "out.rrd").replace(tmp_path / "earlier.rrd")
-    require_own_rrd(tmp_path / "earlier.rrd")
+    assert is_own_rrd(tmp_path / "out.rrd")
     assert boxes == {line["time_ns"]: [f"{box['class']} {box['track_id']}" for box in line["boxes"]] for line in lines}
     assert 1000 * SCANS < points <= 20_000 * SCANS
 
 
-def test_an_rrd_of_others_is_not_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [b"RRF2 of mine", b"asca-pillars"])
+def test_an_rrd_of_others_is_not_replaced(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
+) -> None:
+    monkeypatch.setattr(steps, "require", lambda extra: None)
     with pytest.raises(ConfigError, match="choose such a name"):
-        require_own_rrd(tmp_path / "boxes.mcap")
-    require_own_rrd(tmp_path / "free.rrd")
-    (tmp_path / "mine.rrd").write_bytes(b"RRF2 of mine")
+        run(drive, tmp_path / "out", rerun=tmp_path / "boxes.mcap")
+    (tmp_path / "mine.rrd").write_bytes(content)
     with pytest.raises(OutputError, match=r"mine\.rrd: `asca detect` did not write it and would replace it"):
-        require_own_rrd(tmp_path / "mine.rrd")
+        run(drive, tmp_path / "out", rerun=tmp_path / "mine.rrd")
+    assert (tmp_path / "mine.rrd").read_bytes() == content and not (tmp_path / "out").exists()
 
 
 def test_what_rerun_cannot_write_ends_the_run(

@@ -7,7 +7,7 @@ import pytest
 
 from asca_pillars.commands import extras
 from asca_pillars.commands import simulate as command
-from asca_pillars.errors import AscaError, ConfigError, DatasetError
+from asca_pillars.errors import AscaError, ConfigError, DatasetError, OutputError
 from tests.sim.report.made_up import write_set
 
 
@@ -89,3 +89,53 @@ def test_sequences_are_written_and_go_with_nothing_of_single_scans(
     simulate(tmp_path / "c", 1, report=False)
     with pytest.raises(AscaError, match="another folder"):
         command.simulate(tmp_path / "c", sequences=1, length=2)
+
+
+def test_lists_that_were_edited_are_not_written_anew(tmp_path: Path) -> None:
+    simulate(tmp_path, 4, report=False)
+    simulate(tmp_path, 5, report=False)
+    train = tmp_path / "ImageSets" / "train.txt"
+    for edited in ("000000\n000002\n", "000001\n000000\n", "my own split\n", train.read_text() + "\n"):
+        train.write_text(edited)
+        with pytest.raises(OutputError, match=r"train\.txt: `asca simulate` did not write it"):
+            simulate(tmp_path, 6, report=False)
+        assert train.read_text() == edited and len(list(tmp_path.rglob("*.bin"))) == 5
+
+
+def test_a_report_of_somebody_else_is_not_replaced(tmp_path: Path) -> None:
+    root = write_set(tmp_path / "set")
+    report = root / "report"
+    report.mkdir()
+    (report / "report.json").write_text('{"rows": "of mine"}')
+    with pytest.raises(OutputError, match="nothing that `asca simulate` wrote"):
+        simulate(root, None)
+    (report / "report.json").unlink()
+    simulate(root, None)
+    simulate(root, None)
+    (report / "cars.png").write_bytes(b"a photograph")
+    with pytest.raises(OutputError, match=r"cars\.png: `asca simulate` did not write it"):
+        simulate(root, None)
+
+
+@pytest.mark.parametrize(
+    "name", ["training/velodyne", "training", "ImageSets", "ImageSets/val.txt", "simulation.json", "report"]
+)
+def test_nothing_is_simulated_through_links(tmp_path: Path, name: str) -> None:
+    out = tmp_path / "out"
+    simulate(out, 2)
+    elsewhere = (out / name).rename(tmp_path / "elsewhere")
+    (out / name).symlink_to(elsewhere)
+    before = written(tmp_path)
+    with pytest.raises(OutputError, match=f"{name}: is a link"):
+        simulate(out, 3)
+    if name != "report":  # the frames are written before the report is asked for
+        assert written(tmp_path) == before
+
+
+def test_sequences_go_on_beside_their_lists(tmp_path: Path) -> None:
+    for sequences in (1, 2, 3):
+        command.simulate(tmp_path, sequences=sequences, length=2, workers=1, config="vlp_16", val_share=0.4)
+    train = tmp_path / "ImageSets" / "train.txt"
+    train.write_text("0000/000000\n0002/000001\n")
+    with pytest.raises(OutputError, match=r"train\.txt: `asca simulate` did not write it"):
+        command.simulate(tmp_path, sequences=4, length=2, workers=1, config="vlp_16")

@@ -47,6 +47,20 @@ def test_all_parts_are_printed_and_written(tiny_bundle: Path, bundle_copy: Path,
     assert len(report["scaling"]) > 1 and report["stream"]["stream_fps"] > 0
 
 
+def test_json_replaces_its_own_report_alone(tiny_bundle: Path, scan: Points, tmp_path: Path) -> None:
+    write_scan(tmp_path / "scan.bin", scan)
+    command = ["bench", tmp_path / "scan.bin", "-b", tiny_bundle, "--rounds", 1, "--json"]
+    for _ in range(2):
+        CliRunner().invoke(app, [*map(str, command), str(tmp_path / "report.json")], catch_exceptions=False)
+    (tmp_path / "evaluation.json").write_text('{"subject": "x", "fps": 1}')
+    (tmp_path / "link.json").symlink_to(tmp_path / "report.json")
+    for name in ("evaluation.json", "scan.bin", "link.json", f"{tiny_bundle}/bundle.json"):
+        before = (tmp_path / name).read_bytes()
+        with pytest.raises(OutputError, match=r"`asca bench` did not write it|is a link"):
+            CliRunner().invoke(app, [*map(str, command), str(tmp_path / name)], catch_exceptions=False)
+        assert (tmp_path / name).read_bytes() == before
+
+
 def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tiny_bundle.parent)
     for others in ([tiny_bundle], [Path(tiny_bundle.name), "asca_sim"]):

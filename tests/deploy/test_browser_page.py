@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -157,6 +158,35 @@ def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_pa
             loaded = re.findall(r'"([^" ]+\.(?:js|mjs|css|wasm))"', text)
             assert {Path(word).name for word in loaded} <= set(files), name
             assert "://" not in text, f"{name} loads something from elsewhere"
+
+
+@pytest.mark.parametrize("name", ["index.html", "main.js", "page.json", "sample.bin", "évil .mjs"])
+def test_a_stranger_s_names_of_graphs_do_not_reach_the_page(made_up_package: Path, tmp_path: Path, name: str) -> None:
+    """Bytes of a graph may well be a script, and a page would run it."""
+    bundle, page = tmp_path / "bundle", tmp_path / "page"
+    shutil.copytree(shipped_bundles()["asca_small_sim_int8"], bundle)
+    described = json.loads((bundle / "bundle.json").read_text())
+    (bundle / "backbone.onnx").rename(bundle / name)
+    described["graphs"]["backbone"]["file"] = name
+    (bundle / "bundle.json").write_text(json.dumps(described))
+    write_page(page, bundle, sample_scan_path(), made_up_package)
+    write_page(tmp_path / "usual", shipped_bundles()["asca_small_sim_int8"], sample_scan_path(), made_up_package)
+    usual = {path.name: path.read_bytes() for path in (tmp_path / "usual").iterdir()}
+    assert {path.name: path.read_bytes() for path in page.iterdir()} == usual
+
+
+def test_what_is_read_is_not_replaced(made_up_package: Path, tmp_path: Path) -> None:
+    """A page is a bundle, too."""
+    page, bundle = tmp_path / "page", shipped_bundles()["asca_small_sim_int8"]
+    write_page(page, bundle, sample_scan_path(), made_up_package)
+    before = {path.name: path.read_bytes() for path in page.iterdir()}
+    for read in ((page, sample_scan_path()), (bundle, page / "sample.bin")):
+        with pytest.raises(OutputError, match=r"would replace .*, which is read"):
+            write_page(page, *read, made_up_package)
+    (page / "page.json").write_text('{"files": ["index.html"]}')
+    with pytest.raises(OutputError, match=r"page\.json: `asca export --browser` did not write it"):
+        write_page(page, bundle, sample_scan_path(), made_up_package)
+    assert {path.name for path in page.iterdir()} == set(before)
 
 
 def test_a_package_that_is_none(made_up_package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

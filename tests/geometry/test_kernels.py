@@ -6,14 +6,12 @@ from importlib import import_module
 from typing import Any
 from unittest.mock import patch
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.geometry import compiling as kernels
 from asca_pillars.geometry import decode, overlap
 from asca_pillars.geometry.decode import rotated_nms
 from asca_pillars.geometry.kernels import load_kernels
@@ -160,19 +158,6 @@ def test_boxes_that_are_not_finite_clash_with_nothing() -> None:
     boxes, scores = np.ones((4, 7), np.float32), np.array([4.0, 3.0, 2.0, 1.0])
     boxes[1, 0], boxes[2, 3] = np.nan, np.nan
     assert rotated_nms(boxes, scores, 0.5).tolist() == [0, 1, 2] == by_numpy(rotated_nms, boxes, scores, 0.5).tolist()
-
-
-def test_compiled_without_a_cache_where_none_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = numba.njit
-
-    def njit(*arguments: Any, cache: bool = False, **options: Any) -> Any:
-        if cache:
-            raise RuntimeError("cannot cache function: no locator available")
-        return real(*arguments, **options)
-
-    monkeypatch.setattr(numba, "njit", njit)
-    double = kernels.compiled(numba.types.int64)(lambda number: 2 * number)
-    assert double(21) == 42
 
 
 @pytest.mark.parametrize("place", WITH_KERNELS)

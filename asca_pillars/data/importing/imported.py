@@ -17,10 +17,12 @@ from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.kitti import write_image_set
 from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.errors import ConfigError, DatasetError, OutputError
-from asca_pillars.files import atomic_path, require_own
+from asca_pillars.files import atomic_path, write_text
+from asca_pillars.own_files import json_lines, require_own, require_own_file, starting_with
 from asca_pillars.schema import to_dict
 
 COMMAND = "asca import"
+LABELS_FILE = "labels.jsonl"
 MARKER = "# Written by `asca import`, which may replace lists and labels beside it; without this line it does not.\n"
 """First line of the dataset.yaml of an import: others are written by hand, and so may be the labels beside them."""
 
@@ -73,19 +75,26 @@ def renamed(imported: Imported, names: Mapping[str, str]) -> Imported:
     return imported._replace(frames=frames)
 
 
-def require_own_dataset(out: Path) -> None:
+def require_own_dataset(out: Path, source: Path | None = None) -> None:
     """Make sure that an import may write into `out`: it is absent, empty, or holds an earlier import.
+
+    Args:
+        out: folder of the dataset.
+        source: what is imported; it may not be what an earlier import wrote there.
 
     Raises:
         OutputError: it holds something else, such as a dataset that was written by hand.
     """
     path = out / DATASET_FILE
-    if path.is_file() and MARKER.strip() not in path.read_text(encoding="utf-8", errors="replace"):
+    is_own = starting_with(MARKER)
+    if path.is_file() and not is_own(path):
         raise OutputError(
             f"{path}: `{COMMAND}` did not write it, and would replace it and the labels beside it; "
             f"give another OUT, such as {out.parent / out.resolve().name}_imported"
         )
-    require_own(out, COMMAND, DATASET_FILE)
+    scans = [folder.relative_to(out) for folder in (out / "scans").glob("*/")]
+    require_own(out, COMMAND, {DATASET_FILE: is_own}, folders=("ImageSets", "scans", *scans))
+    require_own_file(out / LABELS_FILE, COMMAND, json_lines("scan", "boxes"), (source,))
 
 
 def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCounts:
@@ -102,7 +111,7 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
     if not frames:
         raise DatasetError(f"{scans}: no labelled scan there; give the folder that holds the recordings")
     require_own_dataset(out)
-    with atomic_path(out / "labels.jsonl") as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_path(out / LABELS_FILE) as temporary, temporary.open("w", encoding="utf-8") as file:
         for frame in frames:
             file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records, frame.time_s))
     train, val = _lists(frames, val_share)
@@ -110,8 +119,7 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
         write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
     usual = to_dict(BoxDataset())
     content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
-    with atomic_path(out / DATASET_FILE) as temporary:
-        temporary.write_text(MARKER + yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    write_text(out / DATASET_FILE, MARKER + yaml.safe_dump(content, sort_keys=False))
     boxes = Counter(kind for frame in frames for kind in frame.records.types)
     return ImportCounts(len(train), len(val), dict(boxes.most_common()))
 

@@ -23,7 +23,7 @@ from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
 from asca_pillars.data.scans.find_scans import visible_files
 from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path
+from asca_pillars.files import atomic_path, write_text
 
 TOP = 1
 """The roof's sensor."""
@@ -57,9 +57,9 @@ def read_waymo(root: Path, out: Path) -> Imported:
     if not segments:
         raise DatasetError(f"{root}: no lidar/*.parquet there; give a folder of Waymo's parquet form")
     require_own_dataset(out)
-    with atomic_path(out / DATASET_FILE) as temporary:
+    if not (out / DATASET_FILE).exists():
         # It marks the folder from the start, so that an import that was killed can be given again.
-        temporary.write_text(MARKER, encoding="utf-8")
+        write_text(out / DATASET_FILE, MARKER)
     bar = track(segments, "Reading segments", transient=True)
     frames = [frame for path in bar for frame in _frames(root, path, out.resolve() / "scans")]
     top = _calibrations(root / "lidar_calibration" / segments[0].name).get(TOP)

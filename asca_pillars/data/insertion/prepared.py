@@ -1,13 +1,15 @@
 """The folder of what is computed once per dataset: the object database and the maps of free ground."""
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from asca_pillars.config import DataConfig
 from asca_pillars.data.scans.find_scans import PREPARED_FILE, PREPARED_NOTE
 from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path, require_own
+from asca_pillars.files import atomic_path
+from asca_pillars.own_files import require_own, starting_with
 
 
 def prepared_folder(root: str | Path, data: DataConfig) -> Path:
@@ -24,7 +26,8 @@ def require_writable(folder: Path) -> None:
     """
     # Proposals of earlier versions lie in a folder that has no note of its own.
     notes = (PREPARED_FILE, *(path.relative_to(folder).as_posix() for path in folder.glob(f"*/*/{PREPARED_FILE}")))
-    require_own(folder, "asca prepare", *notes, text=PREPARED_NOTE)
+    below = [Path(at, name).relative_to(folder) for at, names, _ in os.walk(folder) for name in names]
+    require_own(folder, "asca prepare", dict.fromkeys(notes, starting_with(PREPARED_NOTE)), folders=below)
     with writing(folder / PREPARED_FILE) as temporary:
         temporary.write_text(PREPARED_NOTE, encoding="utf-8")
 

@@ -11,6 +11,7 @@ from asca_pillars.data.kitti.calibration import (
 from asca_pillars.data.kitti.kitti_labels import (
     KittiObject,
     boxes_from_objects,
+    is_detection_text,
     labels_text,
     objects_3d,
     objects_from_boxes,
@@ -28,6 +29,7 @@ __all__ = [
     "boxes_from_objects",
     "image_boxes",
     "in_image",
+    "is_detection_text",
     "labels_text",
     "objects_3d",
     "objects_from_boxes",

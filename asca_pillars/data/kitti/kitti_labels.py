@@ -181,6 +181,15 @@ def parse_object(words: Sequence[str], place: str) -> KittiObject:
     )
 
 
+def is_detection_text(text: str) -> bool:
+    """Whether it is of detections as `labels_text` writes them, with scores; labels have none."""
+    try:
+        objects = [parse_object(line.split(), "") for line in text.splitlines()]
+    except DatasetError:
+        return False
+    return all(item.score is not None for item in objects) and labels_text(objects) == text
+
+
 def _number(word: str, place: str) -> float:
     try:
         value = float(word)

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.compiling import cached
 from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
 from asca_pillars.sim.casting.windows import PLAIN, TURN, Window, columns_of, keep, ray_chance, rings_of, window_of
 
@@ -34,7 +34,7 @@ class Leaves(NamedTuple):
     columns: int
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def extent_of(m: Floats, ux: float, uy: float) -> Extent:
     """The extent of |m p| = 1 seen along (ux, uy), from the rows of the inverse of m (3,3)."""
     a0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
@@ -52,7 +52,7 @@ def extent_of(m: Floats, ux: float, uy: float) -> Extent:
     return Extent(np.sqrt(c0 * c0 + c1 * c1 + c2 * c2) / size, flat, across)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def ellipsoid_window(center: Floats, m: Floats, distance: float, limits: RayLimits) -> Window:
     """The window of an ellipsoid |m p| = 1, m (3,3), around a center (3,) that is `distance` metres away.
 
@@ -77,7 +77,7 @@ def ellipsoid_window(center: Floats, m: Floats, distance: float, limits: RayLimi
     return window_of(first, last, np.arctan2(cy, cx) - half_angle, 2 * half_angle, limits)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def leaves_of(density_per_m: float, distance: float, slope: Floats, columns_per_turn: int) -> Leaves:
     """Leaves grow in tufts, so that crowns have depth and not only noise.
 
@@ -89,7 +89,7 @@ def leaves_of(density_per_m: float, distance: float, slope: Floats, columns_per_
     return Leaves(density_per_m, max(rings, 1), max(columns, 1))
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def leaf_chance(leaves: Leaves, k: int, j: int, salt: int, key: int) -> float:
     """What decides how far a ray gets into a cloud: its own chance, or that of its tuft."""
     chance = ray_chance(key, k, j, salt)
@@ -98,7 +98,7 @@ def leaf_chance(leaves: Leaves, k: int, j: int, salt: int, key: int) -> float:
     return ray_chance(key, k // leaves.rings, j // leaves.columns, salt + _TUFT_SALT)
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def solid_cosine(m: Floats, x: float, y: float, z: float, dx: float, dy: float, dz: float, stretch: float) -> float:
     """Cosine of the incidence of a ray (dx, dy, dz) at a place (x, y, z) of the unit frame, of |m p| = 1, m (3,3)."""
     nx = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
@@ -108,7 +108,7 @@ def solid_cosine(m: Floats, x: float, y: float, z: float, dx: float, dy: float, 
     return min(facing / (np.sqrt(nx * nx + ny * ny + nz * nz) * stretch), 1.0)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def cast_ellipsoids(
     centers: Floats,
     unit_from_world: Floats,

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.compiling import cached
 from asca_pillars.sim.casting.windows import PLAIN
 
 Floats = npt.NDArray[np.float64]
@@ -58,7 +58,7 @@ class Street(NamedTuple):
     rise_m: float  # how far all that may stand above the hills
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def heights(points: Floats, street: Street, relief: Floats, z_m: float) -> Floats:
     """`ground_height` of many points (N,2)."""
     result = np.empty(len(points))
@@ -67,7 +67,7 @@ def heights(points: Floats, street: Street, relief: Floats, z_m: float) -> Float
     return result
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def road_distances(x: float, y: float, street: Street) -> tuple[float, float, float, float, float]:
     """Road coordinates u, v, then how far outside the main road, the crossing road and both (negative inside), metres.
 
@@ -85,7 +85,7 @@ def road_distances(x: float, y: float, street: Street) -> tuple[float, float, fl
     return u, v, main, cross, min(main, cross)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def outside_roads(points: Floats, street: Street) -> Floats:
     """How far each of (N,2) points lies outside all roads (negative inside), metres."""
     result = np.empty(len(points))
@@ -94,7 +94,7 @@ def outside_roads(points: Floats, street: Street) -> Floats:
     return result
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def on_rail(from_middle: float, tracks: float) -> bool:
     """Whether a place that far from the middle of one track or of two lies on a rail."""
     if tracks > 1.0:
@@ -102,7 +102,7 @@ def on_rail(from_middle: float, tracks: float) -> bool:
     return abs(from_middle - GAUGE_HALF_M) < RAIL_HALF_M
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float) -> float:
     """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them.
 
@@ -138,7 +138,7 @@ def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float
     return z_m + height
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def ground_material(x: float, y: float, street: Street) -> int:
     """Material of the ground at (x, y)."""
     u, v, main, cross, outside = road_distances(x, y, street)
@@ -163,7 +163,7 @@ def ground_material(x: float, y: float, street: Street) -> int:
     return ASPHALT
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def highest_within(relief: Floats, along_m: float) -> Floats:
     """Highest (R - 1,) of relief (R, R), metres, within each multiple of RELIEF_STEP_M of the car.
 

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.compiling import cached
 from asca_pillars.sim.casting.groundcast import (
     GROUND,
     RAIL,
@@ -53,13 +53,13 @@ class GroundRay(NamedTuple):
     dy: float
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def gap_at(ray: GroundRay, reach: float, street: Street, relief: Floats, z_m: float) -> float:
     """Height in metres of a ray above the ground, relief (R, R), at a horizontal distance."""
     return ray.up + ray.slope * reach - ground_height(reach * ray.dx, reach * ray.dy, street, relief, z_m)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: float) -> float:
     """How many metres a ray of this height and slope stays above everything, in whatever direction.
 
@@ -76,7 +76,7 @@ def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: f
     return start
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def descend(
     ray: GroundRay,
     start: float,
@@ -117,7 +117,7 @@ def descend(
     return Descent(near, above, reach, gap, clear)
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: float) -> tuple[float, float]:
     """Distance at which a ray meets the ground, relief (R, R), between above it and below, and the gap left, metres.
 
@@ -139,7 +139,7 @@ def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: f
     return reach, left
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relief: Floats, z_m: float) -> float:
     """Cosine of the angle at which a ray meets the ground, relief (R, R), of this height in metres there."""
     x, y, step = reach * ray.dx, reach * ray.dy, 0.05
@@ -150,7 +150,7 @@ def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relie
     return facing / (np.sqrt(1.0 + gx * gx + gy * gy) * np.sqrt(1.0 + ray.slope**2))
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def are_needed(outside: Bools, owner: npt.NDArray[np.int32], k: int, first: int, last: int) -> bool:
     """Whether it matters what ground columns [first, last) of ring k meet.
 
@@ -168,7 +168,7 @@ def are_needed(outside: Bools, owner: npt.NDArray[np.int32], k: int, first: int,
     return False
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def cast_ground(
     street: Street, relief: Floats, materials: Floats, z_m: float, rays: Rays, nearest: NearestHits, key: int
 ) -> None:

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.compiling import cached
 from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
 from asca_pillars.sim.casting.windows import PLAIN, TURN, Window, columns_of, keep, ray_chance, rings_of, window_of
 
@@ -32,13 +32,13 @@ class Plane(NamedTuple):
     away: float
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def edge_of(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> Edge:
     """The edge from a to b; exactly the opposite of that from b to a, so that neighbors leave no gap."""
     return Edge(ay * bz - az * by, az * bx - ax * bz, by - ay, ax - bx, ax * by - ay * bx)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def nearest_on_edge(ax: float, ay: float, bx: float, by: float) -> float:
     """Square of the horizontal distance from the sensor's axis to the segment a b."""
     dx, dy = bx - ax, by - ay
@@ -50,13 +50,13 @@ def nearest_on_edge(ax: float, ay: float, bx: float, by: float) -> float:
     return x * x + y * y
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def wrap(angle: float) -> float:
     """The same angle in [-pi, pi), radians."""
     return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def triangle_window(corner: Floats, limits: RayLimits) -> Window:
     """The window of a triangle (3,3), metres; empty for one beside the wedge of columns that are cast."""
     ax, ay, bx, by, cx, cy = corner[0, 0], corner[0, 1], corner[1, 0], corner[1, 1], corner[2, 0], corner[2, 1]
@@ -84,7 +84,7 @@ def triangle_window(corner: Floats, limits: RayLimits) -> Window:
     return window_of(first, last, azimuth + to_first, to_last - to_first, limits)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def plane_of(corner: Floats) -> Plane:
     """The plane of a triangle (3,3), metres, its normal of length 1; all 0 for a triangle without an area."""
     ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
@@ -97,20 +97,20 @@ def plane_of(corner: Floats) -> Plane:
     return Plane(x, y, z, x * corner[0, 0] + y * corner[0, 1] + z * corner[0, 2])
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def turned(edge: Edge, up: float, cos: float, sin: float, slope: float) -> tuple[float, float, float]:
     """An edge's normal for a ring: of x and y of its columns, without the phase, and of 1."""
     x, y = edge.x + up * edge.x_up, edge.y + up * edge.y_up
     return x * cos + y * sin, y * cos - x * sin, edge.up * slope
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def passes(f: float, g: float, h: float) -> bool:
     """Whether a ray lies on one side of the three planes through the edges, whichever way around they go."""
     return (f >= 0 and g >= 0 and h >= 0) or (f <= 0 and g <= 0 and h <= 0)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def cast_triangles(
     triangles: Floats, surface: Floats, owners: Ints, salts: Ints, rays: Rays, nearest: NearestHits, key: int
 ) -> None:

@@ -6,15 +6,15 @@ __pycache__ folder, or the casters of triangles and ellipsoids go on with what t
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.compiling import cached
 from asca_pillars.sim.casting.rays import NearestHits, RayLimits
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-PLAIN = {"cache": True, "error_model": "numpy"}  # NumPy's division, which does not look out for zeros
+PLAIN = {"error_model": "numpy"}  # NumPy's division, which does not look out for zeros
 TURN = 2 * np.pi - 1e-9
 
 
@@ -30,7 +30,7 @@ class Window(NamedTuple):
     width_counts: float
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def ray_bits(key: int, ring: int, column: int, salt: int) -> np.uint64:
     """64 random bits from a key, a ray and a salt (the finalizer of splitmix64)."""
     number = (np.uint64(salt) << np.uint64(24)) ^ np.uint64(ring * 4096 + column)
@@ -40,13 +40,13 @@ def ray_bits(key: int, ring: int, column: int, salt: int) -> np.uint64:
     return z ^ (z >> np.uint64(31))
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def ray_chance(key: int, ring: int, column: int, salt: int) -> float:
     """A uniform number in (0, 1) of a ray and a salt."""
     return (float(ray_bits(key, ring, column, salt) >> np.uint64(11)) + 0.5) * (1.0 / 9007199254740992.0)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def ring_below(slope: Floats, limit: float) -> int:
     """The index of the first ring whose slope is not above `limit`; slopes (K,) fall."""
     first, last = 0, len(slope)
@@ -59,7 +59,7 @@ def ring_below(slope: Floats, limit: float) -> int:
     return first
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def rings_of(z_low: float, z_high: float, near: float, far: float, limits: RayLimits) -> tuple[int, int]:
     """The rings [first, last) that can meet what lies between two heights and two horizontal distances."""
     above = z_high - limits.lowest_origin_m
@@ -71,7 +71,7 @@ def rings_of(z_low: float, z_high: float, near: float, far: float, limits: RayLi
     return first, max(ring_below(limits.slope, np.nextafter(shallowest, -np.inf)), first)
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def window_of(first_ring: int, last_ring: int, low: float, width: float, limits: RayLimits) -> Window:
     """The window of these rings and of azimuths [low, low + width]."""
     counts = limits.counts
@@ -81,7 +81,7 @@ def window_of(first_ring: int, last_ring: int, low: float, width: float, limits:
     return Window(first_ring, last_ring, low_counts, width * per_rad)
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def columns_of(window: Window, phase_counts: float, first_column: Ints, columns: int) -> tuple[int, int]:
     """Indices [first, last) of a ring's columns that lie in a window; `last` may exceed the number of columns.
 
@@ -99,7 +99,7 @@ def columns_of(window: Window, phase_counts: float, first_column: Ints, columns:
     return first, first_column[min(end - counts, counts)] + columns
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def keep(
     nearest: NearestHits, k: int, j: int, reach: float, who: int, incidence: float, normal: float, gloss: float
 ) -> None:

@@ -9,11 +9,12 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.files import atomic_path, write_json
+from asca_pillars.files import write_json, write_text
 from asca_pillars.sim.report.like_for_like import LikeForLike
 from asca_pillars.sim.report.look_alikes import ALL, MEASURES, NEIGHBORS, LikeRow
 from asca_pillars.sim.report.plots import new_figure, save_figure
 from asca_pillars.sim.report.reference import CLASSES
+from asca_pillars.sim.report.tables import PAGE_END
 from asca_pillars.sim.report.unlabelled_clusters import FIRING_SCORE, KINDS, FiringRow
 
 if TYPE_CHECKING:
@@ -67,8 +68,7 @@ def write_like(folder: Path, result: LikeForLike) -> None:
     parts = [f"# {title(result)}\n", "\n".join([*(f"- {line}" for line in notes(result)), ""])]
     parts += [markdown_table(columns, rows, left) for columns, rows, left in _tables(result)]
     parts.append(f"![percentiles]({PICTURE})\n")
-    with atomic_path(folder / "like_for_like.md") as temporary:
-        temporary.write_text("\n".join(parts), encoding="utf-8")
+    write_text(folder / "like_for_like.md", "\n".join(parts) + PAGE_END)
 
 
 def _tables(result: LikeForLike) -> list[tuple[tuple[str, ...], list[tuple[str, ...]], int]]:

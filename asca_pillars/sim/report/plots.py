@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from asca_pillars.files import atomic_path
+from asca_pillars.own_files import PICTURE_SOFTWARE
 from asca_pillars.sim.report.comparison import BARRED_RANGES_M, RATIO_BAR, Comparison
 from asca_pillars.sim.report.distance import coarse
 from asca_pillars.sim.report.measured import Measured
@@ -59,7 +60,7 @@ def save_figure(path: Path, figure: "Figure") -> str:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     with atomic_path(path) as temporary:
-        FigureCanvasAgg(figure).print_png(temporary)
+        FigureCanvasAgg(figure).print_png(temporary, metadata={"Software": PICTURE_SOFTWARE})
     return path.name
 
 

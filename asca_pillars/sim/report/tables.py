@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.files import atomic_path, write_json
+from asca_pillars.files import write_json, write_text
+from asca_pillars.own_files import page_end
 from asca_pillars.schema import to_dict
 from asca_pillars.sim.report.comparison import Comparison, Row
 from asca_pillars.sim.report.reference import CAR_FIT_RANGE_M, NEAR_CARS_M
@@ -19,6 +20,7 @@ from asca_pillars.sim.report.scan_statistics import OBJECTS
 
 _COLUMNS = ("", "KITTI", "this set", "ratio\nor JS", "bar", "kept", "by\nchance")
 _LEFT = 1
+PAGE_END = page_end("asca simulate")
 _MEASURES = {"ratio": "x {:.2f}", "difference": "{:+.2f}", "distance": "JS {:.3f}"}
 
 
@@ -70,8 +72,7 @@ def notes(comparison: Comparison) -> list[str]:
 
 def write_report(folder: Path, comparison: Comparison, plots: Sequence[str]) -> None:
     """Write report.md, which shows the named `plots` in the same folder, and report.json."""
-    with atomic_path(folder / "report.md") as temporary:
-        temporary.write_text(to_markdown(comparison, plots), encoding="utf-8")
+    write_text(folder / "report.md", to_markdown(comparison, plots) + PAGE_END)
     write_json(folder / "report.json", to_json(comparison))
 
 

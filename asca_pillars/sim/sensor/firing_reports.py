@@ -3,10 +3,10 @@
 from statistics import NormalDist
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.compiling import cached
 from asca_pillars.sim.casting.windows import PLAIN, ray_bits
 
 Floats = npt.NDArray[np.float64]
@@ -83,7 +83,7 @@ class Echo(NamedTuple):
     column: int
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def echo_of(
     k: int,
     j: int,
@@ -130,7 +130,7 @@ def echo_of(
     return Echo(slant, own.cosine, own.reflectance, met, k, j)
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def fade_of(slant: float, near_fade: float, receiver: Receiver) -> float:
     """Reported over true reflectance: strongest where the lens is focused."""
     if receiver.fade_m <= 0.0:
@@ -140,7 +140,7 @@ def fade_of(slant: float, near_fade: float, receiver: Receiver) -> float:
     return 1.0 - near_fade * (1.0 - slant / receiver.focus_m) ** 1.5
 
 
-@numba.njit(**PLAIN)
+@cached(**PLAIN)
 def report_firings(
     met: Met, lasers: Lasers, receiver: Receiver, key: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
@@ -185,13 +185,13 @@ def report_firings(
     return points[:kept], owner[:kept], ring[:kept]
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def _level(bits: np.uint64, part: int) -> int:
     """One of _LEVELS, from the quarter `part` of 64 random bits."""
     return int((bits >> np.uint64(16 * part)) & np.uint64(_LEVELS - 1))
 
 
-@numba.njit(inline="always", **PLAIN)
+@cached(inline="always", **PLAIN)
 def _uniform(bits: np.uint64, part: int) -> float:
     """A number in [0, 1), from the quarter `part` of 64 random bits: 16 are fine enough."""
     return float((bits >> np.uint64(16 * part)) & np.uint64(65535)) / 65536.0

@@ -24,7 +24,7 @@ from asca_pillars.data.kitti import in_image, write_image_set
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.files import atomic_path, write_json
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
-from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each, held_out
+from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each, held_out, require_own_simulation
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
 from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
@@ -138,6 +138,13 @@ def simulate_sequences(
     with atomic_path(root / DATASET_FILE) as temporary:
         temporary.write_text(yaml.safe_dump({"labels": "labels", "columns": 4, "reflectance_scale": 1.0}))
     return root
+
+
+def require_own_sequences(out: Path) -> None:
+    """Make sure that `simulate_sequences` may write into `out`; OutputError names what is not ours to replace."""
+    folders = [folder.relative_to(out) for name in ("scans", "labels") for folder in (out / name).glob("*/")]
+    about_keys = ("seed", "length", "rate_hz", "scene", "lidar", "field_of_view")
+    require_own_simulation(out, about_keys, ("scans", "labels", *folders))
 
 
 @lru_cache(maxsize=1)

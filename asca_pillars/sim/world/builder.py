@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.compiling import cached
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, prisms
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
@@ -178,7 +178,7 @@ class Builder:
         return rows
 
 
-@numba.njit(cache=True)
+@cached()
 def _intrudes(blobs: Floats, footprints: Floats) -> npt.NDArray[np.bool_]:
     """Which clouds would hang into the car (its sensor would see nothing else) or an object."""
     result = np.zeros(len(blobs), np.bool_)

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from asca_pillars.geometry.compiling import cached
 
 Floats = npt.NDArray[np.float64]
 
@@ -43,7 +44,7 @@ class Occupied:
         self.count += 1
 
 
-@numba.njit(cache=True)
+@cached()
 def _is_free(row: tuple[float, float, float, float, float, float], rows: Floats, count: int) -> bool:
     """Whether a footprint overlaps none of the first `count` (separating axes of two rectangles)."""
     own = (row[2], row[3], row[4])

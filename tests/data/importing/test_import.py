@@ -47,6 +47,25 @@ def test_boxes_of_ones_own(tmp_path: Path) -> None:
     invoke("import", tmp_path / "boxes.csv", tmp_path / "out", "--scans", own / "scans")  # replaces its own
 
 
+def test_an_import_is_not_imported_over_itself(tmp_path: Path) -> None:
+    own = write_box_dataset(tmp_path / "own", 4)
+    invoke("import", own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
+    labels = tmp_path / "out" / "labels.jsonl"
+    (tmp_path / "link.jsonl").symlink_to(labels)
+    before = labels.read_bytes()
+    for source in (labels, tmp_path / "link.jsonl"):
+        with pytest.raises(OutputError, match=r"labels\.jsonl: would replace .*, which is read"):
+            invoke("import", source, tmp_path / "out", "--scans", own / "scans", "--rename", "Car=Van")
+    assert labels.read_bytes() == before
+    labels.write_text("my notes on labels\n")
+    with pytest.raises(OutputError, match=r"labels\.jsonl: `asca import` did not write it"):
+        invoke("import", own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
+    labels.unlink()
+    labels.symlink_to(own / "labels.jsonl")
+    with pytest.raises(OutputError, match="is a link"):
+        invoke("import", tmp_path / "own" / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
+
+
 @pytest.mark.parametrize("settings", ["", "axes: y-forward\n"])
 def test_a_dataset_that_was_written_by_hand_stays(tmp_path: Path, settings: str) -> None:
     """docs/DATA.md tells to write the very files that an import writes, which may be weeks of labels."""

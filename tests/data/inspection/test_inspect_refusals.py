@@ -97,3 +97,17 @@ def test_a_json_that_cannot_be_written_is_told_before_the_work(
     )
     with pytest.raises(OutputError, match="is a folder; choose a file's name"):
         inspect(data, config=Path("asca_sim"), json=tmp_path)
+
+
+def test_json_replaces_its_own_report_alone(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
+    for _ in range(2):
+        inspect(data, config=tmp_path / "config.yaml", json=tmp_path / "report.json", frames=2)
+    (tmp_path / "other.json").write_text(json.dumps({"config": "mine", "findings": []}))
+    (tmp_path / "link.json").symlink_to(tmp_path / "report.json")
+    label = KittiSplit(data).label_path("000000")
+    for path in (tmp_path / "other.json", tmp_path / "config.yaml", label, tmp_path / "link.json"):
+        before = path.read_bytes()
+        with pytest.raises(OutputError, match=f"{path.name}: (`asca inspect --json` did not write it|is a link)"):
+            inspect(data, config=tmp_path / "config.yaml", json=path)
+        assert path.read_bytes() == before
