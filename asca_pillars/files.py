@@ -21,6 +21,7 @@ from asca_pillars.errors import OutputError
 from asca_pillars.locks import CAN_LOCK, locked
 
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.asca-[0-9a-f]{8}(?P<retired>-old)?(?:\.[^.]*)?")
+_LONGEST_NAME_BYTES = 255  # of a file, on nearly every file system
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _cleared: set[Path] = set()  # folders whose leftovers this process has looked for
 _shares_folders = False
@@ -40,7 +41,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     target = _prepare(path)
     if target.exists() and not target.is_file():
         raise OutputError(f"{path}: is {'a folder' if target.is_dir() else 'no regular file'}; choose a file's name")
-    with _naming(path), _temporary(target, f".{target.stem}.asca-", target.suffix, folder=False) as temporary:
+    stem = os.fsencode(target.stem)[: _LONGEST_NAME_BYTES - len(".12345678.asca-") - len(os.fsencode(target.suffix))]
+    prefix = f".{stem.decode(errors='ignore')}.asca-"
+    with _naming(path), _temporary(target, prefix, target.suffix, folder=False) as temporary:
         yield temporary
         _sync(temporary)
         temporary.replace(target)
@@ -192,9 +195,18 @@ def is_hidden(relative: Path) -> bool:
 def _prepare(path: str | Path) -> Path:
     """The place that `path` leads to, in a folder that exists and holds nothing of killed writers."""
     target = Path(os.path.realpath(path))
-    target.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(target.parent)
     recover(target.parent)
     return target
+
+
+def _make_folder(folder: Path) -> None:
+    """As `folder.mkdir(parents=True, exist_ok=True)`, which fails at a thousand folders: it calls itself for each."""
+    missing = [folder]
+    while not missing[-1].exists():
+        missing.append(missing[-1].parent)
+    for one in reversed(missing):
+        one.mkdir(exist_ok=True)
 
 
 def _entries(folder: Path) -> list[Path]:
