@@ -14,8 +14,10 @@ from asca_deploy import Detections
 from asca_pillars.data.kitti import Calibration, read_calibration
 from asca_pillars.data.labels_beside import labels_beside
 from asca_pillars.data.scans.scan_reader import Scan
-from asca_pillars.errors import AscaError
+from asca_pillars.errors import AscaError, DatasetError
 from asca_pillars.files import atomic_path, require_own, write_json
+from asca_pillars.input_files import require_content
+from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 
 RUN_FILE = "detections.jsonl"
@@ -61,10 +63,7 @@ class ResultWriter:
             write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=self._labels(path)))
         if calibration is None:
             return
-        image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
-        image = read_image(image_path)
-        if image is None and image_path.exists():
-            self.remarks.append(f"{image_path}: cannot be read as an image; the boxes are not drawn on it")
+        image = self._image(path.parent.parent / "image_2" / f"{path.stem}.png")
         _write_kitti(self._named(name, ".txt"), detections, calibration, image)
         if image is not None and self._pictures:
             drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
@@ -79,6 +78,17 @@ class ResultWriter:
         except AscaError as error:
             self.remarks.append(f"no KITTI text is written: {error}")
             return None
+
+    def _image(self, path: Path) -> Image | None:
+        try:
+            require_content(path, DatasetError)
+        except (AscaError, OSError) as error:
+            self.remarks.append(f"the boxes are not drawn on the image: {error}")
+            return None
+        image = read_image(path)
+        if image is None and path.exists():
+            self.remarks.append(f"{path}: cannot be read as an image; the boxes are not drawn on it")
+        return image
 
     def _labels(self, path: Path) -> NDArray[np.float32] | None:
         try:

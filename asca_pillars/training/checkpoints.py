@@ -14,6 +14,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
+from asca_pillars.input_files import require_content
 from asca_pillars.models.checkpoint import unread
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
@@ -100,6 +101,7 @@ def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
     for path in (folder / LAST, folder / PREVIOUS):
         if not path.exists():
             continue
+        require_content(path, TrainingError)
         try:
             torch.load(path, map_location="cpu", weights_only=True, mmap=False)
         except _UNREADABLE as e:
