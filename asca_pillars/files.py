@@ -18,7 +18,7 @@ from asca_pillars.errors import OutputError
 from asca_pillars.locks import CAN_LOCK, RETIRED, is_temporary, locked
 from asca_pillars.own_files import Recognizer, require_no_link, require_replaceable
 
-_LONGEST_STEM_BYTES = 200  # a name has at most 255, and a temporary one is longer than its target's
+_LONGEST_NAME_BYTES = 255  # of a file, on nearly every file system
 
 
 @contextlib.contextmanager
@@ -34,7 +34,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     target = _prepare(path)
     if target.exists() and not target.is_file():
         raise OutputError(f"{path}: is {'a folder' if target.is_dir() else 'no regular file'}; choose a file's name")
-    stem = os.fsencode(target.stem)[:_LONGEST_STEM_BYTES].decode(errors="ignore")
+    longest = _LONGEST_NAME_BYTES - len(".12345678.asca-") - len(os.fsencode(target.suffix))
+    stem = os.fsencode(target.stem)[:longest].decode(errors="ignore")
     with _naming(path), _temporary(target, stem, target.suffix, folder=False) as temporary:
         yield temporary
         _sync(temporary)
@@ -108,8 +109,17 @@ def _prepare(path: str | Path) -> Path:
     """The place that `path` leads to, itself no link, in a folder that exists."""
     require_no_link(path)
     target = Path(os.path.realpath(path))
-    target.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(target.parent)
     return target
+
+
+def _make_folder(folder: Path) -> None:
+    """As `folder.mkdir(parents=True, exist_ok=True)`, which fails at a thousand folders: it calls itself for each."""
+    missing = [folder]
+    while not missing[-1].exists():
+        missing.append(missing[-1].parent)
+    for one in reversed(missing):
+        one.mkdir(exist_ok=True)
 
 
 @contextlib.contextmanager

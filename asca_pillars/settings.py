@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import yaml
 
 from asca_pillars.errors import ConfigError
+from asca_pillars.input_files import read_text
 from asca_pillars.schema import parse
 from asca_pillars.yaml_text import MAX_CHARACTERS, parse_yaml
 
@@ -40,7 +41,7 @@ def read_settings(type_: type[T], path: str | Path, overrides: Sequence[str], sh
     try:
         if path.stat().st_size > 4 * MAX_CHARACTERS:  # a character has up to four bytes
             raise ConfigError(f"{path}: {path.stat().st_size} bytes are too many for settings; give another file")
-        data = parse_yaml(path.read_text(encoding="utf-8"))
+        data = parse_yaml(read_text(path, ConfigError))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); these ship: {', '.join(shipped)}") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date like 2026-99-99

@@ -16,8 +16,9 @@ from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import Calibration, is_detection_text, read_calibration
 from asca_pillars.data.labels_beside import labels_beside
 from asca_pillars.data.scans.scan_reader import Scan
-from asca_pillars.errors import AscaError
+from asca_pillars.errors import AscaError, DatasetError
 from asca_pillars.files import atomic_path, write_json, write_text
+from asca_pillars.input_files import require_content
 from asca_pillars.locks import recover
 from asca_pillars.own_files import (
     Recognizer,
@@ -28,6 +29,7 @@ from asca_pillars.own_files import (
     require_own,
     require_own_file,
 )
+from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 
 COMMAND = "asca detect"
@@ -159,10 +161,7 @@ class ResultWriter:
 
     def _write_camera_view(self, path: Path, name: Path, detections: Detections, calibration: Calibration) -> set[str]:
         """What the camera sees as text, and drawn on its image; the endings of what was written."""
-        image_path = path.parent.parent / "image_2" / f"{path.stem}.png"
-        image = read_image(image_path)
-        if image is None and image_path.exists():
-            self.remarks.append(f"{image_path}: cannot be read as an image; the boxes are not drawn on it")
+        image = self._image(path.parent.parent / "image_2" / f"{path.stem}.png")
         _write_kitti(self._named(name, ".txt"), detections, calibration, image)
         if image is not None and self._pictures:
             drawn = draw_on_image(image, detections.boxes, detections.names, detections.scores, calibration)
@@ -179,6 +178,17 @@ class ResultWriter:
         except AscaError as error:
             self.remarks.append(f"no KITTI text is written: {error}")
             return None
+
+    def _image(self, path: Path) -> Image | None:
+        try:
+            require_content(path, DatasetError)
+        except (AscaError, OSError) as error:
+            self.remarks.append(f"the boxes are not drawn on the image: {error}")
+            return None
+        image = read_image(path)
+        if image is None and path.exists():
+            self.remarks.append(f"{path}: cannot be read as an image; the boxes are not drawn on it")
+        return image
 
     def _labels(self, path: Path) -> NDArray[np.float32] | None:
         try:

@@ -91,7 +91,7 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     if task.odometry is not None and not task.track:
         raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
     poses = None if task.odometry is None else read_poses(recording, task.odometry)
-    damages = {recording.damage}
+    damages = set() if poses is None else {recording.damage}
     scans = RecordedScans(recording, topic, reading.reflectance_scale)
     said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
     mounting, estimate = reading.mounting(scan.points for scan in scans.first(SAMPLE_SCANS))

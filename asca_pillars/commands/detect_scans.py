@@ -1,5 +1,6 @@
 """Scan files one after the other: results, tables of boxes and times, and what a user is to know of them."""
 
+import errno
 import sys
 from collections.abc import Sequence
 
@@ -36,7 +37,7 @@ def detect_scans(
         ScanError: a scan cannot be read; the others are done first.
     """
     results: list[show.Result] = []
-    unreadable = 0
+    unreadable = unwritten = 0
     with writer as write:
         for path, name in track(named, "Detecting", console=console, disable=len(named) == 1):
             try:
@@ -49,7 +50,13 @@ def detect_scans(
                 print(f"asca: {printable(str(error))}", file=sys.stderr)
                 continue
             results.append(show.Result(path, scan.notes, detections.labels, detections.report))
-            write(path, name, scan, detections)
+            try:
+                write(path, name, scan, detections)
+            except OSError as error:
+                if error.errno != errno.ENAMETOOLONG:
+                    raise
+                unwritten += 1
+                print(f"asca: {printable(str(error))}", file=sys.stderr)
     if not results:
         raise ScanError(f"none of the {len(named)} scans can be read")
     console.print(show.boxes(path, detections) if len(named) == 1 else show.scans(results, detector.spec.class_names))
@@ -60,5 +67,7 @@ def detect_scans(
         reports.append(detector(scan.points).report)
     console.print(show.timing(reports[1:], detector))
     console.print(f"Results: {writer.out}/")
+    if unwritten:
+        raise ScanError(f"results of {unwritten} of {len(named)} scans could not be written; they are named above")
     if unreadable:
         raise ScanError(f"{unreadable} of {len(named)} scans could not be read; they are named above")

@@ -15,6 +15,8 @@ from asca_pillars.geometry.frame_report import ScanCounts
 _Floats: TypeAlias = NDArray[np.floating[Any]]
 
 OUTSIDE_SHARE = 0.95
+FAR_M, FAR_SHARE = 1000.0, 0.05
+"""Of the points of a LiDAR's scan less than this share lies further away."""
 SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
 _FRAME_STEP = 2  # of the sample; angles and ranges take longer
 
@@ -49,6 +51,8 @@ def check_input(
         return [InputWarning("points", text)]  # too few to say anything else
     # Column by column in memory, which is how it is read: NumPy is slow along rows of four.
     sample = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLE_POINTS)].T).T
+    if far := _far_warning(sample):
+        return [far]  # what the others would say follows from it
     ground = ground_z_m(sample)
     doubt = doubt_frame(sample[::_FRAME_STEP], ground)
     warnings = [_reflectance_warning(sample[:, 3], expected)]
@@ -64,6 +68,24 @@ def check_input(
         )
         warnings.append(InputWarning("range", text))
     return [warning for warning in warnings if warning]
+
+
+def _far_warning(sample: NDArray[np.float32]) -> InputWarning | None:
+    """Points that no LiDAR sees: their unit is not metres, or they lie in a map's frame."""
+    sideways = sample[:, :2]
+    share = np.count_nonzero((np.abs(sideways) > FAR_M).any(axis=1)) / len(sample)
+    if share <= FAR_SHARE:
+        return None
+    low, middle, high = np.percentile(sideways.astype(np.float64), (5, 50, 95), axis=0)
+    begins = f"{100 * share:.0f} % of the points lie more than {FAR_M / 1000:g} km away"
+    if np.abs(middle).max() > (high - low).max():
+        text = (
+            f"{begins}, around x = {middle[0]:.0f}, y = {middle[1]:.0f}: coordinates have to be those of the sensor's "
+            "frame, not of a map: subtract the sensor's position before they are stored as float32"
+        )
+    else:
+        text = f"{begins}: coordinates have to be in metres: divide millimetres by 1000, centimetres by 100"
+    return InputWarning("range", text)
 
 
 def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:

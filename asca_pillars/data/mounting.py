@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.frame_change import FrameChange, is_rigid
+from asca_pillars.input_files import read_text
 from asca_pillars.strict import Strict
 
 Row: TypeAlias = tuple[float, float, float, float]
@@ -97,7 +98,7 @@ def read_pose(path: str | Path) -> tuple[Row, Row, Row, Row]:
         ConfigError: the file cannot be read or holds something else.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_text(path, ConfigError)
         numbers = [float(word) for word in re.split(r"[\s,;\[\]]+", text) if word]
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read as a pose ({error}); write 16 numbers, row by row") from None

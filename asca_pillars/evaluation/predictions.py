@@ -19,6 +19,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
 from asca_pillars.geometry.detections import Detections
+from asca_pillars.input_files import read_text
 
 KITTI_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 FOLDED_KITTI_TYPES = frozenset(name.casefold() for name in KITTI_TYPES)
@@ -188,5 +189,5 @@ def _read_frame(folder: Path, frame_id: str, *, scored: bool) -> FrameObjects:
 
 def _place(path: Path, index: int) -> str:
     """FILE:LINE of an object: empty lines are not objects."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = read_text(path, DatasetError, errors="replace").splitlines()
     return f"{path}:{[number for number, line in enumerate(lines, start=1) if line.strip()][index]}"

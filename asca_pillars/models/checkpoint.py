@@ -14,6 +14,7 @@ from asca_pillars.config import Config
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path
+from asca_pillars.input_files import require_content
 from asca_pillars.models.build import build_model
 from asca_pillars.models.trainable import Trainable
 from asca_pillars.schema import parse
@@ -44,6 +45,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         TrainingError: not a checkpoint, damaged, or made by an incompatible version.
     """
     path = Path(path)
+    require_content(path, TrainingError)
     if not path.is_file():
         raise TrainingError(f"{path}: no such checkpoint; a run keeps its own in RUN/checkpoints/last.ckpt")
     try:

@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from asca_pillars.config import ModelConfig
 from asca_pillars.errors import TrainingError
 from asca_pillars.files import atomic_path
+from asca_pillars.input_files import require_content
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import read_plain, unread
 
@@ -120,6 +121,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
     for path in (folder / LAST, folder / PREVIOUS):
         if not path.exists():
             continue
+        require_content(path, TrainingError)
         if (reason := _why_unusable(path, model)) is None:
             return path, unusable[0] if unusable else None
         unusable.append(f"{path} {reason}")

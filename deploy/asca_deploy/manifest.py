@@ -25,6 +25,7 @@ from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.errors import AscaError, BundleError, printable
 from asca_pillars.files import write_json
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
+from asca_pillars.input_files import require_content
 from asca_pillars.schema import parse, to_dict
 
 ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
@@ -187,6 +188,7 @@ def _blamed(manifest: Path, error: AscaError) -> str:
 def _verify_graph(folder: Path, graph: GraphFile, stamped: dict[str, Any]) -> None:
     """Raise BundleError unless the file is there, whole, complete in itself, and stamped with these values."""
     path = folder / graph.file
+    require_content(path, BundleError)
     if not path.is_file():
         raise BundleError(f"{path} is missing; copy the whole folder, or {EXPORT_AGAIN}")
     try:

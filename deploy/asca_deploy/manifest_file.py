@@ -7,6 +7,7 @@ from typing import Any
 
 from asca_deploy.bundle import MANIFEST, SCHEMA_VERSION
 from asca_pillars.errors import BundleError, printable
+from asca_pillars.input_files import require_content
 
 EXPORT_AGAIN = "export the bundle again with `asca export`"
 LONGEST_REASON = 300
@@ -18,9 +19,10 @@ _LARGEST_BYTES = 1 << 20
 def read_manifest(manifest: Path) -> dict[str, Any]:
     """The keys and values of a bundle.json of a schema that this version reads; BundleError if it is none."""
     try:
+        require_content(manifest, BundleError)
         if manifest.stat().st_size > _LARGEST_BYTES:
             raise BundleError(f"{manifest} is larger than a manifest ever is (1 MiB); {EXPORT_AGAIN}")
-        text = manifest.read_text(encoding="utf-8")
+        text = manifest.read_text(encoding="utf-8-sig")
         data = json.loads(text, object_pairs_hook=_without_duplicates, parse_constant=_no_number)
     except (FileNotFoundError, NotADirectoryError):
         refuse_run_folder(manifest.parent)

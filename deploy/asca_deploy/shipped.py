@@ -8,6 +8,7 @@ from asca_deploy.bundle import MANIFEST, WEIGHTS
 from asca_deploy.manifest import load_bundle
 from asca_deploy.manifest_file import refuse_run_folder
 from asca_pillars.errors import BundleError
+from asca_pillars.input_files import require_content
 
 
 def default_bundle_path() -> Path:
@@ -48,6 +49,7 @@ def find_weights(bundle: str | Path) -> Path:
     """
     folder = find_bundle(bundle)
     path = folder / WEIGHTS
+    require_content(path, BundleError)
     if not path.is_file():
         refuse_run_folder(folder)
         having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS).is_file()]

@@ -63,6 +63,14 @@ def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys:
     assert json.loads((tmp_path / "around" / "detections.jsonl").read_text())["detector"]["ranges_m"] is None
 
 
+def test_times_that_no_clock_shows_end_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    times = (5, 2**63, 2**64 - 1)
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": [(time_ns, laid_out(POINTS, time_ns=0)) for time_ns in times]})
+    lines = run(path, tmp_path / "out", track=True, foxglove=tmp_path / "boxes.mcap")
+    assert [line["time_ns"] for line in lines] == [5, 0, 0]
+    assert "neither the header nor the recording has a usable time stamp" in capsys.readouterr().out
+
+
 def test_tracks_last_and_move(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = run(drive, tmp_path, track=True)
     first, last = ({box["track_id"]: box for box in line["boxes"]} for line in (lines[0], lines[-1]))

@@ -1,5 +1,6 @@
 """Scans unlike those of the training: each way is noticed, its remedy works, and right scans raise no alarm."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -48,6 +49,33 @@ def test_what_is_expected() -> None:
 
 def test_a_scan_like_the_training_scans() -> None:
     assert check(street(3)) == []
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "remedy"),
+    [
+        (1000.0, (0, 0, 0), "divide millimetres by 1000"),
+        (100.0, (0, 0, 0), "centimetres by 100"),
+        (1000.0, (500, -300, 0), "divide millimetres by 1000"),
+        (1e36, (0, 0, 0), "coordinates have to be in metres"),
+        (1.0, (0, -2000, 0), "x = 11, y = -1994: .* subtract the sensor's position"),
+        (1.0, (494_428, 4_877_419, 120), "not of a map: subtract the sensor's position"),
+    ],
+)
+def test_points_beyond_a_kilometre_are_of_another_unit_or_frame(
+    scale: float, shift: tuple[int, int, int], remedy: str
+) -> None:
+    points = street(3).astype(np.float64)
+    points[:, :3] = points[:, :3] * scale + shift
+    (warning,) = check(points.astype(np.float32))
+    assert warning.about == "range"
+    assert re.search(remedy, warning.text) and "--axes" not in warning.text
+
+
+def test_a_few_points_far_away_are_none_of_another_unit() -> None:
+    points = street(3)
+    points[:100, :2] = 65_535
+    assert check(points) == []
 
 
 def test_too_few_points_near_the_sensor_to_see_the_ground() -> None:

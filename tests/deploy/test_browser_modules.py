@@ -19,6 +19,9 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import ScanError
 from asca_pillars.geometry.overlap import bev_iou
+from benchmarks.fuzz import damaged
+from benchmarks.fuzz_inputs import Kind, read_points, scan_seeds
+from tests.data.scans.pcd_cases import CASES
 from tests.deploy import conftest as tiny
 
 ROOT = Path(__file__).parents[2]
@@ -128,6 +131,37 @@ def test_bin_files_read_as_python_reads_them(tmp_path: Path) -> None:
     for name, values in (("four", points), ("five", rings[:399]), ("dark", np.float32(0.1) * points)):
         values.astype("<f4").tofile(tmp_path / f"{name}.bin")
         assert_reads_alike(tmp_path / f"{name}.bin")
+
+
+def test_files_at_the_edge_are_read_or_refused_as_by_python() -> None:
+    answers = call("readers.js", "readScan", *(["a.pcd", case.content] for case in CASES))
+    for case, answer in zip(CASES, answers, strict=True):
+        assert ("result" in answer) == (case.points is not None), (case.name, answer)
+        if case.points is not None:
+            found = np.array(answer["result"]["points"], np.float32).reshape(-1, 4)
+            np.testing.assert_array_equal(found, case.points, case.name)
+            assert any("left out" in remark for remark in answer["result"]["remarks"]) == case.has_padding, case.name
+
+
+@pytest.mark.parametrize("suffix", ["pcd", "bin"])
+def test_damaged_files_are_read_or_refused_as_by_python(tmp_path: Path, suffix: str) -> None:
+    """The inputs of the fuzz benchmark."""
+    kind = Kind("scan", tmp_path / f"a.{suffix}", scan_seeds()[suffix], read_points)
+    contents = [damaged(kind, np.random.default_rng([5, number])) for number in range(600)]
+    answers = call("readers.js", "readScan", *([kind.path.name, content] for content in contents))
+    read = 0
+    for number, (content, answer) in enumerate(zip(contents, answers, strict=True)):
+        kind.path.write_bytes(content)
+        try:
+            expected = read_points(kind.path)
+        except ScanError as error:
+            assert "error" in answer, (number, error)
+            continue
+        assert "result" in answer, (number, answer)
+        found = np.array(answer["result"]["points"], np.float32).reshape(-1, 4)
+        np.testing.assert_array_equal(found, expected, f"input {number}")
+        read += 1
+    assert 50 < read < 550
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:

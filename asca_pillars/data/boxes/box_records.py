@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.input_files import read_text
 
 FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
 _SHORT = {name.rpartition("_")[0]: name for name in FIELDS}
@@ -239,7 +240,7 @@ def _number(value: Any, name: str, place: str) -> float:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")  # spreadsheets put a mark before the first name
+        return read_text(path, DatasetError)  # spreadsheets put a mark before the first name
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not UTF-8 text; save it as UTF-8") from None
     except OSError as error:

@@ -18,6 +18,7 @@ from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG, TYPES
 from asca_pillars.data.scans.find_scans import files_below, visible_files
 from asca_pillars.errors import DatasetError
+from asca_pillars.input_files import read_text
 
 LABELS = "tracklet_labels.xml"
 
@@ -57,7 +58,7 @@ def _read_tracklets(path: Path) -> dict[int, _Labels]:
     """The labels of each frame."""
     labels: dict[int, _Labels] = defaultdict(lambda: _Labels([], [], []))
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = read_text(path, DatasetError, errors="replace")
         if "<!ENTITY" in text:  # an entity may unfold to any size
             raise ValueError("it declares entities")
         tracklets = ElementTree.fromstring(text).findall("tracklets/item")

@@ -14,6 +14,7 @@ from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects, parse_object, read_calibration
 from asca_pillars.data.scans.find_scans import visible_files
 from asca_pillars.errors import DatasetError
+from asca_pillars.input_files import read_text
 
 LABELED_VIEW_DEG = 81.0
 """Of KITTI's left color camera: 1242 pixels at a focal length of 721."""
@@ -60,7 +61,7 @@ def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
 def _read_tracked(path: Path) -> dict[int, list[_Tracked]]:
     """The objects of each frame with their track's number."""
     try:
-        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+        lines = read_text(path, DatasetError, errors="replace").splitlines()
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None
     tracked = defaultdict(list)

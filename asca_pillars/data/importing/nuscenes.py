@@ -19,6 +19,7 @@ from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.rotations import of_quaternions
+from asca_pillars.input_files import read_text
 
 CHANNEL = "LIDAR_TOP"
 DETECTION_CLASSES = {
@@ -129,7 +130,7 @@ def _tables_folder(root: Path) -> Path:
 def _table(folder: Path, name: str) -> _Table:
     path = folder / f"{name}.json"
     try:
-        return {row["token"]: row for row in json.loads(path.read_text(encoding="utf-8"))}
+        return {row["token"]: row for row in json.loads(read_text(path, DatasetError))}
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); nuScenes' metadata has this table") from None
     except (ValueError, TypeError, KeyError):

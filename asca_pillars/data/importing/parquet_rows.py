@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from asca_pillars.errors import AscaError, DatasetError
+from asca_pillars.input_files import require_content
 
 _BATCH = 8  # rows that are in memory at once: a range image has millions of numbers
 
@@ -22,6 +23,7 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
     except ModuleNotFoundError:
         raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
     try:
+        require_content(path, DatasetError)
         with parquet.ParquetFile(path) as file:
             names = file.schema_arrow.names
             if missing := [name for name in columns if name not in names]:

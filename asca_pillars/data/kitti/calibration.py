@@ -15,6 +15,7 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import corners
 from asca_pillars.geometry.rotations import transform_columns
+from asca_pillars.input_files import read_text
 
 DEFAULT_IMAGE_SIZE_WH = (1242, 375)
 NEAR_PLANE_M = 0.1
@@ -146,7 +147,7 @@ def read_calibration(path: str | Path) -> Calibration:
         DatasetError: the file is missing, lacks a matrix, or holds one that cannot be a calibration.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
+        text = read_text(path, DatasetError, errors="replace")
     except OSError as error:
         raise DatasetError(
             f"{path}: cannot read the calibration ({error.strerror}); every scan needs calib/<frame id>.txt"

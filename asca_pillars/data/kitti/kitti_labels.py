@@ -17,6 +17,7 @@ from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibrati
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.input_files import read_text
 
 _TOO_LARGE = 1e9  # of any field; far above, float32 boxes are no longer finite
 
@@ -63,7 +64,7 @@ def read_labels(path: str | Path) -> list[KittiObject]:
         DatasetError: the file is missing, or a line is not one of KITTI's.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
+        text = read_text(path, DatasetError, errors="replace")
     except OSError as error:
         raise DatasetError(
             f"{path}: cannot read the labels ({error.strerror}); a frame without objects needs an empty file"

@@ -26,6 +26,7 @@ from asca_pillars.data.scans.stored_scans import stored_points
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.input_files import read_text, require_content
 
 _PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # the signature, then length and name of the first chunk
 
@@ -110,6 +111,7 @@ class KittiSplit:
         """
         path = self.image_path(frame_id)
         try:
+            require_content(path, DatasetError)
             with path.open("rb") as file:
                 start = file.read(24)
         except FileNotFoundError:
@@ -196,7 +198,7 @@ def read_image_set(root: Path, name: str) -> set[str]:
     """
     path = root / "ImageSets" / f"{name}.txt"
     try:
-        frame_ids = {line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()} - {""}
+        frame_ids = {line.strip() for line in read_text(path, DatasetError).splitlines()} - {""}
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not UTF-8 text; write one frame id per line") from None
     except OSError as error:

@@ -3,6 +3,7 @@
 from functools import cache
 from typing import Any
 
+from asca_pillars.data.recordings.decompression import ZSTD_MAGIC, unpack_zstd
 from asca_pillars.data.recordings.recording import Encoding, Message
 
 
@@ -13,13 +14,20 @@ def decoded(message: Message, kind: str) -> Any:
         Exception: it is damaged; the library lets struct's and NumPy's errors pass.
     """
     store = _typestore(message.encoding)
-    deserialize = store.deserialize_ros1 if message.encoding == "ros1" else store.deserialize_cdr
-    return deserialize(message.data, kind)
+    if message.encoding == "ros1":
+        return store.deserialize_ros1(message.data, kind)
+    # No CDR begins so. rosbag2 says in its metadata.yaml alone that it compressed the messages.
+    is_compressed = message.data.startswith(ZSTD_MAGIC)
+    return store.deserialize_cdr(unpack_zstd(message.data) if is_compressed else message.data, kind)
 
 
-def reason(error: Exception) -> str:
-    """An error of a library in one short line."""
-    return " ".join(f"{type(error).__name__} {error}".split())[:100]
+def time_of(header: Any, message: Message) -> int | None:
+    """When a message was measured, nanoseconds: by its header, or where that says 0 or less when it was recorded.
+
+    None if neither is known.
+    """
+    time_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    return time_ns if time_ns > 0 else message.recorded_ns
 
 
 @cache

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.recordings.messages import decoded, reason
-from asca_pillars.data.recordings.recording import Recording
+from asca_pillars.data.recordings.messages import decoded, time_of
+from asca_pillars.data.recordings.recording import Recording, reason
 from asca_pillars.errors import ScanError
 from asca_pillars.geometry.rotations import of_quaternions
 
@@ -64,12 +64,13 @@ def read_poses(recording: Recording, topic: str) -> Poses:
         except Exception as error:  # the library lets struct's errors pass
             trouble = reason(error)
             continue
-        stamp, pose = odometry.header.stamp, odometry.pose.pose
-        time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+        pose, time_ns = odometry.pose.pose, time_of(odometry.header, message)
         place, turn = pose.position, pose.orientation
         row = [place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]
-        if np.isfinite(row).all() and np.linalg.norm(row[3:]) > 0.5:
-            rows.append((time_ns if time_ns > 0 else message.recorded_ns, row))
+        if time_ns is None:
+            trouble = "no usable time stamp"
+        elif np.isfinite(row).all() and np.linalg.norm(row[3:]) > 0.5:
+            rows.append((time_ns, row))
         else:
             trouble = "a pose that is not finite, or no rotation"
     if not rows:

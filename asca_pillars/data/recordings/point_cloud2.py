@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asca_pillars.data.recordings.messages import decoded, reason
-from asca_pillars.data.recordings.recording import Message
+from asca_pillars.data.recordings.messages import decoded, time_of
+from asca_pillars.data.recordings.recording import Message, reason
 from asca_pillars.data.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, wanted_fields
 from asca_pillars.errors import ScanError
 
@@ -18,7 +18,7 @@ class PointCloud(NamedTuple):
 
     points: StoredPoints
     time_ns: int
-    """Of the header; where that says 0 or less, when the message was recorded."""
+    """Of the header; where that says 0 or less, when the message was recorded; 0, with a remark, if that is unknown."""
     frame_id: str
 
 
@@ -32,15 +32,17 @@ def read_point_cloud(message: Message, source: str) -> PointCloud:
     Raises:
         ScanError: the message is damaged or contradicts itself, or has no x, y and z.
     """
+    if not message.data:
+        raise ScanError(f"{source}: the message has no data; record it again")
     try:
         cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
     except Exception as error:  # the library lets struct's and NumPy's errors pass
         raise ScanError(f"{source}: no readable PointCloud2 ({reason(error)}); record it again") from None
-    stamp = cloud.header.stamp
-    time_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-    return PointCloud(
-        _points(cloud, source), time_ns if time_ns > 0 else message.recorded_ns, str(cloud.header.frame_id)
-    )
+    points, time_ns = _points(cloud, source), time_of(cloud.header, message)
+    if time_ns is None:
+        said = "neither the header nor the recording has a usable time stamp, it was taken as 0"
+        points, time_ns = points._replace(remarks=(*points.remarks, said)), 0
+    return PointCloud(points, time_ns, str(cloud.header.frame_id))
 
 
 def _points(cloud: Any, source: str) -> StoredPoints:
@@ -67,7 +69,8 @@ def _points(cloud: Any, source: str) -> StoredPoints:
     chosen = [fields[index] for index in wanted]
     if not count:
         return assemble_points(0, [np.zeros(0, field.dtype) for field in chosen], chosen)
-    row_step = row_step if height > 1 else max(row_step, width * step)  # single rows need none, and some have 0
+    if height == 1 or len(data) == count * step:
+        row_step = width * step  # there is no padding, whatever drivers write here: the whole cloud, the width, 0
     # The last row may come without its padding.
     if row_step < width * step or len(data) < (height - 1) * row_step + width * step:
         raise ScanError(

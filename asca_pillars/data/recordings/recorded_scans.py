@@ -55,7 +55,7 @@ class RecordedScans:
             try:
                 cloud = read_point_cloud(message, self._place(number))
             except ScanError as error:
-                yield RecordedScan(number, message.recorded_ns, "", None, str(error))
+                yield RecordedScan(number, message.recorded_ns or 0, "", None, str(error))
                 continue
             yield RecordedScan(number, cloud.time_ns, cloud.frame_id, finite_scan(cloud.points, self.scale.scale))
 

@@ -1,14 +1,22 @@
 """What all kinds of recordings have in common: topics, and the messages of one of them."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from asca_pillars.data.recordings.scan_types import conversion_of
 from asca_pillars.errors import ScanError
 
 Encoding = Literal["cdr", "ros1"]
 """How a message's fields are written: ROS 2's CDR or ROS 1's own."""
+
+
+UNKNOWN_TYPE = "unknown"
+"""Of a topic without a schema."""
+SEVERAL_TYPES = "several types"
+LAST_NS = 2**63 - 1
+"""The latest time that is usable: in 2262."""
 
 
 class Topic(NamedTuple):
@@ -25,9 +33,9 @@ class Topic(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message as it is stored, and when it was recorded, nanoseconds."""
+    """A message as it is stored, and when it was recorded, nanoseconds; None where no usable time is stored."""
 
-    recorded_ns: int
+    recorded_ns: int | None
     data: bytes
     encoding: Encoding
 
@@ -38,7 +46,8 @@ class Recording(ABC):
     Attributes:
         path: the file or folder.
         topics: all of them, by name.
-        damage: what the last call of `messages` lacked, and where; None: nothing.
+        damage: what the last call of `messages` lacked, or before the first one the list of topics, and where; None:
+            nothing.
     """
 
     path: Path
@@ -60,23 +69,54 @@ class Recording(ABC):
             named = [topic for topic in self.topics if topic.name == wanted]
             if not named:
                 raise ScanError(f"{self.path}: no topic {wanted[:80]}; there are {listed(self.topics)}")
-            if not named[0].is_point_cloud:
-                raise ScanError(
-                    f"{self.path}: {wanted} holds {named[0].type}, not scans (sensor_msgs/msg/PointCloud2); "
-                    f"choose one of {listed(clouds)}"
-                )
+            if not named[0].is_point_cloud and named[0].type != UNKNOWN_TYPE:
+                held = f"{self.path}: {wanted} holds {named[0].type}"
+                if conversion := conversion_of(named[0].type):
+                    raise ScanError(f"{held}, a type of scans that is not read: {conversion}")
+                remedy = f"choose one of {listed(clouds)}" if clouds else self._remedy(self.topics)
+                raise ScanError(f"{held}, not scans (sensor_msgs/msg/PointCloud2); {remedy}")
             return named[0]
         filled = [topic for topic in clouds if topic.messages] or clouds
         if not filled:
-            raise ScanError(
-                f"{self.path}: no topic of type sensor_msgs/msg/PointCloud2; there are {listed(self.topics)}: "
-                "record the scans, too"
-            )
+            none = f"no topic of type sensor_msgs/msg/PointCloud2; there are {listed(self.topics)}"
+            if self.damage:
+                raise ScanError(f"{self.damage}; in what can be read {none}: copy or record it again")
+            raise ScanError(f"{self.path}: {none}: {self._remedy(self.topics)}")
         if len(filled) > 1:
             raise ScanError(f"{self.path}: several topics hold scans, give --topic: {listed(filled)}")
         return filled[0]
+
+    def _remedy(self, topics: Sequence[Topic]) -> str:
+        """What to do where none of these topics is read."""
+        for topic in topics:
+            if conversion := conversion_of(topic.type):
+                return f"the scans are recorded as {topic.type}, which is not read: {conversion}"
+        if unknown := [topic for topic in topics if topic.type == UNKNOWN_TYPE]:
+            return f"if one of unknown type holds PointCloud2, name it (--topic {unknown[0].name})"
+        return "record the scans, too"
 
 
 def listed(topics: Sequence[Topic]) -> str:
     """The topics with their types and counts, in one line."""
     return ", ".join(f"{topic.name} ({topic.type}, {topic.messages})" for topic in topics) or "none"
+
+
+def merged(topics: Iterable[Topic]) -> list[Topic]:
+    """Topics by name, those of one name as one with all their messages."""
+    by_name: dict[str, list[Topic]] = {}
+    for topic in topics:
+        by_name.setdefault(topic.name, []).append(topic)
+    return [
+        Topic(name, _common_type(same), sum(topic.messages for topic in same)) for name, same in sorted(by_name.items())
+    ]
+
+
+def _common_type(topics: Sequence[Topic]) -> str:
+    types = {topic.type for topic in topics} - {UNKNOWN_TYPE}
+    return SEVERAL_TYPES if len(types) > 1 else next(iter(types), UNKNOWN_TYPE)
+
+
+def reason(error: Exception) -> str:
+    """An error of a library in one short line."""
+    name = "" if type(error) is ValueError else type(error).__name__
+    return " ".join(f"{name} {error}".split())[:100]

@@ -1,65 +1,85 @@
-"""rosbag2 in SQLite and ROS 1 bags, by the library rosbags."""
+"""ROS 1 bags, by the library rosbags; a chunk or message that cannot be read costs no more than that."""
 
-from collections.abc import Iterator
+import heapq
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from asca_pillars.data.recordings.messages import reason
-from asca_pillars.data.recordings.recording import Message, Recording, Topic
+from asca_pillars.data.recordings.decompression import unpack_bz2, unpack_lz4
+from asca_pillars.data.recordings.recording import SEVERAL_TYPES, Message, Recording, Topic, reason
 from asca_pillars.errors import ScanError
 
 
 class RosBag(Recording):
-    """A `.db3` file, a folder with metadata.yaml and such files, or a ROS 1 `.bag`.
+    """A ROS 1 `.bag` file.
+
+    Args:
+        path: of the recording, for messages.
+        file: where it is read; None: at `path`.
 
     Raises:
         ScanError: no such recording, or it cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with _opened(path) as reader:
-            topics = [
-                Topic(name, info.msgtype or "several types", info.msgcount) for name, info in reader.topics.items()
-            ]
-        self.topics = sorted(topics)
+    def __init__(self, path: Path, file: Path | None = None) -> None:
+        self.path, self._file = path, file or path
+        with self._opened() as reader:
+            self.topics = sorted(
+                Topic(name, info.msgtype or SEVERAL_TYPES, info.msgcount) for name, info in reader.topics.items()
+            )
 
     def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic."""
-        self.damage, count = None, 0
-        with _opened(self.path) as reader:
-            try:
-                chosen = [one for one in reader.connections if one.topic == topic]
-                for _, time_ns, data in reader.messages(connections=chosen):
-                    count += 1
-                    yield Message(time_ns, bytes(data), "ros1" if _is_ros1(self.path) else "cdr")
-                if count < (declared := sum(one.messages for one in self.topics if one.name == topic)):
-                    self.damage = f"{self.path}: {count} of the {declared} messages of {topic} can be read"
-            except (ScanError, GeneratorExit):
-                raise
-            except Exception as error:  # of SQLite, the decompressors, the library
-                self.damage = f"{self.path}: ends early, after {count} messages of {topic} ({reason(error)})"
+        """The messages of a topic by time; those that cannot be read are left out."""
+        self.damage, count, trouble = None, 0, ""
+        damaged_chunks: set[int] = set()
+        with self._opened() as reader:
+            connections = {one.id: one for one in reader.connections if one.topic == topic}
+            entries = [zip(reader.indexes[number], repeat(number)) for number in connections]
+            for entry, number in heapq.merge(*entries, key=lambda pair: pair[0].time):
+                if entry.chunk_pos in damaged_chunks:
+                    continue
+                # The library's generator ends with the first error: it is asked for one message at a time.
+                reader.indexes[number] = [entry]
+                try:
+                    _, time_ns, data = next(reader.messages([connections[number]]))
+                except Exception as error:  # of the decompressors, the library
+                    trouble = trouble or f" ({reason(error)})"
+                    if reader.current_chunk[0] != entry.chunk_pos:
+                        damaged_chunks.add(entry.chunk_pos)
+                        reader.current_chunk = (-1, BytesIO())  # the one before was closed
+                    continue
+                count += 1
+                yield Message(time_ns, bytes(data), "ros1")
+        declared = sum(one.messages for one in self.topics if one.name == topic)
+        if count < declared:
+            self.damage = f"{self.path}: {count} of the {declared} messages of {topic} can be read{trouble}"
+
+    def _opened(self) -> Any:
+        from rosbags.rosbag1 import Reader
+
+        try:
+            reader = Reader(self._file)
+            reader.open()
+        except Exception as error:
+            raise ScanError(
+                f"{self.path}: no readable ROS 1 bag ({reason(error)}); copy it again, or mend its index "
+                "(rosbag reindex)"
+            ) from None
+        reader.chunks = {place: chunk._replace(decompressor=_bounded(chunk)) for place, chunk in reader.chunks.items()}
+        return _Closing(reader)
 
 
-def _is_ros1(path: Path) -> bool:
-    return path.suffix.lower() == ".bag"
+def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
+    """What unpacks a chunk to no more than a limit, in the place of what the library would use."""
+    from rosbags.rosbag1.reader import Compression, decompressors
 
-
-def _opened(path: Path) -> Any:
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
-
-    try:
-        reader = (Reader1 if _is_ros1(path) else Reader2)(path)
-        reader.open()
-    except Exception as error:
-        what, remedy = "rosbag2", "copy it again, or mend it (sqlite3 broken.db3 .recover | sqlite3 mended.db3)"
-        if path.suffix != path.suffix.lower():  # the library goes by the suffix as it stands
-            remedy = f"rename it to {path.stem}{path.suffix.lower()}"
-        if _is_ros1(path):
-            what, remedy = "ROS 1 bag", "copy it again, or mend its index (rosbag reindex)"
-        raise ScanError(f"{path}: no readable {what} ({reason(error)}); {remedy}") from None
-    return _Closing(reader)
+    bounded: dict[str, Callable[[bytes], bytes]] = {
+        Compression.BZ2.value: unpack_bz2,
+        Compression.LZ4.value: unpack_lz4,
+    }
+    return next((bounded[name] for name in bounded if decompressors[name] is chunk.decompressor), chunk.decompressor)
 
 
 class _Closing:

@@ -7,6 +7,7 @@ import numpy as np
 
 from asca_pillars.data.scans.records import StoredPoints
 from asca_pillars.errors import AscaError, ScanError
+from asca_pillars.input_files import require_content
 
 
 def read_feather(path: Path) -> StoredPoints:
@@ -36,6 +37,7 @@ def feather_table(
     except ModuleNotFoundError:
         raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
     try:
+        require_content(path, error)
         table = feather.read_table(path, memory_map=False)
     except (pyarrow.ArrowException, OSError) as reason:
         raise error(

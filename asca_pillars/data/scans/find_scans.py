@@ -1,19 +1,26 @@
 """Which files are scans, and under which name the results of each are written."""
 
-import contextlib
+import hashlib
+import os
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 from asca_pillars.errors import ScanError
 from asca_pillars.files import is_hidden
+from asca_pillars.input_files import require_content
 
 SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
 PREPARED_FILE = "README.txt"
 PREPARED_NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
 """What the file says in a folder that is computed from a dataset: what lies there are no scans."""
+
+_LONGEST_NAME_BYTES = 240
+"""Names of files have at most 255 bytes, and results append such as `_image.png` to the name of their scan."""
 
 
 class NamedScan(NamedTuple):
@@ -26,37 +33,51 @@ class NamedScan(NamedTuple):
 def find_scans(path: str | Path) -> list[Path]:
     """The scan at `path`, or those in the folder at `path`, to any depth, in natural order (2.bin before 10.bin).
 
-    Hidden files and folders are left out, and what `asca prepare` computed; links to folders are followed.
+    Hidden files and folders are left out, and what `asca prepare` computed; links to folders are followed. What has the
+    name of a scan and is no regular file, or a link to nothing, is refused when it is read.
 
     Raises:
         ScanError: there is no scan.
     """
     path = Path(path)
+    require_content(path, ScanError)
     if path.is_file():
         return [path]
     if not path.is_dir():
         raise ScanError(f"{path}: no such file or folder; check the path")
-    scans = [entry for entry in files_below(path) if is_scan(entry.relative_to(path)) and entry.is_file()]
+    scans = [entry for entry in files_below(path) if is_scan(entry.relative_to(path))]
     if not scans:
         raise ScanError(f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}")
     return sorted(scans, key=natural_order)
 
 
-def files_below(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[Path]:
-    """Every file below a folder, to any depth, in any order; links to folders are followed.
+def files_below(folder: Path) -> Iterator[Path]:
+    """Every file below a folder, to any depth; links to folders are followed.
 
-    Folders that may not be read are left out, those that `asca prepare` wrote, and links that lead to a folder which
-    they are in (`above`).
+    Each folder is visited once, under the path without a link on it if there is one. Folders that may not be read are
+    left out, and those that `asca prepare` wrote.
     """
-    here = above | {folder.resolve()}
-    with contextlib.suppress(PermissionError):
-        if _is_prepared(folder):
-            return
-        for entry in folder.iterdir():
-            if not entry.is_dir():
-                yield entry
-            elif entry.resolve() not in here:
-                yield from files_below(entry, here)
+    visited: set[tuple[int, int]] = set()
+    folders, links = [folder], deque[Path]()
+    while folders or links:
+        here = folders.pop() if folders else links.popleft()
+        with suppress(OSError):
+            if (identity := _folder_identity(here)) in visited:
+                continue
+            visited.add(identity)
+            if _is_prepared(here):
+                continue
+            for entry in sorted(os.scandir(here), key=lambda entry: entry.name):
+                if not entry.is_dir():
+                    yield here / entry.name
+                else:
+                    (links if entry.is_symlink() else folders).append(here / entry.name)
+
+
+def _folder_identity(folder: Path) -> tuple[int, int]:
+    """What is the same on all paths to a folder; resolving a path of a thousand folders takes milliseconds."""
+    status = folder.stat()
+    return status.st_dev, status.st_ino
 
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
@@ -66,28 +87,37 @@ def visible_files(folder: Path, pattern: str) -> list[Path]:
 
 def _is_prepared(folder: Path) -> bool:
     path = folder / PREPARED_FILE
-    return path.is_file() and path.read_text(encoding="utf-8", errors="replace") == PREPARED_NOTE
+    return (
+        path.is_file()
+        and path.stat().st_size < 2 * len(PREPARED_NOTE)
+        and path.read_text(encoding="utf-8", errors="replace") == PREPARED_NOTE
+    )
 
 
 def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
     """All scans at several paths, each once, with names for their results.
 
     A name is the scan's path below the folder that was given, without its suffix. Scans that would share a name are put
-    below the name of the folder that was given (a/1.bin and b/1.bin), or keep their suffix (1.bin and 1.npy).
+    below the name of the folder that was given (a/1.bin and b/1.bin), or keep their suffix (1.bin and 1.npy). Of a name
+    that is too long for files of results the end gives way to a part of its SHA-256.
 
     Raises:
         ScanError: a path without scans, or two scans whose results would have the same name even then.
     """
-    found: dict[Path, tuple[Path, Path]] = {}  # resolved path -> (scan, the folder that was given)
+    found: dict[tuple[tuple[int, int], str], tuple[Path, Path]] = {}  # (its folder, name) -> (scan, what was given)
+    folder_identity, resolved = cache(_folder_identity), cache(Path.resolve)
     for given in map(Path, paths):
         for scan in find_scans(given):
-            found.setdefault(scan.resolve(), (scan, given.parent if given.is_file() else given))
+            place = scan.resolve() if scan.is_symlink() else scan
+            key = folder_identity(place.parent), place.name
+            found.setdefault(key, (scan, given.parent if given.is_file() else given))
     scans = [scan for scan, _ in found.values()]
     below = [scan.relative_to(root) for scan, root in found.values()]
-    rooted = [root.resolve().name / name for (_, root), name in zip(found.values(), below, strict=True)]
+    rooted = [resolved(root).name / name for (_, root), name in zip(found.values(), below, strict=True)]
     names = [name.with_suffix("") for name in below]
     for others in ([name.with_suffix("") for name in rooted], below, rooted):
         names = _where_shared(names, others)
+    names = [_shortened(name) for name in names]
     for name, count in Counter(names).items():
         if count > 1:
             first, second, *_ = (scan for scan, own in zip(scans, names, strict=True) if own == name)
@@ -101,6 +131,15 @@ def _where_shared(names: Sequence[Path], others: Sequence[Path]) -> list[Path]:
     return [other if counts[name] > 1 else name for name, other in zip(names, others, strict=True)]
 
 
+def _shortened(name: Path) -> Path:
+    """The name itself, or if its last part is too long the start of that and eight digits of its SHA-256."""
+    encoded = os.fsencode(name.name)
+    if len(encoded) <= _LONGEST_NAME_BYTES:
+        return name
+    digest = hashlib.sha256(encoded).hexdigest()[:8]
+    return name.with_name(f"{encoded[: _LONGEST_NAME_BYTES - 9].decode(errors='ignore')}-{digest}")
+
+
 def is_scan(relative: Path) -> bool:
     """Whether it is a scan by its name; `relative` to the folder that is searched."""
     if relative.suffix.lower() == ".feather" and not relative.stem.isdecimal():
@@ -110,7 +149,9 @@ def is_scan(relative: Path) -> bool:
 
 def natural_order(path: Path) -> list[list[tuple[int, str]]]:
     """A key by which 2.bin comes before 10.bin."""
-    return [
-        [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", part)]
-        for part in path.parts
-    ]
+    return [_pieces(part) for part in path.parts]
+
+
+@lru_cache(maxsize=4096)  # folders are parts of many paths
+def _pieces(part: str) -> list[tuple[int, str]]:
+    return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", part)]

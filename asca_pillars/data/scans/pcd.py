@@ -1,5 +1,6 @@
 """The Point Cloud Library's PCD format, version 0.7: ascii, binary and binary_compressed."""
 
+import codecs
 import struct
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from asca_pillars.errors import ScanError
 
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 _OLD_KEYS = {"COLUMNS": "FIELDS"}  # as PCD's first version has it
+_PAGE_BYTES = tuple(2**power for power in range(12, 17))  # of memory: 4 KiB on most machines, up to 64 KiB on others
 _TYPES = {
     f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IUF" for size in (1, 2, 4, 8) if kind + str(size) != "F1"
 }
@@ -25,6 +27,9 @@ _TYPES = {
 
 def read_pcd(path: Path) -> StoredPoints:
     """The points of a PCD file in its own frame: VIEWPOINT is where the sensor stood, and is not applied.
+
+    Bytes after the points are left out, with a remark, where they are padding: all zeros, or as many as PCL up to 1.8
+    appends, which makes a file as large as a page of memory and the points together.
 
     Raises:
         ScanError: the header is not PCD's, contradicts itself, lacks x, y or z, or the body is damaged or not of
@@ -42,15 +47,20 @@ def read_pcd(path: Path) -> StoredPoints:
             raise ScanError(f"{path}: {len(lines)} lines where the header states {count} points; correct the header")
         return points_from_text(str(path), lines, fields, count)
     if encoding == "binary":
-        if size and len(body) >= (count + 1) * size:
+        stored, used = points_from_bytes(str(path), body, fields, count), count * size
+        padded = body.count(0, used) == len(body) - used or len(data) - used in _PAGE_BYTES
+        if len(body) - used >= size and not padded:
             raise ScanError(
                 f"{path}: {len(body)} bytes where the header states {count} points of {size}; correct the header"
             )
-        return points_from_bytes(str(path), body, fields, count)
-    if encoding == "binary_compressed":
-        unpacked = _decompress(path, body, count * size) if count else b""
-        return points_from_bytes(str(path), unpacked, fields, count, by_field=True)
-    raise ScanError(f"{path}: DATA is '{encoding}'; PCD knows ascii, binary and binary_compressed")
+    elif encoding == "binary_compressed":
+        unpacked, used = _decompress(path, body, count * size) if count else (b"", 0)
+        stored = points_from_bytes(str(path), unpacked, fields, count, by_field=True)
+    else:
+        raise ScanError(f"{path}: DATA is '{encoding}'; PCD knows ascii, binary and binary_compressed")
+    if (surplus := len(body) - used) < size:
+        return stored
+    return stored._replace(remarks=(f"{surplus} bytes after the points were left out",))
 
 
 def lzf_decompress(data: bytes, size: int) -> bytearray:
@@ -94,7 +104,8 @@ def lzf_decompress(data: bytes, size: int) -> bytearray:
     return out
 
 
-def _decompress(path: Path, body: bytes, needed: int) -> bytearray:
+def _decompress(path: Path, body: bytes, needed: int) -> tuple[bytearray, int]:
+    """The unpacked points, and the length of what they were unpacked from."""
     if len(body) < 8:
         raise ScanError(f"{path}: the compressed body is missing; {AGAIN}")
     packed_size, size = struct.unpack_from("<2I", body)
@@ -104,23 +115,23 @@ def _decompress(path: Path, body: bytes, needed: int) -> bytearray:
     if len(packed) < packed_size:
         raise ScanError(f"{path}: {len(packed)} of {packed_size} compressed bytes are there; {AGAIN}")
     try:
-        return lzf_decompress(packed, size)
+        return lzf_decompress(packed, size), 8 + packed_size
     except ValueError as error:
         raise ScanError(f"{path}: the compressed body does not unpack ({error}); {AGAIN}") from error
 
 
 def _split_header(path: Path, data: bytes) -> tuple[dict[str, list[str]], bytes]:
     header: dict[str, list[str]] = {}
-    position = 0
+    position = len(codecs.BOM_UTF8) if data.startswith(codecs.BOM_UTF8) else 0
     while "DATA" not in header:
         end = data.find(b"\n", position, MAX_HEADER_BYTES)
         if end < 0:
             raise ScanError(f"{path}: no DATA line within the first {MAX_HEADER_BYTES} bytes; {AGAIN}")
-        words = data[position:end].decode("ascii", errors="replace").split()
+        words = [word.decode("ascii", errors="replace") for word in data[position:end].split()]
         position = end + 1
         if not words or words[0].startswith("#"):
             continue
-        words[0] = _OLD_KEYS.get(words[0], words[0])
+        words[0] = _OLD_KEYS.get(words[0].upper(), words[0].upper())
         if words[0] not in _KEYS:
             raise ScanError(f"{path}: {words[0][:20]!r} is not a line of a PCD header; {AGAIN}")
         if words[0] in header:
@@ -138,12 +149,12 @@ def _fields(path: Path, header: dict[str, list[str]]) -> list[Field]:
             raise ScanError(f"{path}: {key} has {len(column)} values for {len(names)} FIELDS; correct the header")
     fields = []
     for name, size, kind, count in zip(names, *columns.values(), strict=True):
-        if kind + size not in _TYPES or (values := whole_number(count)) is None:
+        if kind.upper() + size not in _TYPES or (values := whole_number(count)) is None:
             raise ScanError(
                 f"{path}: field {name} has TYPE {kind}, SIZE {size}, COUNT {count}; "
                 "TYPE is I, U or F, SIZE 1, 2, 4 or 8, COUNT a whole number"
             )
-        fields.append(Field(name, np.dtype(_TYPES[kind + size]), values))
+        fields.append(Field(name, np.dtype(_TYPES[kind.upper() + size]), values))
     return fields
 
 

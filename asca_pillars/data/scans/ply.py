@@ -1,5 +1,6 @@
 """The PLY (Stanford polygon) format, ascii and binary of either byte order: its vertices are the points."""
 
+import codecs
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -94,6 +95,7 @@ def _skip_bytes(path: Path, body: bytes, elements: list[_Element]) -> int:
 
 
 def _split_header(path: Path, data: bytes) -> tuple[str, list[_Element], bytes]:
+    data = data.removeprefix(codecs.BOM_UTF8)
     end = data.find(b"\nend_header", 0, MAX_HEADER_BYTES)
     start_of_body = data.find(b"\n", end + 1) + 1
     if not data.startswith(b"ply") or end < 0 or start_of_body == 0:

@@ -64,6 +64,8 @@ def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field
     for number, row in enumerate(rows):
         if len(row) != width:
             raise ScanError(f"{source}: point {number} has {len(row)} values where the fields need {width}; {AGAIN}")
+    if any(b"_" in line for line in lines[:count]):  # Python takes 1_000 for a number
+        raise ScanError(f"{source}: a point has a word with _ in it, no number; {AGAIN}")
     try:
         table = np.array(rows, dtype=np.float64).reshape(count, width)
     except ValueError as error:

@@ -17,6 +17,7 @@ from asca_pillars.data.scans.ply import read_ply
 from asca_pillars.data.scans.records import AGAIN, MAX_POINTS, StoredPoints
 from asca_pillars.errors import ScanError
 from asca_pillars.files import atomic_path
+from asca_pillars.input_files import require_content
 
 ReflectanceScale = Literal["auto"] | float
 """The stored value that is a reflectance of 1: 1, 100, 255, 65535, any other positive number, or auto."""
@@ -110,6 +111,7 @@ def read_stored(path: Path, columns: int | None) -> StoredPoints:
     if reader is None:
         raise ScanError(f"{path}: unknown suffix '{path.suffix}'; scans are {', '.join(SCAN_SUFFIXES)}")
     try:
+        require_content(path, ScanError)
         size = path.stat().st_size
         if size == 0:
             raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")

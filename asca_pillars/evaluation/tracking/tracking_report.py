@@ -20,6 +20,7 @@ from asca_pillars.evaluation.report_page import TextTable
 from asca_pillars.evaluation.tracking.clear_mot import ClearMot, clear_mot
 from asca_pillars.evaluation.tracking.hota import Hota, hota
 from asca_pillars.evaluation.tracking.tracked_frames import Boxes, TrackedFrame, tracked_frame
+from asca_pillars.input_files import read_text
 
 CLEAR_IOU = 0.25
 """3D IoU from which on a box has found an object, for MOTA, switches and fragmentations."""
@@ -230,7 +231,7 @@ def _frame(
 def _label_records(split: BoxSplit, frame_id: str) -> list[dict[str, Any]]:
     """A frame's label records with all their keys, where the frame has a file of its own."""
     path = split.labels_path / f"{frame_id}.json"
-    return list(json.loads(path.read_text(encoding="utf-8"))["boxes"]) if path.is_file() else []
+    return list(json.loads(read_text(path, DatasetError))["boxes"]) if path.is_file() else []
 
 
 def _number(value: Any, otherwise: float) -> float:

@@ -11,6 +11,7 @@ from torch import Tensor
 from asca_pillars.config import Config
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path
+from asca_pillars.input_files import require_content
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import unread
 from asca_pillars.models.openpcdet.links import Link, convert_state
@@ -56,6 +57,7 @@ def read_foreign(path: str | Path) -> ForeignWeights:
         TrainingError: no such file, damaged, or something else.
     """
     path = Path(path)
+    require_content(path, TrainingError)
     if not path.is_file():
         raise TrainingError(f"{path}: no such file; give a checkpoint of OpenPCDet or mmdetection3d (.pth)")
     try:

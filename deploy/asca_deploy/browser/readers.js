@@ -2,6 +2,10 @@
 
 const REFLECTANCE = ["intensity", "reflectance", "reflectivity", "i"];
 const AGAIN = "the file is damaged or incomplete";
+const MAX_HEADER_BYTES = 65536;
+const SPACE = "[ \\t\\n\\r\\v\\f]"; // of ASCII; \s is more, U+FEFF among it
+const WORDS = new RegExp(`${SPACE}+`);
+const LFS_POINTER = "version https://git-lfs";
 
 /**
  * Finite points of a file, and what was done to get them.
@@ -14,6 +18,9 @@ export function readScan(name, buffer) {
   const readers = { bin: readBin, pcd: readPcd };
   if (!Object.hasOwn(readers, suffix)) throw new Error(`${name}: scans are .bin and .pcd files`);
   if (buffer.byteLength === 0) throw new Error(`${name}: the file is empty`);
+  if (buffer.byteLength <= 1024 && text(new Uint8Array(buffer)).startsWith(LFS_POINTER)) {
+    throw new Error(`${name}: is a pointer of Git LFS, its content was not fetched; run git lfs pull`);
+  }
   try {
     return usable(readers[suffix](buffer));
   } catch (error) {
@@ -55,51 +62,71 @@ function plausible(values, columns) {
     const near = Math.max(Math.abs(x), Math.abs(y), Math.abs(z)) <= 1000;
     fitting += near && reflectance >= 0 && reflectance <= 65535;
   }
-  return fitting >= (0.99 * values.length) / columns;
+  return fitting / (values.length / columns) >= 0.99;
 }
 
-/** PCD 0.7: ascii, binary and binary_compressed. */
+/** PCD 0.7: ascii, binary and binary_compressed; keywords and types of either case. */
 function readPcd(buffer) {
-  const { header, body } = splitHeader(new Uint8Array(buffer));
-  const count = pointCount(header);
+  const { header, body, start } = splitHeader(new Uint8Array(buffer));
   const fields = pcdFields(header);
-  const encoding = (header.DATA ?? "").trim().toLowerCase();
-  const read = { ascii: asciiColumns, binary: binaryColumns, binary_compressed: compressedColumns }[encoding];
-  if (!read) throw new Error(`DATA is '${encoding}'; PCD knows ascii, binary and binary_compressed`);
+  const count = pointCount(header);
+  const encoding = header.DATA.join(" ").toLowerCase();
+  const readers = { ascii: asciiColumns, binary: binaryColumns, binary_compressed: compressedColumns };
+  if (!Object.hasOwn(readers, encoding)) {
+    throw new Error(`DATA is '${encoding}'; PCD knows ascii, binary and binary_compressed`);
+  }
   const names = fields.map(({ name }) => name.toLowerCase().replace(/^scalar_/, "")); // CloudCompare's scalar_Intensity
   const wanted = ["x", "y", "z"].map((name) => names.indexOf(name));
   if (wanted.includes(-1)) throw new Error(`no field x, y or z among ${names.join(", ")}`);
   const bright = REFLECTANCE.map((name) => names.indexOf(name)).find((index) => index >= 0);
-  for (const index of [...wanted, ...(bright === undefined ? [] : [bright])]) {
+  if (bright !== undefined) wanted.push(bright);
+  for (const index of wanted) {
+    const { count: values } = fields[index];
+    if (values !== 1) throw new Error(`${names[index]} has ${values} values per point; export one`);
     if (names.indexOf(names[index], index + 1) >= 0) throw new Error(`several fields ${names[index]}; export one`);
   }
-  const [x, y, z, reflectance] = read(body, fields, count, [...wanted, ...(bright === undefined ? [] : [bright])]);
-  const bytes = bright !== undefined && fields[bright].type !== "F" && fields[bright].size === 1;
+  const { columns, surplus } = readers[encoding](body, fields, count, wanted, start);
+  const [x, y, z, reflectance] = columns;
   const integers = bright !== undefined && fields[bright].type !== "F";
-  return { x, y, z, reflectance, bytes, integers, remarks: [] };
+  const remarks = surplus >= stride(fields) ? [`${surplus} bytes after the points were left out`] : [];
+  return { x, y, z, reflectance, bytes: integers && fields[bright].size === 1, integers, remarks };
 }
 
+const KEYS = ["VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"];
+const PAGE_BYTES = [4096, 8192, 16384, 32768, 65536]; // of memory
+const OLD_KEYS = { COLUMNS: "FIELDS" }; // as PCD's first version has it
+
+/** Words of each header line by its keyword, and the bytes after them, which begin at `start`. */
 function splitHeader(bytes) {
   const header = {};
-  let position = 0;
+  let position = bytes[0] === 0xef && bytes[1] === 0xbb && bytes[2] === 0xbf ? 3 : 0; // a byte-order mark
   while (!("DATA" in header)) {
     const end = bytes.indexOf(10, position);
-    if (end < 0 || end > 65536) throw new Error(`no DATA line in the header; ${AGAIN}`);
-    const line = new TextDecoder().decode(bytes.subarray(position, end)).trim();
-    const [key, ...words] = line.split(/\s+/);
-    if (key && !key.startsWith("#")) header[key] = words.join(" ");
+    if (end < 0 || end >= MAX_HEADER_BYTES) throw new Error(`no DATA line within ${MAX_HEADER_BYTES} bytes; ${AGAIN}`);
+    const [word, ...words] = wordsOf(text(bytes.subarray(position, end)));
     position = end + 1;
+    if (word === undefined || word.startsWith("#")) continue;
+    const key = Object.hasOwn(OLD_KEYS, word.toUpperCase()) ? OLD_KEYS[word.toUpperCase()] : word.toUpperCase();
+    if (!KEYS.includes(key)) throw new Error(`'${word.slice(0, 20)}' is not a line of a PCD header; ${AGAIN}`);
+    if (key in header) throw new Error(`two ${key} lines; correct the header`);
+    header[key] = words;
   }
-  return { header, body: bytes.slice(position) };
+  return { header, body: bytes.slice(position), start: position };
 }
+
+/** Bytes as characters, one each: Python splits them before it decodes them, too. */
+const text = (bytes) => new TextDecoder("latin1").decode(bytes);
+const wordsOf = (line) => line.split(WORDS).filter(Boolean);
+const wholeNumber = (word) => (/^[0-9]{1,18}$/.test(word) ? Number(word) : undefined);
+const stride = (fields) => fields.reduce((sum, field) => sum + field.size * field.count, 0);
 
 /** POINTS, which has to be WIDTH times HEIGHT where those are there too. */
 function pointCount(header) {
   const numbers = {};
   for (const key of ["POINTS", "WIDTH", "HEIGHT"]) {
     if (!(key in header)) continue;
-    if (!/^[0-9]{1,18}$/.test(header[key])) throw new Error(`${key} is no whole number; correct the header`);
-    numbers[key] = Number(header[key]);
+    numbers[key] = header[key].length === 1 ? wholeNumber(header[key][0]) : undefined;
+    if (numbers[key] === undefined) throw new Error(`${key} is not one whole number; correct the header`);
   }
   const { POINTS, WIDTH, HEIGHT = 1 } = numbers;
   if (POINTS === undefined && WIDTH === undefined) throw new Error("neither POINTS nor WIDTH in the header");
@@ -111,21 +138,30 @@ function pointCount(header) {
 }
 
 function pcdFields(header) {
-  const words = (key) => (header[key] ?? "").split(/\s+/).filter(Boolean);
-  const counts = "COUNT" in header ? words("COUNT").map(Number) : words("FIELDS").map(() => 1);
-  const sizes = words("SIZE").map(Number);
-  const types = words("TYPE");
+  const names = header.FIELDS ?? [];
+  const columns = { SIZE: header.SIZE ?? [], TYPE: header.TYPE ?? [], COUNT: header.COUNT ?? names.map(() => "1") };
+  for (const [key, column] of Object.entries(columns)) {
+    if (column.length === names.length) continue;
+    throw new Error(`${key} has ${column.length} values for ${names.length} FIELDS; correct the header`);
+  }
   let start = 0;
-  return words("FIELDS").map((name, index) => {
-    const field = { name, size: sizes[index], type: types[index], count: counts[index], start };
-    if (!READ[field.type]?.[field.size] || !(field.count >= 0)) throw new Error(`field ${name} is not described`);
+  return names.map((name, index) => {
+    const [size, type] = [columns.SIZE[index], columns.TYPE[index].toUpperCase()];
+    const count = wholeNumber(columns.COUNT[index]);
+    const known = Object.hasOwn(READ, type) && Object.hasOwn(READ[type], size);
+    if (!known || count === undefined) throw new Error(`field ${name} is not described; correct the header`);
+    const field = { name, size: Number(size), type, count, start };
     start += field.size * field.count;
     return field;
   });
 }
 
 const READ = {
-  F: { 4: (view, at) => view.getFloat32(at, true), 8: (view, at) => view.getFloat64(at, true) },
+  F: {
+    2: (view, at) => halfFloat(view.getUint16(at, true)),
+    4: (view, at) => view.getFloat32(at, true),
+    8: (view, at) => view.getFloat64(at, true),
+  },
   U: {
     1: (view, at) => view.getUint8(at),
     2: (view, at) => view.getUint16(at, true),
@@ -140,17 +176,22 @@ const READ = {
   },
 };
 
+function halfFloat(bits) {
+  const [sign, exponent, fraction] = [bits >> 15 ? -1 : 1, (bits >> 10) & 31, bits & 1023];
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
+}
+
 function asciiColumns(body, fields, count, wanted) {
-  const lines = new TextDecoder().decode(body).split("\n").filter((line) => line.trim());
+  const lines = text(body).split(/\r\n|\n|\r/).map(wordsOf).filter((words) => words.length);
   if (lines.length !== count) throw new Error(`${lines.length} lines where the header states ${count} points`);
   const starts = fields.map((_, index) => fields.slice(0, index).reduce((sum, field) => sum + field.count, 0));
   const width = fields.reduce((sum, field) => sum + field.count, 0);
-  const rows = lines.map((line, row) => {
-    const numbers = line.trim().split(/\s+/).map(asNumber);
-    if (numbers.length !== width) throw new Error(`point ${row} has ${numbers.length} values, not ${width}`);
-    return numbers;
+  const rows = lines.map((words, row) => {
+    if (words.length !== width) throw new Error(`point ${row} has ${words.length} values, not ${width}`);
+    return words.map(asNumber);
   });
-  return wanted.map((index) => Float64Array.from(rows, (numbers) => numbers[starts[index]]));
+  return { columns: wanted.map((index) => Float64Array.from(rows, (numbers) => numbers[starts[index]])), surplus: 0 };
 }
 
 /** A decimal number, nan or inf, as Python reads them; `Number` alone takes 0x10 and makes NaN of any other word. */
@@ -161,25 +202,38 @@ function asNumber(word) {
   throw new Error(`'${word.slice(0, 20)}' is no number; ${AGAIN}`);
 }
 
-function binaryColumns(body, fields, count, wanted) {
-  const last = fields[fields.length - 1];
-  const stride = last.start + last.size * last.count;
-  if (body.length < count * stride) throw new Error(`${body.length} bytes where ${count} points need ${count * stride}`);
-  return wanted.map((index) => readColumn(body, fields[index], count, fields[index].start, stride));
+/** Point after point. What follows them may be padding: zeros, or as many bytes as PCL up to 1.8 appends (pcd.py). */
+function binaryColumns(body, fields, count, wanted, start) {
+  const size = stride(fields);
+  const used = count * size;
+  if (body.length < used) throw new Error(`${body.length} bytes where ${count} points need ${used}; ${AGAIN}`);
+  const surplus = body.length - used;
+  const padded = PAGE_BYTES.includes(start + surplus) || body.subarray(used).every((byte) => byte === 0);
+  if (surplus >= size && !padded) {
+    throw new Error(`${body.length} bytes where the header states ${count} points of ${size}; correct the header`);
+  }
+  const columns = wanted.map((index) => readColumn(body, fields[index], count, fields[index].start, size));
+  return { columns, surplus };
 }
 
 /** Field after field, as one LZF stream behind its two sizes. */
 function compressedColumns(body, fields, count, wanted) {
-  const sizes = new DataView(body.buffer, body.byteOffset);
-  if (body.length < 8) throw new Error(`the compressed body is missing; ${AGAIN}`);
-  const last = fields[fields.length - 1];
-  const needed = count * (last.start + last.size * last.count);
-  if (sizes.getUint32(4, true) !== needed) throw new Error(`the header's points need ${needed} unpacked bytes; ${AGAIN}`);
-  const unpacked = lzfDecompress(body.subarray(8, 8 + sizes.getUint32(0, true)), needed);
-  return wanted.map((index) => {
+  let [unpacked, used] = [new Uint8Array(), 0];
+  if (count) {
+    if (body.length < 8) throw new Error(`the compressed body is missing; ${AGAIN}`);
+    const sizes = new DataView(body.buffer, body.byteOffset);
+    const needed = count * stride(fields);
+    const size = sizes.getUint32(4, true);
+    if (size !== needed) throw new Error(`${size} unpacked bytes where the points need ${needed}; ${AGAIN}`);
+    used = 8 + sizes.getUint32(0, true);
+    if (body.length < used) throw new Error(`${body.length} of ${used} compressed bytes are there; ${AGAIN}`);
+    unpacked = lzfDecompress(body.subarray(8, used), needed);
+  }
+  const columns = wanted.map((index) => {
     const field = fields[index];
-    return readColumn(unpacked, field, count, field.start * count, field.size * field.count);
+    return readColumn(unpacked, field, count, field.start * count, field.size);
   });
+  return { columns, surplus: body.length - used };
 }
 
 function readColumn(bytes, field, count, start, stride) {

@@ -75,17 +75,22 @@ def write_mcap(
     others: dict[str, str] | None = None,
     odometry: list[tuple[int, Any]] | None = None,
     chunk_size: int = 2000,
+    has_schema: bool = True,
+    **options: Any,
 ) -> Path:
-    """An MCAP with topics of (time, PointCloud2 message or raw bytes); `others` are topics of other types."""
+    """An MCAP with topics of (time, PointCloud2 message or raw bytes); `others` are topics of other types.
+
+    `options` are those of the writer.
+    """
     from mcap.writer import Writer
 
     one = store()
     definition, _ = one.generate_msgdef(CLOUD, ros_version=2)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=chunk_size)
+        writer = Writer(file, chunk_size=chunk_size, **options)
         writer.start(profile="ros2", library="test")
-        schema = writer.register_schema(CLOUD, "ros2msg", definition.encode())
+        schema = writer.register_schema(CLOUD, "ros2msg", definition.encode()) if has_schema else 0
         for topic, messages in topics.items():
             channel = writer.register_channel(topic, "cdr", schema)
             for time_ns, message in messages:

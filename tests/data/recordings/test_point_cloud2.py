@@ -57,6 +57,14 @@ def test_without_a_reflectance() -> None:
 def test_the_stamp_of_the_header_counts_and_the_recorded_time_where_there_is_none() -> None:
     assert read(laid_out(POINTS)).time_ns == START_NS
     assert read(laid_out(POINTS, time_ns=0), recorded_ns=77).time_ns == 77
+    for known in (read(laid_out(POINTS)), read(laid_out(POINTS, time_ns=0), recorded_ns=0)):
+        assert known.points.remarks == ()
+
+
+def test_a_time_that_is_nowhere_is_zero_and_said() -> None:
+    data = bytes(store().serialize_cdr(laid_out(POINTS, time_ns=0), CLOUD))
+    cloud = read_point_cloud(Message(None, data, "cdr"), "here")
+    assert cloud.time_ns == 0 and "time stamp" in cloud.points.remarks[0]
 
 
 def test_no_points() -> None:
@@ -70,6 +78,20 @@ def test_the_last_row_may_lack_its_padding() -> None:
     message.data = message.data[:-1]
     with pytest.raises(ScanError, match=r"here: \d+ bytes where 4 x 6 points of 16 bytes in rows of 104"):
         read(message)
+
+
+@pytest.mark.parametrize("row_step", [0, 1, 6, 16, 95, 97, 6 * 4 * 16, 2**32 - 1])
+@pytest.mark.parametrize("ros1", [False, True])
+def test_a_wrong_row_step_where_there_is_no_room_for_padding(row_step: int, ros1: bool) -> None:
+    """Drivers write the whole cloud's bytes, its width, or nothing."""
+    one = store(ros1)
+    message = point_cloud2(one, START_NS, POINTS)
+    message.height, message.width, message.row_step = 4, 6, row_step
+    if ros1:
+        cloud = read_point_cloud(Message(1, bytes(one.serialize_ros1(message, CLOUD)), "ros1"), "here")
+    else:
+        cloud = read(message)
+    assert np.array_equal(cloud.points.xyz, POINTS[:, :3])
 
 
 def test_ros1() -> None:

@@ -1,13 +1,18 @@
 """Which files are scans, in which order, and that no two of them get one name for their results."""
 
+import os
 import shutil
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
 from asca_pillars.data.insertion.prepared import require_writable
 from asca_pillars.data.scans.find_scans import find_scans, name_scans
+from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ScanError
+from asca_pillars.files import atomic_path
 
 
 def touch(root: Path, *names: str) -> Path:
@@ -39,6 +44,54 @@ def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> Non
     (scans / "again").symlink_to(scans)
     (real / "b" / "home").symlink_to(scans)
     assert [scan.relative_to(scans).as_posix() for scan in find_scans(scans)] == ["a/1.bin", "b/1.bin", "b/2.bin"]
+
+
+def test_folders_that_are_linked_crosswise_are_visited_once(tmp_path: Path) -> None:
+    folders = [tmp_path / str(number) for number in range(9)]  # 9! ways through them
+    for folder in folders:
+        touch(folder, "a.bin")
+    for folder in folders:
+        for other in folders:
+            (folder / f"to{other.name}").symlink_to(other)
+    assert names(tmp_path) == [f"{number}/a" for number in range(9)], "by the path without a link"
+
+
+def test_folders_deeper_than_python_calls_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    depth = 1200
+    monkeypatch.chdir(tmp_path)
+    for _ in range(depth):
+        Path("d").mkdir()
+        os.chdir("d")
+    Path("a.bin").touch()
+    monkeypatch.undo()
+    start = time.process_time()
+    (scan,) = name_scans([tmp_path])
+    assert len(scan.name.parts) == depth + 1
+    with atomic_path(tmp_path / "out" / scan.name) as temporary:
+        temporary.touch()
+    assert time.process_time() - start < 10  # 40 s before; no bar on speed
+    subprocess.run(["rm", "-r", tmp_path / "d", tmp_path / "out"], check=True)  # deeper than rmtree goes
+
+
+@pytest.mark.parametrize("letter", ["n", "ä"])
+def test_names_that_are_too_long_for_results_are_shortened(tmp_path: Path, letter: str) -> None:
+    longest = 251 // len(letter.encode()) * letter  # with its suffix 255 bytes
+    touch(tmp_path, f"{longest}.bin", f"{longest[:-1]}x.bin", f"{letter * 100}.bin")
+    found = names(tmp_path)
+    assert len(set(found)) == 3 and letter * 100 in found
+    for name in found:
+        with atomic_path(tmp_path / f"{name}_image.png") as temporary:
+            temporary.touch()
+        assert (tmp_path / f"{name}_image.png").exists()
+
+
+def test_links_to_nothing_are_named_when_they_are_read(tmp_path: Path) -> None:
+    """As git-annex and DVC leave them where the content was not fetched."""
+    touch(tmp_path, "1.bin")
+    (tmp_path / "2.bin").symlink_to(tmp_path / "content")
+    assert names(tmp_path) == ["1", "2"]
+    with pytest.raises(ScanError, match=r"2\.bin: cannot be read \(No such file"):
+        read_scan(tmp_path / "2.bin")
 
 
 def test_what_was_prepared_for_training_holds_no_scans(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""LZF, which compressed PCD files are packed with, against streams made by hand."""
+"""PCD files at the edge of what is read, and LZF, which compressed ones are packed with, by hand."""
 
 import struct
 
@@ -6,7 +6,24 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.scans.pcd import lzf_decompress
+from asca_pillars.errors import ScanError
+from tests.data.scans.pcd_cases import READ, REFUSED
 from tests.data.scans.test_scan_reader import literal_lzf, read
+
+
+@pytest.mark.parametrize("case", READ, ids=lambda case: case.name)
+def test_what_is_read(tmp_path, case):
+    scan = read(tmp_path, "a.pcd", case.content)
+    np.testing.assert_array_equal(scan.points, case.points)
+    assert bool(scan.notes.remarks) == case.has_padding
+    assert all("bytes after the points were left out" in remark for remark in scan.notes.remarks)
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=lambda case: case.name)
+def test_what_is_refused(tmp_path, case):
+    with pytest.raises(ScanError, match=r"a\.pcd"):
+        read(tmp_path, "a.pcd", case.content)
+
 
 # --- LZF
 
@@ -55,8 +72,3 @@ def test_compressed_pcd_with_references(tmp_path):
     header = "FIELDS z y x\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary_compressed\n"
     scan = read(tmp_path, "a.pcd", header.encode() + struct.pack("<2I", len(stream), 24) + stream)
     np.testing.assert_array_equal(scan.points, [[1, 1, 1, 0]] * 2)
-
-
-def test_columns_is_the_old_name_of_fields(tmp_path):
-    header = "COLUMNS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
-    np.testing.assert_array_equal(read(tmp_path, "a.pcd", header.encode() + b"1 2 3\n").points, [[1, 2, 3, 0]])
