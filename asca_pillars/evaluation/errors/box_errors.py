@@ -119,6 +119,11 @@ class DetectionMatch:
     kind: str
     label: str
 
+    @property
+    def is_false(self) -> bool:
+        """Whether it counts and is false."""
+        return self.reported and self.kind in FALSE_KINDS
+
 
 def least_iou(class_name: str) -> float:
     """The overlap from above from which on an object counts as found."""

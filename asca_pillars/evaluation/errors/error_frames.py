@@ -1,24 +1,26 @@
 """Frames as the error analysis takes them: points, labels and detections of one frame, the sensor at the origin."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, read_labels
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.evaluation.boxes.box_predictions import BoxFrames
+from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
 from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
 from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares
 from asca_pillars.evaluation.kitti.score_threshold import DONT_CARE_SHARE
 from asca_pillars.evaluation.kitti.states import KittiState, detection_states, truth_states
-from asca_pillars.evaluation.predictions import KITTI_TYPES, ScoredFrames
+from asca_pillars.evaluation.predictions import KITTI_TYPES
 from asca_pillars.geometry.boxes import points_in_boxes
 
 UNKNOWN_OCCLUSION = -1
-_DIFFICULTY = "moderate"
+DIFFICULTY = "moderate"
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class ErrorFrame:
         truncated: (M,) 0..1, 0 where unknown.
         object_points: (M,) points in each box.
         counted: (M,) objects that are to be found: within the protocol's limits and with a point inside.
-        found: (D,) detected boxes.
+        found: (D, 7) detected boxes.
         found_types: of the detections.
         scores: (D,).
         excused: (D,) detections that are no error wherever they stand: in a DontCare area, or smaller in the image than
@@ -55,81 +57,115 @@ class ErrorFrame:
     excused: NDArray[np.bool_]
 
 
-def kitti_error_frames(
-    split: KittiSplit, labels: Path, predictions: Path, scored: ScoredFrames, class_names: Sequence[str]
-) -> Iterator[ErrorFrame]:
+class ErrorFrames(Protocol):
+    """The frames of an evaluation, read one by one: points of a thousand scans need not fit in memory."""
+
+    @property
+    def frame_ids(self) -> Sequence[str]:
+        """Sorted."""
+
+    def read(self, frame_id: str) -> ErrorFrame:
+        """One frame; DatasetError or ScanError if a file of it is missing or damaged."""
+
+
+@dataclass(frozen=True)
+class KittiErrorFrames:
     """Frames of KITTI's layout with predictions as KITTI text; objects count within the limits of moderate.
 
-    Args:
-        split: the scans and calibrations.
+    Attributes:
+        split: scans and calibrations.
         labels, predictions: folders of the text.
-        scored: which frames have predictions.
         class_names: classes that are evaluated.
-
-    Raises:
-        DatasetError, ScanError: a file is missing or damaged.
+        frame_ids: those with predictions, sorted.
     """
-    known = {name.casefold(): name for name in (*KITTI_TYPES, *class_names)}
-    for frame in scored.truth:
-        frame_id = frame.frame_id
-        calibration = split.calibration(frame_id)
-        truth = [item for item in read_labels(labels / f"{frame_id}.txt") if item.has_box_3d]
-        areas = [item for item in read_labels(labels / f"{frame_id}.txt") if not item.has_box_3d]
-        found = [item for item in read_labels(predictions / f"{frame_id}.txt") if item.has_box_3d]
-        points = split.points(frame_id, camera_view=True)
+
+    split: KittiSplit
+    labels: Path
+    predictions: Path
+    class_names: tuple[str, ...]
+    frame_ids: tuple[str, ...]
+
+    def read(self, frame_id: str) -> ErrorFrame:
+        """One frame; types are spelt as KITTI and `class_names` spell them."""
+        calibration = self.split.calibration(frame_id)
+        labelled = read_labels(self.labels / f"{frame_id}.txt")
+        truth = [item for item in labelled if item.has_box_3d]
+        found = [item for item in read_labels(self.predictions / f"{frame_id}.txt") if item.has_box_3d]
+        points = self.split.points(frame_id, camera_view=True)
         boxes = boxes_from_objects(truth, calibration).astype(np.float64)
         inside = points_in_boxes(points, boxes).sum(axis=0)
         flat_truth, flat_found = frame_objects(frame_id, truth), frame_objects(frame_id, found)
-        yield ErrorFrame(
-            frame_id,
-            points,
-            boxes,
-            tuple(known.get(item.type.casefold(), item.type) for item in truth),
-            flat_truth.occluded.astype(np.int64),
-            flat_truth.truncated,
-            inside,
-            _counted(flat_truth, class_names) & (inside > 0),
-            boxes_from_objects(found, calibration).astype(np.float64),
-            tuple(known.get(item.type.casefold(), item.type) for item in found),
-            flat_found.scores,
-            _excused(flat_found, frame_objects(frame_id, areas)),
+        flat_areas = frame_objects(frame_id, [item for item in labelled if not item.has_box_3d])
+        return ErrorFrame(
+            frame_id=frame_id,
+            points=points,
+            objects=boxes,
+            types=tuple(self._spelling.get(item.type.casefold(), item.type) for item in truth),
+            occluded=flat_truth.occluded.astype(np.int64),
+            truncated=np.maximum(flat_truth.truncated, 0.0),
+            object_points=inside,
+            counted=_counted(flat_truth, self.class_names) & (inside > 0),
+            found=boxes_from_objects(found, calibration).astype(np.float64),
+            found_types=tuple(self._spelling.get(item.type.casefold(), item.type) for item in found),
+            scores=flat_found.scores,
+            excused=_excused(flat_found, flat_areas),
         )
 
+    @cached_property
+    def _spelling(self) -> dict[str, str]:
+        return {name.casefold(): name for name in (*KITTI_TYPES, *self.class_names)}
 
-def box_error_frames(split: LabeledSplit, scored: BoxFrames) -> Iterator[ErrorFrame]:
+
+@dataclass(frozen=True)
+class BoxErrorFrames:
     """Frames of any layout with boxes in the LiDAR frame; an object counts if it holds a point.
 
-    Raises:
-        ScanError: a scan is missing or damaged.
+    Attributes:
+        split: the scans.
+        frames: labels and predictions, in the frame of `split.points`.
     """
-    change = split.to_sensor
-    for frame in scored.frames:
-        points = change.points(split.points(frame.frame_id, camera_view=False))
+
+    split: LabeledSplit
+    frames: tuple[EvaluatedFrame, ...]
+
+    @cached_property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Those with predictions, sorted."""
+        return tuple(sorted(self._by_id))
+
+    def read(self, frame_id: str) -> ErrorFrame:
+        """One frame; occlusion is unknown."""
+        frame, change = self._by_id[frame_id], self.split.to_sensor
+        points = change.points(self.split.points(frame_id, camera_view=False))
         objects = change.boxes(np.asarray(frame.objects)).astype(np.float64)
         inside = points_in_boxes(points, objects).sum(axis=0)
-        yield ErrorFrame(
-            frame.frame_id,
-            points,
-            objects,
-            tuple(frame.object_types),
-            np.full(len(objects), UNKNOWN_OCCLUSION),
-            np.zeros(len(objects)),
-            inside,
-            inside > 0,
-            change.boxes(np.asarray(frame.found)).astype(np.float64),
-            tuple(frame.found_types),
-            np.asarray(frame.scores, np.float64),
-            np.zeros(len(frame.found), bool),
+        return ErrorFrame(
+            frame_id=frame_id,
+            points=points,
+            objects=objects,
+            types=tuple(frame.object_types),
+            occluded=np.full(len(objects), UNKNOWN_OCCLUSION),
+            truncated=np.zeros(len(objects)),
+            object_points=inside,
+            counted=inside > 0,
+            found=change.boxes(np.asarray(frame.found)).astype(np.float64),
+            found_types=tuple(frame.found_types),
+            scores=np.asarray(frame.scores, np.float64),
+            excused=np.zeros(len(frame.found), bool),
         )
+
+    @cached_property
+    def _by_id(self) -> dict[str, EvaluatedFrame]:
+        return {frame.frame_id: frame for frame in self.frames}
 
 
 def _counted(truth: FrameObjects, class_names: Sequence[str]) -> NDArray[np.bool_]:
     counted = np.zeros(len(truth), bool)
     for name in class_names:
-        counted |= truth_states(truth, name, _DIFFICULTY) == KittiState.COUNTED
+        counted |= truth_states(truth, name, DIFFICULTY) == KittiState.COUNTED
     return counted
 
 
 def _excused(found: FrameObjects, areas: FrameObjects) -> NDArray[np.bool_]:
-    low = detection_states(found, "", _DIFFICULTY) == KittiState.IGNORED
+    low = detection_states(found, "", DIFFICULTY) == KittiState.IGNORED  # too low for any class
     return np.asarray(low | (dont_care_shares(Frames.join([areas], [found])) > DONT_CARE_SHARE))

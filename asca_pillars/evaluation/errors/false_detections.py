@@ -1,8 +1,8 @@
 """What stands where a detection is false: height, brightness, points, and what is beside it.
 
-Everything is measured on the points of the scan that lie above the ground, whatever they belong to. A detection may have
-several traits or none. The traits of persons and of vehicles are the same; only their meaning differs: a person that
-goes on above 2.3 m is a post or a trunk, a car that does is a van, a wall or a hedge.
+Everything is measured on the points of the scan that lie above the ground, whatever they belong to. A detection may
+have several traits or none. The traits are the same for every class, and mean different things: where a person is
+detected and points go on to more than 2.3 m stands a post or a trunk, where a car is, a van, a wall or a hedge.
 """
 
 from collections.abc import Sequence
@@ -81,15 +81,17 @@ class Surroundings:
         return tuple(name for name in TRAITS if holds[name])
 
 
-def describe(points: NDArray[np.float32], ground: Ground | None, boxes: NDArray[np.floating]) -> Sequence[Surroundings]:
-    """Describe what stands at boxes (K, 7) of a scan (N, 4), metres, the sensor at the origin.
+def describe(
+    points: NDArray[np.float32], ground: Ground | None, boxes: Sequence[NDArray[np.float64]]
+) -> list[Surroundings]:
+    """Describe what stands at K boxes (7,) in a scan (N, 4), metres, the sensor at the origin.
 
     Args:
         points: x, y, z, reflectance.
         ground: `data.insertion.ground_fit.fit_ground` of the points; without it the ground is each box's own bottom.
         boxes: of detections.
     """
-    return [_describe_one(points, ground, box) for box in boxes.astype(np.float64)]
+    return [_describe_one(points, ground, box) for box in boxes]
 
 
 def _describe_one(points: NDArray[np.float32], ground: Ground | None, box: NDArray[np.float64]) -> Surroundings:

@@ -5,7 +5,8 @@ simulated dataset with a real one, or the drives of a real one with each other.
 
 Everything is measured along a box's own axes. The ray-facing axis is the heading or its opposite, whichever points away
 from the sensor: along it the near face comes first and the far face last. Objects of at least VEHICLE_LENGTH_M are
-measured end-on only, where the visible flank and the visible end tell length and width apart.
+measured end-on only, where the visible flank and the visible end tell length and width apart; of smaller ones, which
+are seen as a whole, the range is measured.
 """
 
 from typing import NamedTuple
@@ -76,9 +77,11 @@ def label_fit(points: NDArray[np.floating], boxes: NDArray[np.floating]) -> NDAr
         if not 0 < distance <= MAX_RANGE_M:
             continue
         near = _points_near(points, box)
-        values = _range_statistics(near, box)
-        if box[3] >= VEHICLE_LENGTH_M and view_angle_deg(box[None])[0] < END_ON_DEG:
-            values |= _end_on_statistics(near, box, distance)
+        values: dict[str, float] = {}
+        if box[3] < VEHICLE_LENGTH_M:
+            values = _range_statistics(near, box)
+        elif view_angle_deg(box[None])[0] < END_ON_DEG:
+            values = _end_on_statistics(near, box, distance)
         row[:] = [values.get(name, np.nan) for name in STATISTICS]
     return result
 
