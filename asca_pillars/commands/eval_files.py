@@ -7,6 +7,7 @@ from rich.console import Console
 
 from asca_pillars.commands.writable_file import require_writable
 from asca_pillars.evaluation import gallery
+from asca_pillars.evaluation.errors.error_report import remove_errors
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.files import atomic_path, remove_directory, require_own, require_replaceable, write_json
 
@@ -37,6 +38,8 @@ def write_report(
 ) -> None:
     """Print a report; write `name`.json and `name`.md below `out`, and the JSON to `json_path`, too.
 
+    An earlier evaluation's analysis of errors is removed.
+
     Args:
         name: of the files.
         page: what is printed and written as Markdown.
@@ -51,6 +54,7 @@ def write_report(
     """
     page.print(console)
     _remove_predictions_of_another(out, scored)
+    remove_errors(out)
     write_json(out / f"{name}.json", content)
     with atomic_path(out / f"{name}.md") as temporary:
         temporary.write_text(page.markdown(), encoding="utf-8")
