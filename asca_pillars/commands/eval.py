@@ -114,7 +114,7 @@ def evaluate(
 
     from asca_pillars.commands import eval_steps as steps
     from asca_pillars.commands.eval_arguments import EvalArguments, check_arguments, default_protocol
-    from asca_pillars.commands.eval_errors import prepare_errors
+    from asca_pillars.commands.eval_errors import prepare_errors, who_predicted
     from asca_pillars.commands.eval_files import claim
     from asca_pillars.commands.models import open_model
     from asca_pillars.data.kitti import KittiSplit
@@ -151,7 +151,7 @@ def evaluate(
     if predictions is not None:
         if errors:
             assert frames_of is not None, "checked with the arguments"
-            analysis = prepare_errors(predictions.name, frames_of, errors_by, beside)
+            analysis = prepare_errors(who_predicted(predictions), frames_of, errors_by, beside)
         task = steps.text_task(predictions, labels, frames_of, score)
     else:
         assert frames_of is not None, "checked with the arguments"

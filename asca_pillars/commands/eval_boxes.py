@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_errors import prepare_errors, report_errors
+from asca_pillars.commands.eval_errors import prepare_errors, report_errors, who_predicted
 from asca_pillars.commands.eval_files import COMMAND, MADE_BY, claim, write_report
 from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
@@ -58,7 +58,9 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
         class_names = model.spec.class_names
         subject, about = f"{model.name} on {task.data}, {task.split}", about | {"model": model.about}
     else:
-        analysis = prepare_errors(predictions.name, split, task.errors_by, task.beside) if task.errors else None
+        analysis = (
+            prepare_errors(who_predicted(predictions), split, task.errors_by, task.beside) if task.errors else None
+        )
         frames = read_box_predictions(predictions, split, console=console)
         class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.found_types}))
         scores = dict.fromkeys(class_names, TEXT_SCORE if task.score is None else task.score)

@@ -1,11 +1,13 @@
 """The steps of `asca eval --errors`: which rows stand beside those of the data, and the report."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from asca_pillars.commands.eval_files import MADE_BY
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
 from asca_pillars.evaluation.errors.error_report import ErrorReport, parts_of, read_report, write_errors
@@ -43,6 +45,15 @@ def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: list[P
     parts = {} if by is None else parts_of(root, split.name, split.frame_ids, by)
     named = {f"{where}/{part}": ids for part, ids in parts.items()}
     return ErrorAnalysis(f"{where}/{split.name}", named, tuple(read_report(path) for path in beside or ()))
+
+
+def who_predicted(predictions: Path) -> str:
+    """The model's name where `asca eval` wrote the predictions, else that of the file or folder."""
+    made_by = (predictions if predictions.is_dir() else predictions.parent) / MADE_BY
+    try:
+        return str(json.loads(made_by.read_text(encoding="utf-8"))["model"]["name"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return predictions.name
 
 
 def report_errors(

@@ -20,7 +20,7 @@ def raising(error: BaseException) -> Callable[[], None]:
 
 @pytest.fixture(autouse=True)
 def _script(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["benchmarks/transfer.py"])
+    monkeypatch.setattr(sys, "argv", ["benchmarks/memory.py"])
 
 
 @pytest.mark.parametrize(

@@ -79,12 +79,10 @@ def crop_svg(points: NDArray[np.float32], ground: Ground | None, boxes: Sequence
     along, across = offset @ axis, offset @ _right_of(axis)
     depth, right = offset @ sight, offset @ _right_of(sight)
     inside = (np.abs(along) < half[0] + 0.3) & (np.abs(across) < half[1] + 0.3)
-    flat = [(one, footprints(one.box[None])[0] - middle[:2]) for one in boxes]
-    ways = {
-        "above": np.stack([_right_of(sight), sight], axis=1),
-        "side": axis[:, None],
-        "sensor": _right_of(sight)[:, None],
-    }
+    corners = [footprints(one.box[None])[0] - middle[:2] for one in boxes]
+    upwards = np.stack([_right_of(sight), sight], axis=1)
+    outlines = [(_style(one), place @ upwards) for one, place in zip(boxes, corners, strict=True)]
+    outlines += [(_style(one), _arrow(one, middle) @ upwards) for one in boxes]
     panes = [
         _Pane(
             np.stack([right, depth], axis=1)[standing],
@@ -92,25 +90,21 @@ def crop_svg(points: NDArray[np.float32], ground: Ground | None, boxes: Sequence
             (reach, reach),
             inside[standing],
             bright[standing],
-            [(_style(one), corners @ ways["above"]) for one, corners in flat]
-            + [(_style(one), _arrow(one, middle) @ ways["above"]) for one in boxes],
+            outlines,
         )
     ]
-    for way, horizontal, strong in (
-        ("side", along, np.abs(across) < half[1] + 0.3),
-        ("sensor", right, np.abs(depth) < np.abs(sight @ np.stack([axis, _right_of(axis)]).T) @ half + 0.5),
+    half_depth = abs(sight @ axis) * half[0] + abs(sight @ _right_of(axis)) * half[1] + 0.5
+    for direction, horizontal, strong in (
+        (axis, along, np.abs(across) < half[1] + 0.3),
+        (_right_of(sight), right, np.abs(depth) < half_depth),
     ):
-        outlines = [(_style(one), _upright(corners @ ways[way], one.box, floor)) for one, corners in flat if one.main]
-        panes.append(
-            _Pane(
-                np.stack([horizontal, height], axis=1),
-                (-reach, _LOW_M),
-                (reach, _HIGH_M),
-                strong & standing,
-                bright,
-                outlines,
-            )
-        )
+        outlines = [
+            (_style(one), _upright(place @ direction, one.box, floor))
+            for one, place in zip(boxes, corners, strict=True)
+            if one.main
+        ]
+        heights = np.stack([horizontal, height], axis=1)
+        panes.append(_Pane(heights, (-reach, _LOW_M), (reach, _HIGH_M), strong & standing, bright, outlines))
     return _svg(panes, round(100 * reach))
 
 
@@ -130,7 +124,7 @@ def _arrow(one: DrawnBox, middle: _Doubles) -> _Doubles:
 
 
 def _upright(horizontal: _Doubles, box: _Doubles, floor: float) -> _Doubles:
-    """(4, 2) rectangle of a box whose corners (4, 1) are seen from the side."""
+    """(4, 2) rectangle of a box seen from the side, from its corners' places (4,) to the right."""
     left, right = float(horizontal.min()), float(horizontal.max())
     bottom, top = (float(box[2] + side * box[5] / 2 - floor) for side in (-1, 1))
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
@@ -143,8 +137,8 @@ def _svg(panes: Sequence[_Pane], reach_cm: int) -> str:
     parts = [f'<svg viewBox="0 0 {total} {tall}" role="img">']
     for number, pane in enumerate(panes):
         own_tall = round(100 * (pane.high[1] - pane.low[1]))
-        at = f"{number * (width + _GAP_CM)} {tall - own_tall}"
-        parts.append(f'<svg x="{at.split()[0]}" y="{at.split()[1]}" width="{width}" height="{own_tall}">')
+        left, top = number * (width + _GAP_CM), tall - own_tall
+        parts.append(f'<svg x="{left}" y="{top}" width="{width}" height="{own_tall}">')
         parts.append(f'<rect class="pane" width="{width}" height="{own_tall}"/>')
         if pane.low[1] == _LOW_M:
             ground = round(100 * pane.high[1])

@@ -19,9 +19,12 @@ h2 { margin-top: 2.5rem; border-bottom: 1px solid var(--line); }
 table { border-collapse: collapse; font-size: 12px; font-variant-numeric: tabular-nums; }
 th, td { padding: .2rem .5rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th.name, td.name { text-align: left; }
+tr.first td { border-top: 2px solid var(--soft); }
+summary { cursor: pointer; font-weight: 600; margin: 1rem 0; }
 th button { all: unset; cursor: pointer; font-weight: 600; }
 th button:focus-visible { outline: 2px solid var(--near); }
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(34rem, 1fr)); gap: 1rem; }
+a { color: var(--near); }
 figure { margin: 0; }
 figcaption, .notes, .legend { color: var(--soft); font-size: 12px; }
 figcaption b { color: var(--text); }
@@ -29,9 +32,9 @@ svg { width: 100%; height: auto; }
 svg svg { overflow: hidden; }
 path, polygon { fill: none; stroke-linecap: round; }
 .pane { fill: var(--pane); }
-.far { stroke: var(--far); stroke-width: 5; }
-.near { stroke: var(--near); stroke-width: 7; }
-.bright { stroke: var(--bright); stroke-width: 8; }
+.far { stroke: var(--far); stroke-width: 6; }
+.near { stroke: var(--near); stroke-width: 9; }
+.bright { stroke: var(--bright); stroke-width: 11; }
 .ground { stroke: var(--line); stroke-width: 2; }
 .label { stroke: var(--label); stroke-width: 5; }
 .detection { stroke: var(--detection); stroke-width: 5; }
@@ -52,6 +55,7 @@ document.querySelectorAll('th button').forEach(button => button.addEventListener
   const order = cell.className === 'name'
     ? (a, b) => text(a).localeCompare(text(b))
     : (a, b) => number(text(a)) - number(text(b));
+  table.querySelectorAll('tr.first').forEach(row => row.classList.remove('first'));
   [...table.tBodies[0].rows].sort((a, b) => (up ? 1 : -1) * order(a, b)).forEach(row => table.tBodies[0].append(row));
 }));
 document.querySelector('#order').addEventListener('change', event => {
@@ -73,20 +77,18 @@ _ORDERS = {
 def error_page(
     title: str,
     tables: Sequence[TextTable],
+    more: Sequence[TextTable],
     notes: Sequence[str],
     sections: Sequence[CaseSection],
-    pictures: Sequence[Sequence[str]],
-    frame_ids: Sequence[str],
 ) -> str:
     """The page as HTML.
 
     Args:
         title: what was evaluated.
         tables: as they are printed.
+        more: tables that are folded away.
         notes: definitions.
-        sections: cases to look at.
-        pictures: of each case of each section, SVG.
-        frame_ids: names of the frames that the cases' numbers mean.
+        sections: cases with pictures (`worst_cases.draw_cases`).
     """
     names = dict.fromkeys(section.class_name for section in sections)
     links = " · ".join(f'<a href="#{_anchor(name)}">{escape(name)}</a>' for name in names)
@@ -96,9 +98,12 @@ def error_page(
         '<!doctype html><html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-        f"<title>{escape(title)}: errors</title><style>{_STYLE}</style></head><body>",
-        f"<h1>{escape(title)}: errors</h1><p>Pictures: {links}</p>",
+        f"<title>{escape(title)}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{escape(title)}</h1><p>Pictures: {links}</p>",
         *map(_table, tables),
+        "<details><summary>By distance, occlusion, points and neighbors</summary>",
+        *map(_table, more),
+        "</details>",
         f'<ul class="notes">{"".join(f"<li>{escape(note)}</li>" for note in notes)}</ul>',
         '<h2>Pictures</h2><p><label>Order <select id="order">',
         f"{orders}</select></label></p>",
@@ -109,12 +114,12 @@ def error_page(
         'depth; <span style="color:var(--bright)">bright ones</span> (reflectance of 0.5 or more).</p>',
     ]
     seen: set[str] = set()
-    for section, drawn in zip(sections, pictures, strict=True):
+    for section in sections:
         if section.class_name not in seen:
             seen.add(section.class_name)
             parts.append(f'<h2 id="{_anchor(section.class_name)}">{escape(section.class_name)}</h2>')
-        figures = [_figure(case, frame_ids[case.frame], svg) for case, svg in zip(section.cases, drawn, strict=True)]
-        parts.append(f'<h3>{escape(section.title)}</h3><div class="grid">{"".join(figures)}</div>')
+        figures = "".join(map(_figure, section.cases))
+        parts.append(f'<h3>{escape(section.title)}</h3><div class="grid">{figures}</div>')
     return "\n".join([*parts, f"<script>{_SCRIPT}</script></body></html>", ""])
 
 
@@ -128,7 +133,12 @@ def _table(table: TextTable) -> str:
         f'<th class="{kind}" scope="col"><button>{escape(title)}</button></th>'
         for kind, title in zip(kinds, table.columns, strict=True)
     )
-    body = "".join(f"<tr>{_cells(kinds, row)}</tr>" for row in table.rows)
+    before = ("", *(row[0] for row in table.rows[:-1]))
+    first = [row[0] != name for row, name in zip(table.rows, before, strict=True)]
+    body = "".join(
+        f"<tr{' class=first' if starts else ''}>{_cells(kinds, row)}</tr>"
+        for starts, row in zip(first, table.rows, strict=True)
+    )
     return (
         f'<h3>{escape(table.title)}</h3><div class="wide"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
@@ -139,10 +149,10 @@ def _cells(kinds: Sequence[str], row: Sequence[str]) -> str:
     return "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in zip(kinds, row, strict=True))
 
 
-def _figure(case: Case, frame_id: str, svg: str) -> str:
+def _figure(case: Case) -> str:
     data = f'data-error="{case.error:g}" data-score="{case.score:g}" data-distance="{case.distance_m:g}" '
     data += f'data-points="{case.points}" data-frame="{case.frame}"'
     score = f"score {case.score:.2f}, " if case.score else ""
     place = f"{score}{case.distance_m:.0f} m, {case.points} points"
     texts = "; ".join(map(escape, case.texts))
-    return f"<figure {data}>{svg}<figcaption><b>{escape(frame_id)}</b> {place}; {texts}</figcaption></figure>"
+    return f"<figure {data}>{case.svg}<figcaption><b>{escape(case.frame_id)}</b> {place}; {texts}</figcaption></figure>"

@@ -14,7 +14,7 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
 from asca_pillars.evaluation.errors.error_page import error_page
 from asca_pillars.evaluation.errors.error_summary import DatasetErrors, match_frames, summarize
-from asca_pillars.evaluation.errors.error_tables import error_notes, error_tables
+from asca_pillars.evaluation.errors.error_tables import PRINTED_NOTES, error_notes, error_tables, group_tables
 from asca_pillars.evaluation.errors.worst_cases import draw_cases, worst_cases
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.files import atomic_path, write_json
@@ -127,14 +127,15 @@ def write_errors(
     own = summarize(matches, name, parts, console=console)
     datasets = [*own, *(data for report in beside for data in report.datasets)]
     sections = worst_cases(matches)
-    pictures = draw_cases(frames, matches, sections, console=console)
-    notes, tables = error_notes(datasets), error_tables(datasets, brief=False)
-    ReportPage(f"{subject}: errors", error_tables(datasets, brief=True), notes[:4]).print(console)
+    pictured = draw_cases(frames, matches, sections, console=console)
+    notes, tables, more = error_notes(datasets), error_tables(datasets), group_tables(datasets)
+    title = f"{subject}: errors"
+    ReportPage(title, tables, notes[:PRINTED_NOTES]).print(console)
     write_json(out / JSON, to_dict(ErrorReport(subject, tuple(own), about)))
     with atomic_path(out / MARKDOWN) as temporary:
-        temporary.write_text(ReportPage(f"{subject}: errors", tables, notes).markdown(), encoding="utf-8")
+        temporary.write_text(ReportPage(title, [*tables, *more], notes).markdown(), encoding="utf-8")
     with atomic_path(out / PAGE) as temporary:
-        page = error_page(subject, tables, notes, sections, pictures, matches.frame_ids)
+        page = error_page(title, tables, more, notes, pictured)
         temporary.write_text(page, encoding="utf-8")
 
 

@@ -343,7 +343,8 @@ def _groups(objects: Sequence[ObjectMatch]) -> dict[str, _Mask]:
     groups = {ALL: counted, CLEAR: clear} | {name: clear & (view == name) for name in VIEWS}
     groups |= {_band(low, high, "m"): counted & _within(distance, low, high) for low, high in pairwise(DISTANCES_M)}
     groups |= {name: occluded == state for state, name in enumerate(OCCLUSIONS)}
-    groups |= {_band(low, high, "points"): counted & _within(points, low, high) for low, high in pairwise(POINTS)}
+    for low, high in pairwise(POINTS):
+        groups[_band(low, high - 1, "points")] = counted & _within(points, low, high)
     for low, high in pairwise(NEIGHBORS_M):
         groups[f"next one at {_band(low, high, 'm')}"] = counted & _within(neighbor, low, high)
     return groups

@@ -20,6 +20,8 @@ from asca_pillars.evaluation.errors.false_detections import TRAITS
 from asca_pillars.evaluation.errors.label_fit import END_ON_DEG, MAX_RANGE_M, STATISTICS
 from asca_pillars.evaluation.report_page import TextTable
 
+PRINTED_NOTES = 4
+"""How many of the notes are needed to read the first tables; the others say what traits and statistics are."""
 _NONE = "-"
 _BOX_COLUMNS = (
     "near_end",
@@ -42,23 +44,24 @@ _TITLES = {
 }
 
 
-def error_tables(datasets: Sequence[DatasetErrors], *, brief: bool) -> list[TextTable]:
-    """Box errors, 3D overlap, false detections and label fit of datasets side by side.
-
-    Args:
-        datasets: in the order of the rows.
-        brief: leave out the groups by distance, occlusion, points and neighbors.
-    """
-    names = list(dict.fromkeys(one.class_name for data in datasets for one in data.classes))
-    tables = [_box_table(datasets, name, brief) for name in names]
+def error_tables(datasets: Sequence[DatasetErrors]) -> list[TextTable]:
+    """Box errors by view, 3D overlap, false detections and label fit; datasets are rows in their order."""
+    names = _class_names(datasets)
+    tables = [_box_table(datasets, name, main=True) for name in names]
     tables += [_reaching_table(datasets, names), _false_table(datasets, names), _background_table(datasets, names)]
     tables.append(_fit_table(datasets, names))
     return [table for table in tables if table.rows]
 
 
+def group_tables(datasets: Sequence[DatasetErrors]) -> list[TextTable]:
+    """Box errors by distance, occlusion, points and neighbors."""
+    tables = [_box_table(datasets, name, main=False) for name in _class_names(datasets)]
+    return [table for table in tables if table.rows]
+
+
 def error_notes(datasets: Sequence[DatasetErrors]) -> list[str]:
     """Definitions that one must know to read the tables."""
-    names = list(dict.fromkeys(one.class_name for data in datasets for one in data.classes))
+    names = _class_names(datasets)
     overlaps = ", ".join(f"{name} {least_iou(name):g}" for name in names)
     return [
         "Errors are predicted minus label in metres: median ± half of its 95 % interval (half of what lies between the "
@@ -76,19 +79,24 @@ def error_notes(datasets: Sequence[DatasetErrors]) -> list[str]:
     ]
 
 
-def _box_table(datasets: Sequence[DatasetErrors], name: str, brief: bool) -> TextTable:
+def _class_names(datasets: Sequence[DatasetErrors]) -> list[str]:
+    return list(dict.fromkeys(one.class_name for data in datasets for one in data.classes))
+
+
+def _box_table(datasets: Sequence[DatasetErrors], name: str, *, main: bool) -> TextTable:
     found = [(data.name, _class_of(data, name)) for data in datasets]
     groups = dict.fromkeys(group.group for _, one in found if one is not None for group in one.groups)
     rows = [
         (group, title, *_group_cells(own))
         for group in groups
-        if not brief or group in MAIN_GROUPS
+        if (group in MAIN_GROUPS) is main
         for title, one in found
         if (own := _group_of(one, group)) is not None
     ]
     titles = (_TITLES.get(column, column.replace("_", " ")) for column in _BOX_COLUMNS)
     columns = ("objects", "dataset", "n", "recall", "below score", "boxes", *titles)
-    return TextTable(f"{name}: errors of boxes", columns, tuple(rows))
+    by = "view" if main else "distance, occlusion, points and the next object of the class"
+    return TextTable(f"{name}: errors of boxes by {by}", columns, tuple(rows))
 
 
 def _group_cells(group: GroupErrors) -> tuple[str, ...]:

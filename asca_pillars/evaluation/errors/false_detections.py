@@ -32,7 +32,7 @@ TRAITS = {
     "low": f"no point higher than {LOW_M:g} m above the ground",
     "bright": f"{BRIGHT_SHARE:.0%} of its points or more with a reflectance of {BRIGHT_REFLECTANCE:g} or more",
     "beside": f"as many points within {_BESIDE_M:g} m beside it, at its height, as in it",
-    "part of a long thing": f"what it stands on is joined to points over more than {LONG_M:g} m",
+    "attached": f"what it stands on is joined to points over more than {LONG_M:g} m",
     "hollow": f"at most {HOLLOW_SHARE:.0%} of its points in the middle half of its length and width",
 }
 
@@ -75,7 +75,7 @@ class Surroundings:
             "low": self.top_m < LOW_M,
             "bright": self.bright >= BRIGHT_SHARE,
             "beside": self.beside >= 1,
-            "part of a long thing": self.cluster_length_m > LONG_M,
+            "attached": self.cluster_length_m > LONG_M,
             "hollow": self.middle <= HOLLOW_SHARE,
         }
         return tuple(name for name in TRAITS if holds[name])

@@ -26,8 +26,8 @@ MIN_DENSE_POINTS = 80
 
 STATISTICS = {
     "flank_end": "end of the visible flank - far face (97th percentile of the low points, end-on)",
-    "upper_end": "last point above 0.6 of the height - near face, as a share of the length (from behind)",
-    "roof_end": "last point between 0.8 and 0.9 of the height - near face (from behind)",
+    "upper_end": "last points above 0.6 of the height - near face, as a share of the length (from behind)",
+    "roof_end": "last points between 0.8 and 0.9 of the height - near face (from behind)",
     "roof_length": "length of the visible roof (above 0.8 of the height, 5th to 95th percentile, end-on)",
     "nearest_point": "nearest point - near face (end-on)",
     "rear_width": "visible width of the near end - width (end-on, 0.35 to 0.8 m above the bottom)",
@@ -134,8 +134,8 @@ def _end_on_statistics(near: _BoxPoints, box: NDArray[np.float64], distance_m: f
         roof = near.up > 0.8 * height
         if _heads_away(box):
             upper = near.along[near.up > 0.6 * height]
-            values["upper_end"] = (_percentile(upper, 97) + length / 2) / length
-            values["roof_end"] = _percentile(near.along[roof & (near.up < 0.9 * height)], 97) + length / 2
+            values["upper_end"] = (_last(upper) + length / 2) / length
+            values["roof_end"] = _last(near.along[roof & (near.up < 0.9 * height)]) + length / 2
         values["roof_length"] = _percentile(near.along[roof], 95) - _percentile(near.along[roof], 5)
     if len(near.along) > MIN_DENSE_POINTS:
         values["top_97"] = float(np.percentile(near.up, 97) - height)
@@ -148,6 +148,11 @@ def _end_on_statistics(near: _BoxPoints, box: NDArray[np.float64], distance_m: f
 
 def _heads_away(box: NDArray[np.float64]) -> bool:
     return bool(np.cos(box[6]) * box[0] + np.sin(box[6]) * box[1] > 0)
+
+
+def _last(values: NDArray[np.float64]) -> float:
+    """The third largest, as one or two points may be strays; NaN of fewer than five values."""
+    return float(np.sort(values)[-3]) if len(values) > 4 else float("nan")
 
 
 def _percentile(values: NDArray[np.float64], share: float) -> float:

@@ -1,7 +1,7 @@
 """The worst of each kind of error, to be looked at: false detections, missed objects, and boxes with large errors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
@@ -30,6 +30,7 @@ class Case:
         error: what cases of one section are ordered by, the largest first.
         score: of the detection; 0 without one.
         points: in the first box.
+        frame_id, svg: name of the frame and picture, from `draw_cases`.
     """
 
     frame: int
@@ -38,6 +39,8 @@ class Case:
     error: float
     score: float
     points: int
+    frame_id: str = ""
+    svg: str = ""
 
     @property
     def distance_m(self) -> float:
@@ -78,15 +81,15 @@ def worst_cases(matches: Matches) -> list[CaseSection]:
 
 def draw_cases(
     frames: ErrorFrames, matches: Matches, sections: Sequence[CaseSection], *, console: Console | None = None
-) -> list[list[str]]:
-    """A picture (`crops.crop_svg`) of each case of each section; every frame is read once.
+) -> list[CaseSection]:
+    """The same sections with a picture (`crops.crop_svg`) of each case; every frame is read once.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
     """
     places = [(row, column) for row, section in enumerate(sections) for column in range(len(section.cases))]
     places.sort(key=lambda place: sections[place[0]].cases[place[1]].frame)
-    pictures = [[""] * len(section.cases) for section in sections]
+    drawn = [list(section.cases) for section in sections]
     bar = track(places, "Drawing errors", console=console, disable=console is None)
     for index, group in groupby(bar, lambda place: sections[place[0]].cases[place[1]].frame):
         frame = frames.read(matches.frame_ids[index])
@@ -98,9 +101,10 @@ def draw_cases(
             if score >= matches.scores.get(kind, np.inf)
         ]
         for row, column in group:
-            boxes = [*sections[row].cases[column].boxes, *others]
-            pictures[row][column] = crop_svg(frame.points, ground, boxes)
-    return pictures
+            case = drawn[row][column]
+            svg = crop_svg(frame.points, ground, [*case.boxes, *others])
+            drawn[row][column] = replace(case, frame_id=frame.frame_id, svg=svg)
+    return [replace(section, cases=tuple(cases)) for section, cases in zip(sections, drawn, strict=True)]
 
 
 def _worst(cases: Sequence[Case], count: int) -> tuple[Case, ...]:
