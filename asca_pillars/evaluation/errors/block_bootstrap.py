@@ -34,7 +34,12 @@ class Resamples:
     blocks: NDArray[np.int64]
 
     def median_interval(self, values: _Doubles, frames: NDArray[np.int64]) -> tuple[float, float] | None:
-        """Interval of the median of values (N,), which are from frames (N,); None of too few blocks."""
+        """Interval of the median of values (N,), in their unit; None of too few blocks.
+
+        Args:
+            values: numbers.
+            frames: index of the frame that each is from.
+        """
         if len(np.unique(self.blocks[frames])) < MIN_BLOCKS:
             return None
         order = np.argsort(values, kind="stable")
@@ -45,7 +50,7 @@ class Resamples:
         return _interval(values[order][middle])
 
     def ratio_interval(self, parts: _Doubles, wholes: _Doubles) -> tuple[float, float] | None:
-        """Interval of sum(parts) / sum(wholes), both (F,) by frame; None of too few blocks."""
+        """Interval of the ratio sum(parts) / sum(wholes), counts (F,) by frame; None of too few blocks."""
         if len(np.unique(self.blocks[wholes > 0])) < MIN_BLOCKS:
             return None
         whole = self.weights @ wholes

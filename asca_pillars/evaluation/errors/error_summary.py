@@ -37,7 +37,9 @@ SIDE_ON_DEG = 90.0 - END_ON_DEG
 DISTANCES_M = (0.0, 15.0, 25.0, 40.0, inf)
 POINTS = (1, 20, 100, inf)
 NEIGHBORS_M = (0.0, 1.0, 2.0, inf)
-OCCLUSIONS = ("fully visible", "partly occluded", "largely occluded")
+OCCLUSIONS = ("fully visible", "partly occluded")
+LARGELY_OCCLUDED = "largely occluded"
+"""Objects that are not counted, of which a detection is neither right nor wrong."""
 OTHER_IOU_3D = 0.5
 ALL, CLEAR = "all", "clear"
 VIEWS = ("clear, end-on", "clear, oblique", "clear, side-on")
@@ -342,7 +344,8 @@ def _groups(objects: Sequence[ObjectMatch]) -> dict[str, _Mask]:
     neighbor = np.array([item.neighbor_m for item in objects], np.float64)
     groups = {ALL: counted, CLEAR: clear} | {name: clear & (view == name) for name in VIEWS}
     groups |= {_band(low, high, "m"): counted & _within(distance, low, high) for low, high in pairwise(DISTANCES_M)}
-    groups |= {name: occluded == state for state, name in enumerate(OCCLUSIONS)}
+    groups |= {name: counted & (occluded == state) for state, name in enumerate(OCCLUSIONS)}
+    groups[LARGELY_OCCLUDED] = occluded == len(OCCLUSIONS)
     for low, high in pairwise(POINTS):
         groups[_band(low, high - 1, "points")] = counted & _within(points, low, high)
     for low, high in pairwise(NEIGHBORS_M):

@@ -7,6 +7,7 @@ from asca_pillars.evaluation.errors.box_errors import CORRECTIONS, FALSE_KINDS, 
 from asca_pillars.evaluation.errors.error_summary import (
     CLEAR_RANGE_M,
     CLEAR_TRUNCATION,
+    LARGELY_OCCLUDED,
     MAIN_GROUPS,
     SIDE_ON_DEG,
     WITHOUT_MEDIANS,
@@ -71,7 +72,8 @@ def error_notes(datasets: Sequence[DatasetErrors]) -> list[str]:
         "on. Below score: missed objects that a detection below the score covers well enough.",
         f"Clear: neither hidden nor truncated by more than {CLEAR_TRUNCATION:g}, as far as labels say, and within "
         f"{CLEAR_RANGE_M:g} m. End-on: less than {END_ON_DEG:g} degrees between axis and line of sight; side-on: more "
-        f"than {SIDE_ON_DEG:g}. Groups by occlusion also hold objects that the protocol does not count.",
+        f"than {SIDE_ON_DEG:g}. Objects count within the limits of KITTI's moderate, where labels "
+        f"have them; {LARGELY_OCCLUDED} ones do not.",
         f"Intervals: bootstrap over blocks of {BLOCK_FRAMES} neighboring frames, within parts where there are any, and "
         f"over the parts; ±?: values of fewer than {MIN_BLOCKS} blocks have none.",
         *(f"{trait}: {meaning}" for trait, meaning in TRAITS.items()),

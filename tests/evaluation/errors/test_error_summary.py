@@ -97,7 +97,7 @@ def test_groups() -> None:
         "clear, oblique": (1, 0),
         "15-25 m": (2, 1),
         "40+ m": (1, 0),
-        "fully visible": (3, 1),
+        "fully visible": (2, 1),
         "partly occluded": (1, 0),
         "largely occluded": (1, 0),
         "20-99 points": (2, 0),
