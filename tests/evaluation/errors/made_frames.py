@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from asca_pillars.evaluation.errors.error_frames import UNKNOWN_OCCLUSION, ErrorFrame
 
@@ -26,8 +27,8 @@ def column(x: float, y: float, top: float, *, bottom: float = 0.0, width: float 
 
 
 def frame(
-    objects: Sequence[tuple[str, Sequence[float]]],
-    found: Sequence[tuple[str, float, Sequence[float]]],
+    objects: Sequence[tuple[str, ArrayLike]],
+    found: Sequence[tuple[str, float, ArrayLike]],
     *,
     frame_id: str = "000000",
     points: np.ndarray | None = None,

@@ -68,7 +68,6 @@ def test_boxes_are_seen_from_the_sensor(tmp_path: Path) -> None:
     made = reader.read("000000")
     np.testing.assert_allclose(made.objects[:, :3], boxes[:, :3] - [2.0, 1.0, 0.5], atol=1e-5)
     np.testing.assert_allclose(made.found[0], made.objects[0])
-    np.testing.assert_allclose(
-        made.points[:, :3], split.points("000000", camera_view=False)[:, :3] - np.float32([2.0, 1.0, 0.5]), atol=1e-5
-    )
+    points = split.points("000000", camera_view=False)[:, :3]
+    np.testing.assert_allclose(made.points[:, :3], points - np.array([2.0, 1.0, 0.5]), atol=1e-5)
     assert made.counted.all() and (made.occluded == UNKNOWN_OCCLUSION).all() and made.scores.tolist() == [0.8]
