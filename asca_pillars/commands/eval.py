@@ -81,6 +81,26 @@ def evaluate(
     precision: PrecisionOption = None,
     threads: ThreadsOption = None,
     around: AroundOption = False,
+    errors: Annotated[
+        bool,
+        typer.Option(
+            "--errors",
+            help="Also analyze the errors, into errors.html, errors.md and errors.json: how boxes are off by view, "
+            "distance, occlusion and points, what false detections stand on, pictures of the worst.",
+        ),
+    ] = False,
+    errors_by: Annotated[
+        str | None,
+        typer.Option(
+            "--errors-by",
+            help="Rows for parts of the data, too: list, the other lists of ImageSets/ within --split; or a number, "
+            "frames whose ids begin with the same so many characters.",
+        ),
+    ] = None,
+    beside: Annotated[
+        list[Path] | None,
+        typer.Option("--beside", help="errors.json of another evaluation, for the same tables. Repeatable."),
+    ] = None,
 ) -> None:
     """Score a model, or finished predictions, by KITTI's protocol: AP and AOS, by distance, recall and precision.
 
@@ -94,6 +114,7 @@ def evaluate(
 
     from asca_pillars.commands import eval_steps as steps
     from asca_pillars.commands.eval_arguments import EvalArguments, check_arguments, default_protocol
+    from asca_pillars.commands.eval_errors import prepare_errors, who_predicted
     from asca_pillars.commands.eval_files import claim
     from asca_pillars.commands.models import open_model
     from asca_pillars.data.kitti import KittiSplit
@@ -102,7 +123,9 @@ def evaluate(
     console = Console(markup=False)
     protocol = protocol or default_protocol(data)
     options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
-    given = EvalArguments(protocol, model, data, split, predictions, labels, gallery, score, min_score, around)
+    given = EvalArguments(
+        protocol, model, data, split, predictions, labels, gallery, score, min_score, around, errors, errors_by, beside
+    )
     check_arguments(given, options)
     split = "val" if split is None else split
     if protocol == "tracking":
@@ -115,20 +138,27 @@ def evaluate(
         from asca_pillars.commands.eval_boxes import BoxTask, evaluate_boxes
 
         assert data is not None, "checked with the arguments"
-        box_task = BoxTask(protocol, data, split, out, json, score, min_score, around)
+        box_task = BoxTask(protocol, data, split, out, json, score, min_score, around, errors, errors_by, beside)
         evaluate_boxes(box_task, options, predictions, console)
         return
-    claim("report" if protocol == "kitti" else protocol, out, json, predictions, (model, data, labels))
+    inputs = (model, data, labels, *(beside or ()))
+    claim("report" if protocol == "kitti" else protocol, out, json, predictions, inputs)
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:
         assert frames_of is not None, "checked with the arguments"
         labels = frames_of.folder / "label_2"
     truth = read_truth(labels, None if frames_of is None else frames_of.frame_ids)
+    analysis = None
     if predictions is not None:
+        if errors:
+            assert frames_of is not None, "checked with the arguments"
+            analysis = prepare_errors(who_predicted(predictions), frames_of, errors_by, beside)
         task = steps.text_task(predictions, labels, frames_of, score)
     else:
         assert frames_of is not None, "checked with the arguments"
         opened = open_model(options, min_score)
+        if errors:
+            analysis = prepare_errors(opened.name, frames_of, errors_by, beside)
         scores = steps.kitti_scores(opened, score, min_score) if protocol == "kitti" else {}
         task = steps.run_model(opened, frames_of, labels, scores, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)
@@ -138,4 +168,6 @@ def evaluate(
         steps.check_classes(task, frames)
         steps.report_kitti(task, frames, out, json, console)
         steps.draw_gallery(task, frames, out, gallery, console)
+        if analysis is not None:
+            steps.analyze_errors(analysis, task, frames, out, console)
     console.print(f"Written to {out}/", highlight=False)

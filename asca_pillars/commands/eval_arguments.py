@@ -25,6 +25,9 @@ class EvalArguments:
     score: float | None
     min_score: float
     around: bool
+    errors: bool = False
+    errors_by: str | None = None
+    beside: list[Path] | None = None
 
 
 def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
@@ -38,6 +41,7 @@ def check_arguments(given: EvalArguments, options: RuntimeOptions) -> None:
         _check_no_runtime(given.predictions, options, given.min_score)
     if given.split is not None and given.data is None:
         raise ConfigError(f"--split {given.split} is a list of the frames of a dataset: give --data ROOT, too")
+    _check_errors(given)
     if given.protocol == "tracking":
         _check_tracking(given)
         return
@@ -65,6 +69,18 @@ def _check_no_runtime(predictions: Path, options: RuntimeOptions, min_score: flo
         raise ConfigError(
             f"{options_given[0]} is for running a model; --predictions {predictions} are scored as they are"
         )
+
+
+def _check_errors(given: EvalArguments) -> None:
+    if not given.errors:
+        if given.errors_by is not None or given.beside:
+            option = "--beside" if given.errors_by is None else f"--errors-by {given.errors_by}"
+            raise ConfigError(f"{option} belongs to the error analysis: give --errors, too")
+        return
+    if given.protocol in ("waymo", "tracking"):
+        raise ConfigError(f"--errors goes with --protocol kitti, iou or distance, not with {given.protocol}")
+    if given.data is None:
+        raise ConfigError("--errors looks at the points of the scans: give --data ROOT that has them")
 
 
 def _check_tracking(given: EvalArguments) -> None:

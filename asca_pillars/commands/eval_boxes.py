@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
+from asca_pillars.commands.eval_errors import prepare_errors, report_errors, who_predicted
 from asca_pillars.commands.eval_files import MADE_BY, PREDICTIONS_FOLDER, claim, write_report
 from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
@@ -18,6 +19,7 @@ from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation.boxes.box_predictions import BoxFrames, read_box_predictions, write_box_predictions
 from asca_pillars.evaluation.boxes.box_report import BoxProtocol, box_json, box_notes, box_report, box_tables
 from asca_pillars.evaluation.boxes.fixed_scores import fixed_scores
+from asca_pillars.evaluation.errors.error_frames import BoxErrorFrames
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.files import atomic_directory, write_json
 from asca_pillars.system import describe_environment
@@ -37,11 +39,14 @@ class BoxTask:
     score: float | None
     min_score: float
     around: bool
+    errors: bool
+    errors_by: str | None
+    beside: list[Path] | None
 
 
 def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | None, console: Console) -> None:
     """Evaluate by IoU or by distance; print and write the tables, the JSON, and the model's predictions."""
-    claim(task.protocol, task.out, task.json, predictions, (options.bundle, task.data))
+    claim(task.protocol, task.out, task.json, predictions, (options.bundle, task.data, *(task.beside or ())))
     split = open_split(task.data, task.split)
     about: dict[str, Any] = {"data": str(task.data), "split": task.split}
     if task.around and isinstance(split, BoxSplit) and split.has_camera:
@@ -49,10 +54,14 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     if predictions is None:
         model = open_model(options, task.min_score, sensor_height_m=split.mounting.sensor_height_m, around=task.around)
         scores = model_scores(model, task.score, task.min_score)
+        analysis = prepare_errors(model.name, split, task.errors_by, task.beside) if task.errors else None
         frames = _run(model, split, task, console)
         class_names = model.spec.class_names
         subject, about = f"{model.name} on {task.data}, {task.split}", about | {"model": model.about}
     else:
+        analysis = (
+            prepare_errors(who_predicted(predictions), split, task.errors_by, task.beside) if task.errors else None
+        )
         frames = read_box_predictions(predictions, split, console=console)
         class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.found_types}))
         scores = dict.fromkeys(class_names, TEXT_SCORE if task.score is None else task.score)
@@ -64,6 +73,11 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     page = ReportPage(report.title, box_tables(report), box_notes(report))
     scored = task.out / "predictions" if predictions is None else predictions
     write_report(task.protocol, page, box_json(report), task.out, task.json, scored, console)
+    if analysis is not None:
+        labelled = {kind for frame in frames.frames for kind in frame.object_types}
+        found = {name: score for name, score in scores.items() if name in labelled}
+        read = BoxErrorFrames(split, frames.frames)
+        report_errors(analysis, read, found, subject, about, task.out, console)
     console.print(f"Written to {task.out}/", highlight=False)
 
 

@@ -9,6 +9,8 @@ from rich.console import Console
 from asca_pillars.commands.writable_file import require_writable
 from asca_pillars.errors import OutputError
 from asca_pillars.evaluation import gallery
+from asca_pillars.evaluation.errors.error_report import PRODUCTS as ERROR_PRODUCTS
+from asca_pillars.evaluation.errors.error_report import remove_errors
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.files import remove_directory, write_json, write_text
 from asca_pillars.own_files import (
@@ -38,6 +40,7 @@ _PRODUCTS: dict[str, Recognizer] = {
     **{f"{name}.json": is_own for name, is_own in REPORTS.items()},
     **{f"{name}.md": ending_with(_PAGE_END) for name in REPORTS},
     CURVES: is_own_picture,
+    **ERROR_PRODUCTS,
 }
 MADE_BY = "made_by.json"
 PREDICTIONS_FOLDER = (COMMAND, MADE_BY, json_object("model", "data", "split", "files"))
@@ -91,6 +94,8 @@ def write_report(
 ) -> None:
     """Print a report; write `name`.json and `name`.md below `out`, and the JSON to `json_path`, too.
 
+    An earlier evaluation's analysis of errors is removed.
+
     Args:
         name: of the files, see REPORTS.
         page: what is printed and written as Markdown.
@@ -105,6 +110,7 @@ def write_report(
     """
     page.print(console)
     _remove_predictions_of_another(out, scored)
+    remove_errors(out)
     for path in (out / f"{name}.json", *([] if json_path is None else [json_path])):
         require_own_file(path, COMMAND, REPORTS[name])
         write_json(path, content)

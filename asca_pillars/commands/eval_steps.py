@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
+from asca_pillars.commands.eval_errors import ErrorAnalysis, report_errors
 from asca_pillars.commands.eval_files import COMMAND, CURVES, GALLERY_FOLDER, MADE_BY, PREDICTIONS_FOLDER, write_report
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model
@@ -13,6 +14,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
+from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
@@ -166,3 +168,14 @@ def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None,
     folders = task.split, task.labels, task.predictions
     with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
         gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)
+
+
+def analyze_errors(analysis: ErrorAnalysis, task: Task, frames: ScoredFrames, out: Path, console: Console) -> None:
+    """Write the error analysis of KITTI's classes that are labelled or detected below `out`."""
+    assert task.split is not None, "checked with the arguments"
+    there = {name for frame in (*frames.truth, *frames.detections) for name in frame.folded_types.tolist()}
+    scores = {name: score for name, score in task.scores.items() if name.casefold() in there}
+    frame_ids = tuple(frame.frame_id for frame in frames.truth)
+    read = KittiErrorFrames(task.split, task.labels, task.predictions, tuple(scores), frame_ids)
+    about = task.about | {"environment": describe_environment()}
+    report_errors(analysis, read, scores, task.subject, about, out, console)

@@ -20,7 +20,7 @@ def raising(error: BaseException) -> Callable[[], None]:
 
 @pytest.fixture(autouse=True)
 def _script(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["benchmarks/transfer.py"])
+    monkeypatch.setattr(sys, "argv", ["benchmarks/memory.py"])
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_errors_are_one_line(error: Exception, line: str, capsys: pytest.Capture
 def test_a_script_goes_by_its_own_name(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         run_command(raising(AscaError("no such folder")))
-    assert capsys.readouterr().err == "transfer: no such folder\n"
+    assert capsys.readouterr().err == "memory: no such folder\n"
 
 
 def test_a_defect_keeps_its_traceback() -> None:
