@@ -1,0 +1,297 @@
+"""Matches of objects and detections, and the errors of matched boxes along the axes of their labels.
+
+Each reported detection, the best score first, takes the free object of its class, or of the neighboring type (KITTI's
+Van for Car), that it overlaps most from above, if that is at least `evaluation.recall`'s minimum. Then what is left,
+detections and objects, is matched alike from LOCALIZATION_IOU on: these boxes are not found, but badly placed, and
+their errors count among those of the others. Detections that stay without an object are false. Their kinds are those of
+TIDE (Bolya et al., ECCV 2020), with overlaps from above:
+
+    localization     at LOCALIZATION_IOU or more on an object of its class, below the minimum
+    classification   at LOCALIZATION_IOU or more on an object of another class
+    duplicate        on an object that a better detection has taken
+    background       on no label
+
+Errors are predicted minus label. Ends and sides are faces: positive means drawn too far out. The ray-facing axis is the
+label's heading or its opposite, whichever points away from the sensor; the near end is the face where it enters. For an
+object seen side-on no end is the nearer one, for one seen end-on no side is; the names are then arbitrary.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.frames import NEIGHBOR_TYPES
+from asca_pillars.evaluation.errors.error_frames import ErrorFrame
+from asca_pillars.evaluation.errors.label_fit import view_angle_deg
+from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
+from asca_pillars.geometry.assignment import match_by_overlap
+from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.overlap import bev_iou
+
+LOCALIZATION_IOU = 0.1
+FALSE_KINDS = ("background", "localization", "classification", "duplicate")
+
+RESIDUALS = {
+    "near_end": "m; face across the ray-facing axis, on the sensor's side; positive: too far out",
+    "far_end": "m; the opposite face; positive: too far out",
+    "length": "m; near end and far end together",
+    "near_side": "m; the long face on the sensor's side; positive: too far out",
+    "far_side": "m; the opposite face; positive: too far out",
+    "width": "m; both sides together",
+    "bottom": "m; positive: too high",
+    "top": "m; positive: too high",
+    "height": "m; top - bottom",
+    "range": "m; center along the line of sight; positive: too far away",
+    "left": "m; center across the line of sight; positive: too far left",
+    "heading_deg": "degrees of the axis, within -90 to 90, counter-clockwise; the direction is `turned`",
+    "turned": "share of headings that are off by more than 90 degrees",
+}
+"""Names of the columns of `box_residuals`."""
+
+_Doubles = NDArray[np.float64]
+_NONE = -1
+_MIN_SIZE_M = 0.1
+_FACES = tuple(list(RESIDUALS).index(name) for name in ("near_end", "far_end", "near_side", "far_side"))
+_BOTTOM, _TOP, _HEADING, _TURNED = (list(RESIDUALS).index(name) for name in ("bottom", "top", "heading_deg", "turned"))
+CORRECTIONS: dict[str, tuple[int, ...]] = {
+    "as drawn": (),
+    "label's ends": _FACES[:2],
+    "label's sides": _FACES[2:],
+    "label's bottom and top": (_BOTTOM, _TOP),
+    "label's heading": (_HEADING,),
+}
+"""Parts of a box that `corrected` takes from the label, as columns of `box_residuals`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMatch:
+    """A labelled object of an evaluated class, and the detection that found it.
+
+    Attributes:
+        frame: index of its frame.
+        class_name: its type.
+        box: (7,) label, sensor at the origin.
+        points: in the box, at least one.
+        view_deg: between heading and line of sight, 0 to 90.
+        neighbor_m: distance to the nearest other object of its type.
+        counted: is to be found, by the protocol.
+        found: a reported detection overlaps it enough.
+        below_score: it is not, but would be by a detection below the score.
+        detection: (7,) the detection that found it, or that is badly placed on it; None without one.
+        score: of that detection.
+    """
+
+    frame: int
+    class_name: str
+    box: _Doubles
+    points: int
+    occluded: int
+    truncated: float
+    view_deg: float
+    neighbor_m: float
+    counted: bool
+    found: bool
+    below_score: bool
+    detection: _Doubles | None
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionMatch:
+    """A detection of an evaluated class that reaches its least score.
+
+    Attributes:
+        frame: index of its frame.
+        class_name: its type.
+        box: (7,) sensor at the origin.
+        score: its own.
+        reported: reaches the score from which on detections count.
+        kind: one of FALSE_KINDS for a false one, "found" on a counted object, "ignored" for one that is neither.
+        label: type of the object that a false one stands on; empty for `background`.
+    """
+
+    frame: int
+    class_name: str
+    box: _Doubles
+    score: float
+    reported: bool
+    kind: str
+    label: str
+
+
+def least_iou(class_name: str) -> float:
+    """The overlap from above from which on an object counts as found."""
+    return BEV_IOU.get(class_name, SMALL_BEV_IOU)
+
+
+def match_frame(
+    frame: ErrorFrame, index: int, class_name: str, score: float
+) -> tuple[list[ObjectMatch], list[DetectionMatch]]:
+    """Match the objects and detections of one class of a frame.
+
+    Args:
+        frame: the frame.
+        index: its number, which the matches carry.
+        class_name: type of the objects and detections.
+        score: from which on detections are reported.
+    """
+    types = np.array(frame.types, dtype=object)
+    own = types == class_name
+    related = own | (types == NEIGHBOR_TYPES.get(class_name, ""))
+    mine = np.flatnonzero(np.array(frame.found_types, dtype=object) == class_name)
+    mine = mine[np.argsort(-frame.scores[mine], kind="stable")]
+    boxes, scores, excused = frame.found[mine], frame.scores[mine], frame.excused[mine]
+    reported = scores >= score
+    overlap = bev_iou(boxes, frame.objects)
+
+    # The best score comes first, so that detections below the score take nothing from those above it.
+    holder = _match(overlap, np.ones(len(mine), bool), related, least_iou(class_name))
+    found = (holder >= 0) & np.append(reported, False)[holder]
+    unmatched = reported.copy()
+    unmatched[holder[holder >= 0]] = False
+    badly_placed = _match(overlap, unmatched, related & ~found, LOCALIZATION_IOU)
+
+    object_of = np.full(len(mine), _NONE)
+    object_of[holder[holder >= 0]] = np.flatnonzero(holder >= 0)
+    detections = []
+    for row, item in enumerate(object_of):
+        if item >= 0:
+            kind, label = ("found" if own[item] and frame.counted[item] else "ignored"), ""
+        elif excused[row]:
+            kind, label = "ignored", ""
+        else:
+            kind, label = _false_kind(overlap[row], types, related, least_iou(class_name))
+        detections.append(
+            DetectionMatch(index, class_name, boxes[row], float(scores[row]), bool(reported[row]), kind, label)
+        )
+
+    view, neighbors = view_angle_deg(frame.objects), _nearest_m(frame.objects, own)
+    objects = []
+    for row in np.flatnonzero(own & (frame.object_points > 0)).tolist():
+        detection = int(holder[row] if found[row] else badly_placed[row])
+        objects.append(
+            ObjectMatch(
+                frame=index,
+                class_name=class_name,
+                box=frame.objects[row],
+                points=int(frame.object_points[row]),
+                occluded=int(frame.occluded[row]),
+                truncated=float(frame.truncated[row]),
+                view_deg=float(view[row]),
+                neighbor_m=float(neighbors[row]),
+                counted=bool(frame.counted[row]),
+                found=bool(found[row]),
+                below_score=bool(holder[row] >= 0 and not found[row]),
+                detection=None if detection == _NONE else boxes[detection],
+                score=float("nan") if detection == _NONE else float(scores[detection]),
+            )
+        )
+    return objects, detections
+
+
+def box_residuals(found: _Doubles, labels: _Doubles) -> _Doubles:
+    """Errors of boxes found[k] against labels[k], sensor at the origin: (K, 7), (K, 7) -> (K, len(RESIDUALS)).
+
+    A box that is turned by more than 45 degrees against its label's axis is taken by its other axis: what it covers
+    counts for ends and sides, and its heading error is the turn itself.
+    """
+    turn = wrap_angle(found[:, 6] - labels[:, 6])
+    axis_turn = wrap_angle(turn, np.pi)
+    across_first = np.abs(axis_turn) > np.pi / 4
+    length, width = np.where(across_first, found[:, [4, 3]].T, found[:, [3, 4]].T)
+    axis, near_side = _ray_facing_axes(labels)
+    offset = found[:, :2] - labels[:, :2]
+    along = (offset * axis).sum(axis=1)
+    across = near_side * (offset[:, 1] * axis[:, 0] - offset[:, 0] * axis[:, 1])
+    line = labels[:, :2] / np.maximum(np.linalg.norm(labels[:, :2], axis=1, keepdims=True), 1e-9)
+    bottom = (found[:, 2] - found[:, 5] / 2) - (labels[:, 2] - labels[:, 5] / 2)
+    top = (found[:, 2] + found[:, 5] / 2) - (labels[:, 2] + labels[:, 5] / 2)
+    longer, wider = (length - labels[:, 3]) / 2, (width - labels[:, 4]) / 2
+    columns = {
+        "near_end": longer - along,
+        "far_end": longer + along,
+        "length": 2 * longer,
+        "near_side": wider + across,
+        "far_side": wider - across,
+        "width": 2 * wider,
+        "bottom": bottom,
+        "top": top,
+        "height": top - bottom,
+        "range": (offset * line).sum(axis=1),
+        "left": offset[:, 1] * line[:, 0] - offset[:, 0] * line[:, 1],
+        "heading_deg": np.rad2deg(axis_turn),
+        "turned": (np.abs(turn) > np.pi / 2).astype(np.float64),
+    }
+    return np.stack([columns[name] for name in RESIDUALS], axis=1)
+
+
+def boxes_from_residuals(labels: _Doubles, residuals: _Doubles) -> _Doubles:
+    """Inverse of `box_residuals`: (K, 7), (K, len(RESIDUALS)) -> (K, 7), from ends, sides, bottom, top and heading.
+
+    Boxes that are turned by more than 45 degrees come back with the same footprint, length and width exchanged.
+    """
+    part = dict(zip(RESIDUALS, residuals.T, strict=True))
+    axis, near_side = _ray_facing_axes(labels)
+    along = (part["far_end"] - part["near_end"]) / 2
+    across = near_side * (part["near_side"] - part["far_side"]) / 2
+    heading = np.deg2rad(part["heading_deg"])
+    quarter = np.where(np.abs(heading) > np.pi / 4, -np.sign(heading) * np.pi / 2, 0.0)
+    boxes = labels.copy()
+    boxes[:, 0] += along * axis[:, 0] - across * axis[:, 1]
+    boxes[:, 1] += along * axis[:, 1] + across * axis[:, 0]
+    boxes[:, 2] += (part["bottom"] + part["top"]) / 2
+    boxes[:, 3] += part["near_end"] + part["far_end"]
+    boxes[:, 4] += part["near_side"] + part["far_side"]
+    boxes[:, 5] += part["top"] - part["bottom"]
+    boxes[:, 3:6] = np.maximum(boxes[:, 3:6], _MIN_SIZE_M)
+    boxes[:, 6] = wrap_angle(labels[:, 6] + heading + quarter + np.pi * part["turned"])
+    return boxes
+
+
+def corrected(labels: _Doubles, residuals: _Doubles, part: str) -> _Doubles:
+    """The boxes (K, 7) of these residuals with one part, a key of CORRECTIONS, taken from the labels (K, 7)."""
+    kept = residuals.copy()
+    kept[:, list(CORRECTIONS[part])] = 0.0
+    return boxes_from_residuals(labels, kept)
+
+
+def _ray_facing_axes(labels: _Doubles) -> tuple[_Doubles, _Doubles]:
+    """Unit vectors (K, 2) of the labels' ray-facing axes, and on which side of them the sensor is: (K,), 1 is left."""
+    heading = np.stack([np.cos(labels[:, 6]), np.sin(labels[:, 6])], axis=1)
+    axis = np.where((heading * labels[:, :2]).sum(axis=1, keepdims=True) < 0, -heading, heading)
+    sensor_left = labels[:, 0] * axis[:, 1] - labels[:, 1] * axis[:, 0]
+    return axis, np.where(sensor_left < 0, -1.0, 1.0)
+
+
+def _match(
+    overlap: _Doubles, detections: NDArray[np.bool_], objects: NDArray[np.bool_], least: float
+) -> NDArray[np.int64]:
+    """Match some detections with some objects by (D, M) overlaps: (M,) detection that each object gets, or _NONE."""
+    rows, columns = np.flatnonzero(detections), np.flatnonzero(objects)
+    matched, items = match_by_overlap(overlap[np.ix_(rows, columns)], least)
+    holder = np.full(overlap.shape[1], _NONE)
+    holder[columns[items]] = rows[matched]
+    return holder
+
+
+def _false_kind(
+    overlap: _Doubles, types: NDArray[np.object_], related: NDArray[np.bool_], least: float
+) -> tuple[str, str]:
+    """Kind of a false detection and the type of the label it stands on, from its overlaps (M,) with the objects."""
+    for chosen, low, kind in (
+        (related, least, "duplicate"),
+        (related, LOCALIZATION_IOU, "localization"),
+        (~related, LOCALIZATION_IOU, "classification"),
+    ):
+        touching = np.where(chosen, overlap, 0.0)
+        if touching.max(initial=0.0) >= low:
+            return kind, str(types[touching.argmax()])
+    return "background", ""
+
+
+def _nearest_m(boxes: _Doubles, own: NDArray[np.bool_]) -> _Doubles:
+    """Distance (M,) from each box (M, 7) to the nearest other one that a mask (M,) chooses; infinite without one."""
+    apart = np.linalg.norm(boxes[:, None, :2] - boxes[None, :, :2], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    return np.where(own, apart, np.inf).min(axis=1, initial=np.inf)
