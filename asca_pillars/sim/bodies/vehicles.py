@@ -1,9 +1,9 @@
 """Cars and vans as triangle meshes around the origin: x ahead, wheels on z = 0.
 
 A car is lofted: at stations along its length stand cross-sections (sill, waist, belt, lintel, edge of hood or roof, and
-on to the middle), joined by panels that are paint below the belt, glass up to the lintel and paint on the roof's rail. Hood and roof are crowned, nose and
-tail are bowed in plan, as those of real cars are: a ring of a LiDAR draws arcs on them. Bodies are given by the size
-of the BODY, not of the looser label box.
+on to the middle), joined by panels that are paint below the belt, glass up to the lintel and paint on the roof's rail.
+Hood and roof are crowned, nose and tail are bowed in plan, as those of real cars are: a ring of a LiDAR draws arcs on
+them. Bodies are given by the size of the BODY, not of the looser label box.
 """
 
 from typing import NamedTuple
@@ -77,7 +77,7 @@ def car_body(
         wheel_radius=float(rng.uniform(0.29, 0.34)) * float(np.clip(1.0 + 0.25 * (height - 1.5), 0.95, 1.2)),
         crown=float(rng.uniform(0.03, 0.07)),
         rail=float(rng.uniform(0.07, 0.14)),
-        nose_bow=float(rng.uniform(0.06, 0.24)),
+        nose_bow=float(rng.uniform(0.04, 0.20)),
         tail_bow=float(rng.uniform(0.02, 0.09)),
     )
     paint = draw_paint(rng, dark_share)
