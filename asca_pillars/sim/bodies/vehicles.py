@@ -106,8 +106,8 @@ def _sections(hull: _Hull, x: Floats) -> Floats:
     waist = np.minimum(2 * hull.wheel_radius + 0.09, 0.3 * hull.clearance + 0.7 * belt)
     sill = np.minimum(sill, waist - 0.01)
     # Bodies narrow towards both ends and round their corners; they are widest above the wheels.
-    plan = 1.0 - 0.02 * np.maximum(1 - x / 0.25, 0) ** 2 - 0.05 * np.maximum(1 - x / 0.06, 0) ** 2
-    plan -= 0.02 * np.maximum(1 - (1 - x) / 0.25, 0) ** 2 + 0.04 * np.maximum(1 - (1 - x) / 0.05, 0) ** 2
+    plan = 1.0 - 0.015 * np.maximum(1 - x / 0.25, 0) ** 2 - 0.025 * np.maximum(1 - x / 0.04, 0) ** 2
+    plan -= 0.02 * np.maximum(1 - (1 - x) / 0.25, 0) ** 2 + 0.03 * np.maximum(1 - (1 - x) / 0.04, 0) ** 2
     plan *= hull.width / 2
     over_belt = np.clip((z_top - hull.profile.belt * hull.height) / ((1 - hull.profile.belt) * hull.height), 0.0, 1.0)
     roof = plan * (0.94 + (hull.profile.tumble - 0.94) * over_belt)
@@ -137,7 +137,7 @@ def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -
     window = Surface(0.05, float(np.exp(rng.uniform(np.log(0.3), np.log(12.0)))), float(rng.uniform(0.05, 0.6)))
     arch = (hull.wheel_radius + 0.06) / hull.length
     arches = (hull.wheel_x[:, None] + np.array([-1.0, -0.8, -0.4, 0.4, 0.8, 1.0]) * arch).ravel()
-    low = np.unique(np.concatenate([[0.0, 0.03, 0.08], arches, [0.93, 0.98, 1.0]]).clip(0, 1))
+    low = np.unique(np.concatenate([[0.0, 0.02, 0.05], arches, [0.95, 0.98, 1.0]]).clip(0, 1))
     post = profile.cabin[0] + float(rng.uniform(0.40, 0.50)) * (profile.cabin[1] - profile.cabin[0])
     posts = [post - 0.018, post + 0.018]
     high = np.unique(np.concatenate([top[:, 0], profile.cabin, posts]).clip(0, 1))
