@@ -76,7 +76,7 @@ def car_body(
         wheel_x=np.array([rng.uniform(0.17, 0.21), rng.uniform(0.78, 0.83)]),
         wheel_radius=float(rng.uniform(0.29, 0.34)) * float(np.clip(1.0 + 0.25 * (height - 1.5), 0.95, 1.2)),
         crown=float(rng.uniform(0.03, 0.07)),
-        rail=float(rng.uniform(0.07, 0.14)),
+        rail=float(rng.uniform(0.09, 0.18)),
         nose_bow=float(rng.uniform(0.04, 0.20)),
         tail_bow=float(rng.uniform(0.02, 0.09)),
     )
