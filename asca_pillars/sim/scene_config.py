@@ -70,6 +70,11 @@ class SceneConfig(Strict):
     level_band_m: tuple[float, float] = (0.17, 0.02)
     # Standard deviation of a body's center about that of its label box.
     box_offset_sigma_m: float = 0.03
+    # How far a person's body stands behind the center of its label, seen from the sensor, mean and standard deviation.
+    person_behind_box_m: tuple[float, float] = (0.11, 0.03)
+
+    warp_m: tuple[float, float] = (0.02, 0.06)  # by how much a smooth field at most moves the points of a body
+    dark_patch_share: float = 0.15  # of bodies a part of which returns nothing
 
     # Shares of street kinds: narrow with parked cars, wide in town, out of town, square or campus, trunk road,
     # alley between walls.
@@ -110,7 +115,7 @@ class SceneConfig(Strict):
     min_visible_share: float = 0.05
 
     def __post_init__(self) -> None:
-        normal = ("slope_x", "slope_y", "level_band_m")  # no bounds of a draw
+        normal = ("slope_x", "slope_y", "level_band_m", "person_behind_box_m")  # no bounds of a draw
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name == "box_lift_m":

@@ -16,7 +16,7 @@ def pedestrian_body(
     """
     h = height
     shoulder = float(np.clip(0.40 * width + 0.04, 0.19, 0.30)) * min(h / 1.6, 1.0)
-    lean = float(rng.normal(0.02, 0.03)) * h
+    lean = float(rng.normal(0.03, 0.025)) * h  # forward, as of one who walks
     upper, lower, shoe = draw_cloth(rng, 3)
     skin = draw_skin(rng)
     thick = float(rng.uniform(1.35, 1.8))
@@ -28,14 +28,14 @@ def pedestrian_body(
     rows: list[Limb] = [
         ((0, 0, 0.52 * h), (lean, 0, 0.80 * h), shoulder * 0.9, 0.128 * thick, upper),
         ((lean * 0.8, 0, 0.70 * h), (lean, 0, 0.84 * h), shoulder, 0.115 * thick, upper),
-        ((0, 0, 0.46 * h), (0, 0, 0.56 * h), 0.16 * thick, 0.125 * thick, lower),
-        ((lean, 0, 0.82 * h), (lean + 0.01, 0, 0.86 * h), 0.055, 0.06, skin),
+        ((-0.03, 0, 0.46 * h), (-0.03, 0, 0.56 * h), 0.16 * thick, 0.125 * thick, lower),
+        ((lean, 0, 0.82 * h), (lean + 0.03, 0, 0.86 * h), 0.055, 0.06, skin),
     ]
     for side in (1.0, -1.0):
         rows += _leg(h, side, stride, phase, thick, (lower, shoe))
         rows += _arm(rng, h, side, -0.75 * stride * np.sin(phase) * side, (lean, shoulder), (upper, skin))
     size = 0.066 if h > 1.4 else 0.076  # children have larger heads
-    head = [(lean + 0.02, 0, (1.0 - size) * h), (lean - 0.005, 0, (1.0 - 0.92 * size) * h)]
+    head = [(lean + 0.055, 0, (1.0 - size) * h), (lean + 0.025, 0, (1.0 - 0.92 * size) * h)]
     hair = draw_cloth(rng, 1)[0] * (0.6, 1.0, 1.0)
     parts = [
         jointed(rows),
@@ -59,13 +59,13 @@ def _leg(h: float, side: float, stride: float, phase: float, thick: float, cloth
     lift = 0.5 * min(stride, 0.3) * max(np.cos(phase) * side, 0.0)
     foot = (forward - 0.3 * lift, side * 0.09, 0.05 + lift)
     knee = (0.52 * forward + 0.03 + 0.06 * (forward > 0) + 0.6 * lift, side * 0.10, 0.28 * h + 0.35 * lift)
-    heel = 0.10 * max(-forward - 0.1, 0.0)
+    heel = 0.25 * max(-forward - 0.06, 0.0)  # the foot behind stands on its toes, the one ahead on its sole
     return [
         ((0, side * 0.09, 0.52 * h), knee, 0.078 * thick, 0.088 * thick, lower),
         (knee, foot, 0.056 * thick, 0.062 * thick, lower),
         (
-            (foot[0] - 0.07, foot[1], foot[2] - 0.01 + heel),
-            (foot[0] + 0.15, side * 0.10, foot[2] - 0.015),
+            (foot[0] - 0.06, foot[1], foot[2] - 0.01 + heel),
+            (foot[0] + 0.18, side * 0.11, foot[2] - 0.015),
             0.055,
             0.055,
             shoe,
@@ -86,7 +86,7 @@ def _arm(
     upper, skin = cloth
     swing += float(rng.normal(0.0, 0.04))
     habit = rng.random()
-    bent = rng.uniform(0.0, 0.22) if habit < 0.7 else rng.uniform(0.2, 0.35)
+    bent = rng.uniform(0.04, 0.24) if habit < 0.7 else rng.uniform(0.2, 0.35)
     elbow = (lean + 0.45 * swing - 0.02, side * (shoulder + 0.05), 0.63 * h)
     inward = 0.4 * bent * (bent > 0.2)
     hand = (elbow[0] + 0.4 * swing + bent, side * (shoulder + 0.03 - inward), 0.50 * h + 0.5 * bent)

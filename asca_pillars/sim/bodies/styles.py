@@ -21,6 +21,8 @@ from asca_pillars.sim.bodies.profiles import (
 
 PALE_SHARE = 0.2  # of the cars that are not dark
 BELT_LOWER = 0.035  # windows of today's streets begin lower than the profiles' outlines suggest, share of height
+# Seen from behind, short cars look like long ones: their bonnets are shorter, not their cabins.
+BONNET_PER_M, USUAL_LENGTH_M = 0.055, 3.75
 
 Shares = tuple[tuple[Profile, float], ...]
 _SMALL: Shares = ((CITY, 0.62), (HATCHBACK, 0.36), (CONVERTIBLE, 0.02))
@@ -40,15 +42,22 @@ def draw_style(rng: np.random.Generator, length_m: float, height_m: float, van: 
     else:
         shares = _SMALL if length_m < 3.65 else _MIDDLE if length_m < 4.2 else _LARGE
     weights = np.array([weight for _, weight in shares])
-    return _varied(shares[int(rng.choice(len(shares), p=weights / weights.sum()))][0], rng)
+    bonnet = 0.0 if van else BONNET_PER_M * (length_m - USUAL_LENGTH_M)
+    return _varied(shares[int(rng.choice(len(shares), p=weights / weights.sum()))][0], bonnet, rng)
 
 
-def _varied(profile: Profile, rng: np.random.Generator) -> Profile:
+def _varied(profile: Profile, bonnet: float, rng: np.random.Generator) -> Profile:
+    """A profile with its windscreen moved by `bonnet`, a share of the length, and at random."""
     base, tail = profile.glass[0][0], profile.cabin[1]
     if tail - base < 0.1:
         tail = 0.8
     x_from = (0.0, base, tail, 1.0)
-    x_to = (0.0, base + rng.normal(0.0, 0.02), tail + min(rng.normal(0.0, 0.015), 0.8 * (1.0 - tail)), 1.0)
+    x_to = (
+        0.0,
+        base + bonnet + float(np.clip(rng.normal(0.0, 0.035), -0.08, 0.08)),
+        tail + min(rng.normal(0.0, 0.015), 0.8 * (1.0 - tail)),
+        1.0,
+    )
     lift = float(np.clip(rng.normal(-BELT_LOWER, 0.02), -0.08, 0.02))
 
     outline = np.array(profile.top)

@@ -1,9 +1,9 @@
 """Cars and vans as triangle meshes around the origin: x ahead, wheels on z = 0.
 
-A car is lofted: at stations along its length stand cross-sections (sill, waist, belt, edge of hood or roof, and on
-to the middle), joined by panels that are paint below the belt and glass above it. Hood and roof are crowned, nose and
-tail are bowed in plan, as those of real cars are: a ring of a LiDAR draws arcs on them. Bodies are given by the size
-of the BODY, not of the looser label box.
+A car is lofted: at stations along its length stand cross-sections (sill, waist, belt, lintel, edge of hood or roof, and
+on to the middle), joined by panels that are paint below the belt, glass up to the lintel and paint on the roof's rail.
+Hood and roof are crowned, nose and tail are bowed in plan, as those of real cars are: a ring of a LiDAR draws arcs on
+them. Bodies are given by the size of the BODY, not of the looser label box.
 """
 
 from typing import NamedTuple
@@ -49,6 +49,7 @@ class _Hull(NamedTuple):
     wheel_x: Floats  # (2,) shares of length
     wheel_radius: float
     crown: float
+    rail: float  # height of the frame between a side window and the edge of the roof
     nose_bow: float  # the corners of the nose stand back by this much
     tail_bow: float
 
@@ -74,9 +75,10 @@ def car_body(
         clearance=float(rng.uniform(0.12, 0.22)),
         wheel_x=np.array([rng.uniform(0.17, 0.21), rng.uniform(0.78, 0.83)]),
         wheel_radius=float(rng.uniform(0.29, 0.34)) * float(np.clip(1.0 + 0.25 * (height - 1.5), 0.95, 1.2)),
-        crown=float(rng.uniform(0.04, 0.09)),
-        nose_bow=float(rng.uniform(0.18, 0.42)),
-        tail_bow=float(rng.uniform(0.05, 0.16)),
+        crown=float(rng.uniform(0.03, 0.07)),
+        rail=float(rng.uniform(0.09, 0.18)),
+        nose_bow=float(rng.uniform(0.04, 0.20)),
+        tail_bow=float(rng.uniform(0.02, 0.09)),
     )
     paint = draw_paint(rng, dark_share)
     trim = Surface(float(np.exp(rng.uniform(np.log(0.008), np.log(0.06)))), 0.5)
@@ -91,7 +93,7 @@ def car_body(
 
 
 def _sections(hull: _Hull, x: Floats) -> Floats:
-    """Left halves (S,7,3) of the cross-sections at shares `x` of the length: sill, waist, belt, edge, ..., middle."""
+    """Left halves (S,8,3) of the cross-sections at shares `x` of the length: sill, waist, belt, lintel, ..., middle."""
     top = np.array(hull.profile.top)
     z_top = np.interp(x, top[:, 0], top[:, 1]) * hull.height
     arch = hull.wheel_radius + 0.06
@@ -104,13 +106,16 @@ def _sections(hull: _Hull, x: Floats) -> Floats:
     waist = np.minimum(2 * hull.wheel_radius + 0.09, 0.3 * hull.clearance + 0.7 * belt)
     sill = np.minimum(sill, waist - 0.01)
     # Bodies narrow towards both ends and round their corners; they are widest above the wheels.
-    plan = 1.0 - 0.05 * np.maximum(1 - x / 0.25, 0) ** 2 - 0.12 * np.maximum(1 - x / 0.08, 0) ** 2
-    plan -= 0.05 * np.maximum(1 - (1 - x) / 0.25, 0) ** 2 + 0.10 * np.maximum(1 - (1 - x) / 0.06, 0) ** 2
+    plan = 1.0 - 0.015 * np.maximum(1 - x / 0.25, 0) ** 2 - 0.025 * np.maximum(1 - x / 0.04, 0) ** 2
+    plan -= 0.02 * np.maximum(1 - (1 - x) / 0.25, 0) ** 2 + 0.03 * np.maximum(1 - (1 - x) / 0.04, 0) ** 2
     plan *= hull.width / 2
     over_belt = np.clip((z_top - hull.profile.belt * hull.height) / ((1 - hull.profile.belt) * hull.height), 0.0, 1.0)
     roof = plan * (0.94 + (hull.profile.tumble - 0.94) * over_belt)
-    half = np.stack([0.95 * plan, plan, 0.98 * plan] + [share * roof for share, _ in _LID], axis=1)
-    high = np.stack([sill, waist, belt] + [z_top - drop * hull.crown for _, drop in _LID], axis=1)
+    lintel = np.maximum(edge - hull.rail, 0.5 * (belt + edge))
+    shoulder = 0.98 * plan
+    frame = shoulder + (lintel - belt) / (edge - belt) * (roof - shoulder)
+    half = np.stack([0.95 * plan, plan, shoulder, frame] + [share * roof for share, _ in _LID], axis=1)
+    high = np.stack([sill, waist, belt, lintel] + [z_top - drop * hull.crown for _, drop in _LID], axis=1)
     along = (0.5 - x)[:, None] * hull.length + _bow(hull, x[:, None], half)
     return np.stack([along, half, high], axis=2)
 
@@ -128,29 +133,30 @@ def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -
     profile, top = hull.profile, np.array(hull.profile.top)
     # What a pane does not let through it mirrors away: most windows of KITTI's cars are holes.
     pane = Surface(0.05, 15.0, float(rng.uniform(0.1, 0.7)))
-    window = Surface(0.05, 15.0, float(rng.uniform(0.05, 0.6)))
+    # Side windows are dirty, tinted, or show a frame where the outline has none: half as many returns as from a door.
+    window = Surface(0.05, float(np.exp(rng.uniform(np.log(0.3), np.log(12.0)))), float(rng.uniform(0.05, 0.6)))
     arch = (hull.wheel_radius + 0.06) / hull.length
     arches = (hull.wheel_x[:, None] + np.array([-1.0, -0.8, -0.4, 0.4, 0.8, 1.0]) * arch).ravel()
-    low = np.unique(np.concatenate([[0.0, 0.03, 0.08], arches, [0.93, 0.98, 1.0]]).clip(0, 1))
+    low = np.unique(np.concatenate([[0.0, 0.02, 0.05], arches, [0.95, 0.98, 1.0]]).clip(0, 1))
     post = profile.cabin[0] + float(rng.uniform(0.40, 0.50)) * (profile.cabin[1] - profile.cabin[0])
-    posts = [post - 0.012, post + 0.012]
+    posts = [post - 0.018, post + 0.018]
     high = np.unique(np.concatenate([top[:, 0], profile.cabin, posts]).clip(0, 1))
     sections = _sections(hull, np.concatenate([low, high]))
     lower, upper = sections[: len(low), :2], sections[len(low) :, 1:]
 
     middle = (high[:-1] + high[1:]) / 2
     raised = np.interp(middle, top[:, 0], top[:, 1]) > profile.belt + 0.08
-    in_cabin = (middle > profile.cabin[0]) & (middle < profile.cabin[1]) & raised & (np.abs(middle - post) > 0.012)
+    in_cabin = (middle > profile.cabin[0]) & (middle < profile.cabin[1]) & raised & (np.abs(middle - post) > 0.018)
     in_pane = np.zeros(len(middle), bool)
     for begin, end in profile.glass:
         in_pane |= (middle > begin) & (middle < end)
     steep = np.abs(np.diff(upper[:, -1, 2])) > 0.6 * np.abs(np.diff(high)) * hull.length
-    # Panels from waist to belt, to the edge of the roof, over the posts beside the panes, and two to the middle.
-    table = np.empty((len(middle), 5, 3))
-    table[:, :2] = paint.upright.row
-    table[:, 2:] = np.where(steep[:, None, None], paint.upright.row, paint.flat.row)
+    # Panels from waist to belt, lintel and edge of the roof, over the posts beside the panes, and two to the middle.
+    table = np.empty((len(middle), 6, 3))
+    table[:, :3] = paint.upright.row
+    table[:, 3:] = np.where(steep[:, None, None], paint.upright.row, paint.flat.row)
     table[in_cabin, 1] = window.row
-    table[in_pane, 3:] = pane.row
+    table[in_pane, 4:] = pane.row
     skirt = np.broadcast_to(paint.upright.row, (len(low) - 1, 3))
     ends = [_end(hull, x, sections[at]) for x, at in ((0.0, 0), (1.0, -1))]
     bumper = np.tile(np.stack([trim.row, paint.upright.row]), (4, 1))
@@ -165,11 +171,11 @@ def _panels(grid: Floats) -> Floats:
 
 
 def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
-    """Left half of the nose (x = 0) or the tail (x = 1) inside its section (7,3).
+    """Left half of the nose (x = 0) or the tail (x = 1) inside its section (8,3).
 
     Returns corners (4,4,3), low and high by turns.
     """
-    levels = outline[[0, 1, 3]]  # sill, waist, edge
+    levels = outline[[0, 1, 4]]  # sill, waist, edge
     share = np.array([1.0, 0.6, 0.0])[:, None]
     y = share * levels[:, 1]
     z = np.broadcast_to(levels[:, 2], y.shape).copy()
@@ -207,8 +213,9 @@ def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface, footprint_m
         (-length / 2, 0, plate_z - 0.1, 0.05, 0.52 + more, 0.11 + more, 0, *plate),
         (length * (0.46 - profile.cabin[0]), 0, 0.45 * height, 0.4, 0.8 * width, 0.14 * height, 0, 0.05, 0.5, 0),
     ]
-    nose, tail = length / 2 - 0.55 * hull.nose_bow, -length / 2 + 0.6 * hull.tail_bow
-    mirror = (0.5 - profile.cabin[0] - 0.05) * length
+    nose, tail = length / 2 - 0.55 * hull.nose_bow, 0.035 - length / 2 + 0.6 * hull.tail_bow
+    mirror = (0.5 - profile.glass[0][0] - float(rng.uniform(0.0, 0.05))) * length  # at the foot of the windscreen
+    mirror_z = profile.belt * height + float(rng.uniform(-0.03, 0.1))
     stands_out = float(rng.uniform(0.03, 0.08))
     lamp_m = float(rng.uniform(0.08, 0.2))  # height of the rear ones
     for sign in (1, -1):
@@ -216,7 +223,7 @@ def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface, footprint_m
             (tail, sign * width * 0.40, 0.5 * height, 0.08, 0.10 + more, lamp_m + more, 0, *rear_lamp),
             (tail - 0.03, sign * width * 0.38, 0.24 * height, 0.06, 0.06 + more, 0.03 + more, 0, 2.5, 0.4, 0),
             (nose - 0.02 * length, sign * width * 0.38, 0.38 * height, 0.08, 0.24 + more, 0.11 + more, 0, *front_lamp),
-            (mirror, sign * (width / 2 + stands_out), profile.belt * height, 0.10, 0.17, 0.13, 0, *paint.row),
+            (mirror, sign * (width / 2 + stands_out), mirror_z, 0.10, 0.17, 0.13, 0, *paint.row),
         ]
     return cuboids(rows)
 
@@ -238,4 +245,7 @@ def _seats(rng: np.random.Generator, hull: _Hull) -> Primitives:
             rows.append((front + 0.05, y, 0.80 * hull.height, 0.10, 0.08, 0.12, 0.12))
     table = np.array(rows)
     surface = np.column_stack([table[:, 6], np.full(len(table), 0.3), np.zeros(len(table))])
-    return ellipsoids(table[:, :3], table[:, 3:6], surface)
+    # Hardly a return comes from beyond the front seats, whichever end one looks in at.
+    half, top = 0.43 * hull.width, 0.72 * hull.height
+    wall = [(front, half, 0.3), (front, -half, 0.3), (front, -half, top), (front, half, top)]
+    return Primitives.join([ellipsoids(table[:, :3], table[:, 3:6], surface), quads([wall], Surface(0.0))])

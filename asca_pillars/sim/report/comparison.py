@@ -13,6 +13,8 @@ from asca_pillars.sim.report.scan_statistics import MATERIALS, OBJECTS, unit_his
 
 RATIO_BAR = 0.15
 DISTANCE_BAR = 0.15
+MIN_DRIVES = 3  # drives of KITTI that know a statistic, from which on they say how far it may be off
+MIN_FIT_BAR = 0.03
 BARRED_RANGES_M = (10, 20, 30, 40)
 CAR_RANGES_M = (*BARRED_RANGES_M, 50)
 
@@ -47,9 +49,11 @@ class Row:
         group: heading under which the row stands.
         real, simulated: the two values; of histograms their means, where these say something.
         measure: what `value` is: simulated / real, simulated - real, or the Jensen-Shannon distance.
-        bar: how far a ratio may be from 1, or how large a distance; None where the row is for information.
-        noise: what chance alone would do, where it is known: the standard error of a ratio; the distance to expect
-            of as few objects (or scans) as the real reflectances come from, or of as few labels as this set has.
+        bar: how far a ratio may be from 1, a difference from 0, or how large a distance; None where the row is for
+            information.
+        noise: what chance alone would do, where it is known: the standard error of a ratio or a difference; the
+            distance to expect of as few objects (or scans) as the real reflectances come from, or of as few labels as
+            this set has.
         noise_of_points: the distance to expect of as many independent points as the real reflectances are.
     """
 
@@ -68,13 +72,17 @@ class Row:
         """Whether the row keeps its bar; None without one."""
         if self.bar is None:
             return None
-        return self.value < self.bar if self.measure == "distance" else abs(self.value - 1) <= self.bar
+        return self.value < self.bar if self.measure == "distance" else self.away <= self.bar
+
+    @property
+    def away(self) -> float:
+        """How far the value is from that of two equal sets."""
+        return abs(self.value - 1) if self.measure == "ratio" else abs(self.value)
 
     @property
     def excused(self) -> bool:
         """Whether a bar is missed by no more than chance would: better cannot be told from as little real data."""
-        away = self.value if self.measure == "distance" else abs(self.value - 1)
-        return self.within is False and self.noise is not None and away <= self.noise
+        return self.within is False and self.noise is not None and self.away <= self.noise
 
 
 @dataclass(frozen=True)
@@ -100,6 +108,7 @@ def compare(measured: Measured, real: Statistics) -> Comparison:
         *_car_rows(real.scan, ours.scan),
         *_reflectance_rows(real.scan, measured),
         *_band_rows(real.scan, ours.scan),
+        *_fit_rows(real, ours),
         *(row for name in real.labels if name in ours.labels for row in _label_rows(name, real, ours)),
         _ratio("labels", "DontCare per frame", real.dont_care_per_frame, ours.dont_care_per_frame),
     ]
@@ -157,6 +166,21 @@ def _band_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
     for band, (first, second) in enumerate(zip(reflectance, ours.ground_reflectance, strict=True)):
         if first and second:
             yield _ratio("ground", f"mean reflectance, {_range_name(band)}", first.mean, second.mean)
+
+
+def _fit_rows(real: Statistics, ours: Statistics) -> Iterator[Row]:
+    """The median of the drives, and whether this set is no farther from it than the drives are from each other."""
+    for name, drives in real.label_fit.items():
+        if name not in ours.label_fit:
+            continue
+        (own,) = ours.label_fit[name]
+        middle = float(np.median([drive.middle for drive in drives]))
+        spread = max(abs(drive.middle - middle) for drive in drives)
+        # A normal distribution holds four fifths of itself within 1.28 deviations; medians scatter by 1.25 / sqrt(n).
+        noise = 1.25 * (own.high - own.low) / 2.56 / np.sqrt(own.objects)
+        bar = max(spread, MIN_FIT_BAR) if len(drives) >= MIN_DRIVES else None
+        group = "where points lie in their labels (m, shares)"
+        yield Row(group, name, middle, own.middle, "difference", own.middle - middle, bar, float(noise))
 
 
 def _label_rows(name: str, real: Statistics, ours: Statistics) -> Iterator[Row]:

@@ -9,8 +9,9 @@ from rich.progress import track
 
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import DatasetError
+from asca_pillars.sim.report.fit_statistics import fits_of
 from asca_pillars.sim.report.label_statistics import label_statistics
-from asca_pillars.sim.report.reference import Statistics, kitti_reference
+from asca_pillars.sim.report.reference import CLASSES, Statistics, kitti_reference
 from asca_pillars.sim.report.scan_statistics import ScanRecord, measure_scan, scan_statistics
 
 MAX_SCANS = 300
@@ -42,4 +43,5 @@ def measure(root: str | Path, *, max_scans: int = MAX_SCANS, progress: bool = Tr
     records = [
         measure_scan(split, frame_ids[index], sensor) for index in track(chosen, "Measuring", disable=not progress)
     ]
-    return Measured(Statistics(str(root), scan_statistics(records), len(frame_ids), labels, dont_care), records)
+    fits = fits_of({name: np.concatenate([record.fits[name] for record in records]) for name in CLASSES}, str(root))
+    return Measured(Statistics(str(root), scan_statistics(records), len(frame_ids), labels, dont_care, fits), records)

@@ -5,7 +5,7 @@ What a scan that was cut to the camera's view cannot tell is None. Ranges are in
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
@@ -147,14 +147,37 @@ class LabelStatistics(Strict):
 
 
 @dataclass(frozen=True)
+class Fit(Strict):
+    """One statistic of how labels lie around points (`fit_statistics`), over the objects of one drive or folder.
+
+    Attributes:
+        source: the drive or folder.
+        objects: of which the statistic is known.
+        middle: median over them; of a share, their mean.
+        low, high: 10th and 90th percentile.
+    """
+
+    source: str
+    objects: int
+    middle: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class Statistics(Strict):
-    """Of a data set: its scans, the labels of CLASSES (those of which there are any), and DontCare areas per frame."""
+    """Of a data set: its scans, the labels of CLASSES (those of which there are any), and DontCare areas per frame.
+
+    `label_fit` tells by "Car flank_end" and the like how labels lie around points: of KITTI drive by drive, because
+    the cars of a drive are few and one annotator's.
+    """
 
     source: str
     scan: ScanStatistics
     frames: int
     labels: dict[str, LabelStatistics]
     dont_care_per_frame: float
+    label_fit: dict[str, tuple[Fit, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image, objects_3d
+from asca_pillars.data.kitti import KittiObject, KittiSplit, boxes_from_objects, in_image, objects_3d
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.sim.report.fit_statistics import object_fits
 from asca_pillars.sim.report.ground_points import ground_mask
 from asca_pillars.sim.report.reference import (
     BAND_M,
@@ -48,6 +49,7 @@ class ScanRecord:
         ground_sums: (3, 2, BANDS) number, sum and sum of squares of z and of reflectance of ground returns.
         reflectance: by material, (units, REFLECTANCES) counts of the scan or of each object in it.
         cars: (C, 2) range and points of its unoccluded, untruncated cars.
+        fits: by class, as `fit_statistics.object_fits` gives them.
     """
 
     points: int
@@ -60,6 +62,7 @@ class ScanRecord:
     ground_sums: NDArray[np.float64]
     reflectance: dict[str, _Counts]
     cars: NDArray[np.float64]
+    fits: dict[str, NDArray[np.float64]]
 
 
 def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor) -> ScanRecord:
@@ -79,7 +82,9 @@ def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor) -> ScanRecord
     sums = [[np.bincount(band, q**power, BANDS)[:BANDS] for q in quantities] for power in (0, 1, 2)]
     reflectance = {"overall": _histogram(value)[None], "ground": _histogram(value[ground])[None]}
     reflectance["non_ground"] = reflectance["overall"] - reflectance["ground"]
-    of_objects, cars = _objects(split, frame_id, points, value)
+    objects = objects_3d(split.objects(frame_id))
+    boxes = boxes_from_objects(objects, split.calibration(frame_id))
+    of_objects, cars = _objects(objects, boxes, points, value)
     return ScanRecord(
         len(points),
         int(camera.sum()),
@@ -91,6 +96,7 @@ def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor) -> ScanRecord
         np.array(sums),
         reflectance | of_objects,
         cars,
+        object_fits(points, objects, boxes),
     )
 
 
@@ -171,11 +177,9 @@ def ring_counts(points: NDArray[np.floating[Any]], sensor: Sensor) -> _Counts:
 
 
 def _objects(
-    split: KittiSplit, frame_id: str, points: NDArray[np.float32], value: _Counts
+    objects: Sequence[KittiObject], boxes: NDArray[np.float32], points: NDArray[np.float32], value: _Counts
 ) -> tuple[dict[str, _Counts], NDArray[np.float64]]:
     """Reflectances of the objects of a frame by type, and range and points of its unhidden cars."""
-    objects = objects_3d(split.objects(frame_id))
-    boxes = boxes_from_objects(objects, split.calibration(frame_id))
     inside = points_in_boxes(points, boxes)
     body = inside & (points[:, None, 2] > boxes[:, 2] - boxes[:, 5] / 2 + _ABOVE_BOTTOM_M)
     types = np.array([item.type.lower() for item in objects])

@@ -1,6 +1,6 @@
 """The comparison as text: on the console, as Markdown and as JSON."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
@@ -15,12 +15,13 @@ from asca_pillars.files import write_json, write_text
 from asca_pillars.own_files import page_end
 from asca_pillars.schema import to_dict
 from asca_pillars.sim.report.comparison import Comparison, Row
-from asca_pillars.sim.report.reference import CAR_FIT_RANGE_M, NEAR_CARS_M
+from asca_pillars.sim.report.reference import CAR_FIT_RANGE_M, NEAR_CARS_M, Fit
 from asca_pillars.sim.report.scan_statistics import OBJECTS
 
 _COLUMNS = ("", "KITTI", "this set", "ratio\nor JS", "bar", "kept", "by\nchance")
 _LEFT = 1
 PAGE_END = page_end("asca simulate")
+_BARS = {"ratio": "1+-{:g}", "difference": "+-{:.2f}", "distance": "< {:g}"}
 _MEASURES = {"ratio": "x {:.2f}", "difference": "{:+.2f}", "distance": "JS {:.3f}"}
 
 
@@ -83,8 +84,23 @@ def to_markdown(comparison: Comparison, plots: Sequence[str]) -> str:
     for group in dict.fromkeys(row.group for row in comparison.rows):
         rows = [_cells(row) for row in comparison.rows if row.group == group]
         parts.append(f"## {group[0].upper()}{group[1:]}\n\n{markdown_table(columns, rows, _LEFT)}")
+    real, ours = comparison.real.label_fit, comparison.simulated.label_fit
+    if ours:
+        both = {name: real.get(name, ()) + ours.get(name, ()) for name in dict.fromkeys([*real, *ours])}
+        parts.append(f"## The same by drive\n\n{fits_table(both)}")
     parts += [f"![{name.removesuffix('.png').replace('_', ' ')}]({name})\n" for name in plots]
     return "\n".join(parts)
+
+
+def fits_table(fits: Mapping[str, Sequence[Fit]]) -> str:
+    """Medians of how labels lie around points, a column for each drive or folder, with the numbers of objects."""
+    sources = list(dict.fromkeys(fit.source for of in fits.values() for fit in of))
+    rows = []
+    for name, of in fits.items():
+        known = {fit.source: fit for fit in of}
+        cells = [f"{fit.middle:+.2f} ({fit.objects})" if (fit := known.get(source)) else "" for source in sources]
+        rows.append((name, *cells))
+    return markdown_table(["", *sources], rows, _LEFT)
 
 
 def to_json(comparison: Comparison) -> dict[str, Any]:
@@ -109,7 +125,7 @@ def _plain(row: Row) -> dict[str, Any]:
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    bar = "" if row.bar is None else f"< {row.bar:g}" if row.measure == "distance" else f"1+-{row.bar:g}"
+    bar = "" if row.bar is None else _BARS[row.measure].format(row.bar)
     within = {None: "", True: "yes", False: "NO"}[row.within]
     noise = "" if row.noise is None else f"{row.noise:.3f}" if row.measure == "distance" else f"+-{row.noise:.2f}"
     value = _MEASURES[row.measure].format(row.value) if isfinite(row.value) else ""  # of nothing there is no ratio

@@ -34,6 +34,20 @@ from asca_pillars.sim.world.lookalikes import (
     stack,
     thin_cylinder,
 )
+from asca_pillars.sim.world.low_clutter import (
+    banded_bollards,
+    before_a_wall,
+    bicycle_at_post,
+    cabinet_and_panel,
+    footed_trunk,
+    litter_bin,
+    low_sign,
+    posts_at_corners,
+    slim_pillars,
+    tapered_stone,
+    wall_corner,
+    warning_barrier,
+)
 from asca_pillars.sim.world.markers import (
     beacon,
     board,
@@ -93,6 +107,10 @@ FAR: tuple[Thing, ...] = (
     covered_thing,
     board,
     mast,
+    low_sign,
+    tapered_stone,
+    footed_trunk,
+    banded_bollards,
 )  # low and sparse clutter beyond 28 m
 SHARES: dict[Thing, float] = {
     pole: 0.09,
@@ -129,4 +147,16 @@ SHARES: dict[Thing, float] = {
     wall_end: 0.03,
     fragments: 0.05,
     low_pieces: 0.03,
+    banded_bollards: 0.09,
+    litter_bin: 0.06,
+    cabinet_and_panel: 0.03,
+    before_a_wall: 0.05,
+    footed_trunk: 0.06,
+    tapered_stone: 0.05,
+    slim_pillars: 0.05,
+    low_sign: 0.06,
+    warning_barrier: 0.04,
+    bicycle_at_post: 0.02,
+    wall_corner: 0.06,
+    posts_at_corners: 0.03,
 }

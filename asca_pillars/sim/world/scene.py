@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.sim.bodies import bicycles, cycles, heavy, people, styles, vehicles
+from asca_pillars.sim.bodies import bicycles, cycles, heavy, people, shape_noise, styles, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
 from asca_pillars.sim.scalar_draws import draws_of
@@ -129,8 +129,8 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     x, y, z, length, width, height, yaw = target.box
     name, footprint = target.type, BEAM_M_PER_M * float(np.hypot(x, y))
     if name in ("Car", "Van"):
-        # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, mostly outside.
-        slack = rng.uniform((0.0, 0.0, -0.03), (0.24, 0.14, 0.09))
+        # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, on either side.
+        slack = rng.uniform((-0.08, -0.04, -0.05), (0.12, 0.10, 0.06))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.1
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark, footprint)
@@ -149,7 +149,18 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         body = people.sitting_body(rng, height - 0.05)
     else:
         body = bicycles.cyclist_body(rng, height - 0.08, width, length - 0.04, footprint)
+    most = float(rng.uniform(*config.warp_m))
+    if name in ("Pedestrian", "Person_sitting", "Cyclist"):
+        body = shape_noise.scaled(body, rng.uniform((0.94, 0.94, 0.98), (1.06, 1.06, 1.02)))
+        most *= 0.7  # of a person's size, waves as high as a car's would tear limbs apart
+    body = shape_noise.warped(rng, body, most)
+    if rng.random() < config.dark_patch_share:
+        body = shape_noise.darkened(rng, body)
     dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
+    if name in ("Pedestrian", "Person_sitting"):
+        # Annotators center a person's box on what they see, which is the side towards the sensor.
+        behind = rng.normal(*config.person_behind_box_m) / max(float(np.hypot(x, y)), 1.0)
+        dx, dy = dx + behind * x, dy + behind * y
     return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from asca_pillars.sim.world.builder import Builder
 from asca_pillars.sim.world.furniture import cabinet, pole
 from asca_pillars.sim.world.lookalikes import post_with_box, thin_cylinder
+from asca_pillars.sim.world.low_clutter import litter_bin, slim_pillars
 from asca_pillars.sim.world.markers import board, fragments, mast, wall_end
 from asca_pillars.sim.world.placement import Target
 from asca_pillars.sim.world.vegetation import bush, shrub, tree
@@ -21,7 +22,16 @@ def _tall_shrub(builder: Builder, along: float, across: float) -> None:
 
 
 BEFORE: tuple[Thing, ...] = (_tall_shrub, _tall_shrub, bush, pole, mast, tree, cabinet, post_with_box)
-BEHIND: tuple[Thing, ...] = (fragments, fragments, board, post_with_box, thin_cylinder, wall_end)
+BEHIND: tuple[Thing, ...] = (
+    fragments,
+    fragments,
+    board,
+    post_with_box,
+    thin_cylinder,
+    wall_end,
+    slim_pillars,
+    litter_bin,
+)
 
 
 def hide_partly(builder: Builder, targets: Sequence[Target]) -> None:

@@ -7,12 +7,16 @@ thinner bodies with a lidar's ray of no width would.
 import numpy as np
 import pytest
 
+from asca_pillars.evaluation.errors.label_fit import label_fit
 from asca_pillars.sim.bodies.bicycles import bicycle, cyclist_body
 from asca_pillars.sim.bodies.burdens import SHARES, draw_burden
 from asca_pillars.sim.bodies.people import pedestrian_body
 from asca_pillars.sim.bodies.styles import draw_style
 from asca_pillars.sim.bodies.vehicles import car_body
-from asca_pillars.sim.world.scene import BEAM_M_PER_M
+from asca_pillars.sim.report.fit_statistics import COLUMNS, WINDOW_RETURNS, window_returns
+from asca_pillars.sim.scene_config import SceneConfig
+from asca_pillars.sim.world.placement import Target
+from asca_pillars.sim.world.scene import BEAM_M_PER_M, body_of
 from tests.sim.bodies.single_body import view
 
 SEEDS = range(24)
@@ -67,6 +71,55 @@ def test_cars_shine_at_plates_and_lamps_and_have_low_windows() -> None:
     assert 0.075 < bright < 0.16
     assert middle < 0.255
     assert 0.4 < np.mean([(points[:, 3] == 0).mean() for points in seen]) < 0.75
+
+
+def label_fits(yaw_rad: float, distance_m: float) -> np.ndarray:
+    """Statistics (24, columns) of cars 1.5 m left of straight ahead, as their labels would have them."""
+    rows = []
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        target = Target("Car", np.array([distance_m, 1.5, 0.75, 3.9, 1.63, 1.5, 0.0]))
+        body = body_of(target, SceneConfig(), rng).placed(-distance_m, -1.5, 0.0, 0.0)
+        seen = view(body, distance_m, yaw_rad, seed)[:, :3]
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        x, y = seen[:, 0] * cos - seen[:, 1] * sin + distance_m, seen[:, 0] * sin + seen[:, 1] * cos
+        box = np.array([distance_m, 0.0, 0.75, 3.9, 1.63, 1.5, yaw_rad])
+        points = np.column_stack([x, y, seen[:, 2]])
+        rows.append([*label_fit(points, box[None])[0], window_returns(points, box)])
+    return np.array(rows)
+
+
+def test_cars_from_behind_end_where_those_of_kitti_do() -> None:
+    """Flanks 0.07 to 0.57 m before the label's far face, last upper points (mirrors) at 0.5 to 0.7 of the length."""
+    seen = dict(zip(COLUMNS, label_fits(0.2, 12.0).T, strict=True))
+    assert -0.42 < np.nanmedian(seen["flank_end"]) < -0.08
+    assert 0.5 < np.nanmedian(seen["upper_end"]) < 0.72
+    assert 1.3 < np.nanmedian(seen["roof_end"]) < 2.1, "a rail runs along the roof above the windows"
+    assert -0.14 < np.nanmedian(seen["nearest_point"]) < 0.02
+    assert -0.18 < np.nanmedian(seen["rear_width"]) < -0.03
+    assert -0.13 < np.nanmedian(seen["top_97"]) < -0.04
+    assert np.nanmean(seen["low_inside"]) < 0.15
+
+
+def test_side_windows_return_at_least_half_as_often_as_doors() -> None:
+    """KITTI's by drive: 0.55 to 0.95."""
+    windows = label_fits(0.7, 14.0)[:, COLUMNS.index(WINDOW_RETURNS)]
+    assert 0.35 < np.nanmedian(windows) < 1.1
+
+
+def test_people_stand_behind_the_middle_of_their_labels() -> None:
+    """Annotators center a box on what they see: KITTI's 5 % and median of range are 0.2 and 0.09 m before it."""
+    rows = []
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        box = np.array([15.0, 0.0, 0.85, 0.85, 0.66, 1.7, float(rng.uniform(-3.1, 3.1))])
+        body = body_of(Target("Pedestrian", box), SceneConfig(), rng).placed(-15.0, 0.0, 0.0, 0.0)
+        points = view(body, 15.0, 0.0, seed)[:, :3] + (15.0, 0.0, 0.0)
+        rows.append(label_fit(points, box[None])[0])
+    fits = dict(zip(COLUMNS, np.array(rows).T, strict=False))
+    assert -0.27 < np.nanmedian(fits["range_5"]) < -0.12
+    assert -0.12 < np.nanmedian(fits["range_50"]) < 0.0
+    assert 0.45 < np.nanmedian(fits["range_spread"]) < 0.8
 
 
 @pytest.mark.parametrize("length", [1.45, 1.7, 2.1])
