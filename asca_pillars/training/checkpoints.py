@@ -112,3 +112,10 @@ def checkpoint_to_resume(folder: Path) -> tuple[Path | None, str | None]:
             f"with the weights of this one if {folder / BEST} is there: --init {folder / BEST}"
         )
     return None, None
+
+
+def steps_of(checkpoint: Path | None) -> int:
+    """Optimizer steps of the run that a checkpoint, which can be read, is of; 0 without one."""
+    if checkpoint is None:
+        return 0
+    return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"])
