@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.processes import in_processes
 
-ABOUT_FILE = "simulation.json"
 Item = TypeVar("Item")
 
 
@@ -45,7 +45,7 @@ def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
     Raises:
         DatasetError: the scans there are of something else.
     """
-    path = root / ABOUT_FILE
+    path = root / SIMULATION_FILE
     text = json.dumps(about, indent=2) + "\n"
     if not path.exists():
         if any(scans.rglob("*.bin")):
