@@ -147,7 +147,11 @@ class TrainConfig(Strict):
 
     Attributes:
         schedule: `step` multiplies the rate by `decay` every `decay_epochs`; `one_cycle` rises to
-            `learning_rate` and falls to almost nothing over the run, step by step.
+            `learning_rate` and falls to almost nothing over the run, step by step; `warmup_stable_decay` rises in
+            `warmup_steps`, stays, and falls linearly to almost nothing in the last `cooldown` of the run, so that a
+            run may be made longer until it falls.
+        warmup_steps: optimizer steps in which the rate of `warmup_stable_decay` rises.
+        cooldown: share of all steps in which the rate of `warmup_stable_decay` falls.
         gradient_clip: largest norm of the whole gradient; 0 leaves it as it is.
         precision: `fp32`, `bf16`, or `auto`: bf16 where the device has it.
         ema: decay of an exponential moving average of the weights, such as 0.999, that is validated, saved and
@@ -159,9 +163,11 @@ class TrainConfig(Strict):
     batch_size: int = 6
     learning_rate: float = 2e-4
     weight_decay: float = 0.0
-    schedule: Literal["step", "one_cycle"] = "step"
+    schedule: Literal["step", "one_cycle", "warmup_stable_decay"] = "step"
     decay: float = 0.8
     decay_epochs: int = 15
+    warmup_steps: int = 500
+    cooldown: float = 0.2
     gradient_clip: float = 10.0
     precision: Precision = "fp32"
     ema: float = 0.0
@@ -171,6 +177,8 @@ class TrainConfig(Strict):
     def __post_init__(self) -> None:
         require_bounds("train", self, ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"), low=1)
         require_bounds("train", self, ("learning_rate", "weight_decay", "decay", "gradient_clip", "seed"), low=0)
+        require_bounds("train", self, ("warmup_steps",), low=0)
+        require_bounds("train", self, ("cooldown",), low=0, high=1)
         for name in ("learning_rate", "decay"):
             if not getattr(self, name):
                 raise ConfigError(f"train.{name} = 0: nothing would be learnt; must be more than 0")

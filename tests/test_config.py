@@ -78,7 +78,11 @@ def test_the_model_for_simulated_streets_has_the_papers_width_and_a_sparse_neck(
     config = load_config("asca_sim")
     assert isinstance(config.model, PillarModel)
     assert config.model.network == NetworkConfig(neck="sparse", active_cells="fine")
-    assert config.model.spec.grid.zones == 1 and config.train.ema == 0.999 and config.train.schedule == "one_cycle"
+    assert (
+        config.model.spec.grid.zones == 1
+        and config.train.ema == 0.999
+        and config.model.spec.ranges.x_m == config.model.spec.ranges.y_m
+    )
     assert [(spec.positive_iou, spec.negative_iou) for spec in config.model.spec.classes] == [
         (0.6, 0.45),
         (0.35, 0.2),

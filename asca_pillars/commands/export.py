@@ -39,6 +39,15 @@ def export(
             "--score", help="CLASS=VALUE: report this class from this score on. Repeatable. Default: the config's."
         ),
     ] = None,
+    range_m: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            "--range",
+            metavar="X0 X1 Y0 Y1",
+            help="Where the bundle looks for objects, in metres; the weights are the same for every range. Default: "
+            "the checkpoint's. Ahead alone: 0 69.12 -30.72 30.72",
+        ),
+    ] = None,
     int8: Annotated[
         bool, typer.Option("--int8", help="8-bit backbone: several times faster on a CPU, a quarter of the size.")
     ] = False,
@@ -88,6 +97,8 @@ def export(
 
     asca export asca_sim --dense-neck -o asca_sim_dense
 
+    asca export asca_sim --range 0 51.2 -25.6 25.6 -o asca_sim_near
+
     asca export my_bundle --golden -o golden
     """
     if golden or browser or ort_web is not None:
@@ -96,6 +107,7 @@ def export(
         of_a_checkpoint = {
             "--trained-on": trained_on,
             "--score": score,
+            "--range": range_m,
             "--int8": int8,
             "--calibrate": calibrate,
             "--dense-neck": dense_neck,
@@ -125,6 +137,7 @@ def export(
         open_source,
         print_quantization,
         read_or_simulate,
+        with_ranges,
     )
     from asca_pillars.errors import ConfigError
     from asca_pillars.own_files import require_not_input, require_replaceable
@@ -136,8 +149,10 @@ def export(
     loaded = source.checkpoint
     scores = source.score_thresholds | dict(class_score(text) for text in score or ())
     spec = loaded.config.model.spec.with_score_threshold(scores)
+    if range_m is not None:
+        spec = with_ranges(spec, range_m)
     model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
-    loaded = loaded._replace(config=replace(loaded.config, model=model))
+    loaded = loaded.with_model(model)
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
     kind = loaded.config.model.kind

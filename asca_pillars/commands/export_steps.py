@@ -1,6 +1,7 @@
 """What `asca export` reads beside the checkpoint, and how it reports 8 bits."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +18,9 @@ from asca_pillars.commands.extras import require
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.pillars.pillar_spec import PillarSpec
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
 CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
@@ -85,6 +88,18 @@ def class_score(text: str) -> tuple[str, float]:
         return name, float(value)
     except ValueError:
         raise ConfigError(f"--score {text}: write a class and its score, such as Car=0.35") from None
+
+
+def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:
+    """The same detector that looks for objects elsewhere: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
+
+    Raises:
+        ConfigError: it is no detector on pillars, or pillars do not fill these ranges; the nearest that fit are named.
+    """
+    if not isinstance(spec, PillarSpec):
+        raise ConfigError("--range: only detectors on pillars look elsewhere with the same weights; leave it out")
+    x0, x1, y0, y1 = range_m
+    return replace(spec, grid=replace(spec.grid, x_range_m=(x0, x1), y_range_m=(y0, y1)))
 
 
 def read_or_simulate(

@@ -4,13 +4,14 @@ import hashlib
 import pickle
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from asca_pillars.config import Config
+from asca_pillars.config import Config, ModelConfig
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.files import atomic_path
@@ -34,6 +35,12 @@ class Checkpoint(NamedTuple):
     detector: Trainable
     steps: int
     expected_input: ExpectedInput | None = None
+
+    def with_model(self, model: ModelConfig) -> "Checkpoint":
+        """The same weights in a network of another `spec`: other ranges, thresholds or post-processing."""
+        detector = build_model(model)
+        detector.load_state_dict(self.detector.state_dict())
+        return self._replace(config=replace(self.config, model=model), detector=detector.eval())
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:

@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import write_text
 from asca_pillars.own_files import json_object, require_own, require_own_file
 from asca_pillars.processes import in_processes
 
-ABOUT_FILE = "simulation.json"
 COMMAND = "asca simulate"
 Item = TypeVar("Item")
 
@@ -63,7 +63,7 @@ def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
     Raises:
         DatasetError: the scans there are of something else.
     """
-    path = root / ABOUT_FILE
+    path = root / SIMULATION_FILE
     text = json.dumps(about, indent=2) + "\n"
     if not path.exists():
         if any(scans.rglob("*.bin")):

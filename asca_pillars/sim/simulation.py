@@ -19,11 +19,11 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
+from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
 from asca_pillars.sim.parallel import (
-    ABOUT_FILE,
     check_wishes,
     claim_simulation,
     for_each,
@@ -164,7 +164,7 @@ def simulate(
             todo,
             cluster,
             shard_size=_SHARD_FRAMES,
-            seen=root / ABOUT_FILE,
+            seen=root / SIMULATION_FILE,
             folders=[split.folder / name for name in ("velodyne", "label_2", "calib")],
             title="Simulating",
             progress=progress,

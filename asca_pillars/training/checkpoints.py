@@ -152,3 +152,10 @@ def _why_unusable(path: Path, model: ModelConfig) -> str | None:
     if wrong := [name for name in wanted if found.get(name) != wanted[name]]:
         return f"is of another network ({wrong[0].removeprefix('detector.')} differs)"
     return None
+
+
+def steps_of(checkpoint: Path | None) -> int:
+    """Optimizer steps of the run that a checkpoint, which can be read, is of; 0 without one."""
+    if checkpoint is None:
+        return 0
+    return int(read_plain(checkpoint)["global_step"])

@@ -33,6 +33,7 @@ from asca_pillars.training.checkpoints import (
     BestCheckpoint,
     LastCheckpoint,
     checkpoint_to_resume,
+    steps_of,
 )
 from asca_pillars.training.initial_weights import initial_weights
 from asca_pillars.training.loaders import DetectionData
@@ -60,8 +61,9 @@ def train(
     Args:
         config: what to train.
         data_root: a dataset's folder, see `data.open_split`.
-        out: folder of this run; one run with the same config in it is resumed exactly. With the `step` schedule it
-            may be made longer by more `train.epochs`, and is then what the longer run would have been. A run there
+        out: folder of this run; one run with the same config in it is resumed exactly. With the `step` schedule,
+            and with `warmup_stable_decay` until its rate falls, it may be made longer by more `train.epochs`, and is
+            then what the longer run would have been. A run there
             that has no checkpoint yet gives way.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
@@ -107,7 +109,7 @@ def _train(
     interrupt = SaveOnInterrupt(last)
     trainer = _trainer(config, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes)
     data = DetectionData(config, data_root)
-    claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights))
+    claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights), steps_of(resumed))
     say = rank_zero_only(Console(markup=False, highlight=False).print)
     if damage is not None and goes_on:
         say(f"{damage}: going on from {resumed}")

@@ -16,6 +16,7 @@ from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.models.build import build_model
 from asca_pillars.schema import to_dict
 from asca_pillars.training.dataset import Batch
+from asca_pillars.training.schedules import make_schedule, steps_per_epoch
 
 
 class DetectionModule(L.LightningModule):
@@ -83,18 +84,7 @@ class DetectionModule(L.LightningModule):
             weight_decay=recipe.weight_decay,
             decoupled_weight_decay=True,
         )
-        steps = self.steps_per_epoch()
-        if recipe.schedule == "step":
-            # Counted in steps, so that a checkpoint taken just before the end of an epoch holds all of its state.
-            schedule: Any = torch.optim.lr_scheduler.StepLR(optimizer, recipe.decay_epochs * steps, recipe.decay)
-        else:
-            schedule = torch.optim.lr_scheduler.OneCycleLR(
-                optimizer,
-                max_lr=recipe.learning_rate,
-                total_steps=recipe.epochs * steps,
-                pct_start=0.3,  # of fast.ai's one cycle, torch's default, stated because it is the recipe
-                div_factor=10,  # as OpenPCDet starts it
-            )
+        schedule = make_schedule(optimizer, recipe, self.steps_per_epoch())
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def steps_per_epoch(self) -> int:
@@ -104,7 +94,7 @@ class DetectionModule(L.LightningModule):
         which the sampler is to go on.
         """
         frames = len(self.trainer.datamodule.training_set)  # type: ignore[attr-defined]
-        return int(frames // (self.config.train.batch_size * self.trainer.world_size))
+        return steps_per_epoch(self.config.train, frames, self.trainer.world_size)
 
     def _require_finite(self, terms: Mapping[str, Tensor], batch: Batch) -> None:
         for name, value in terms.items():

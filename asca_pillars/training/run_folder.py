@@ -32,6 +32,7 @@ from asca_pillars.training.run_files import (
     is_own_config,
     is_own_expected_input,
 )
+from asca_pillars.training.schedules import cooldown_start, steps_per_epoch
 
 EXPECTED_INPUT_FRAMES = 200
 # Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.
@@ -65,11 +66,18 @@ class Seen(NamedTuple):
         return cls(len(sizes), hashlib.sha256("\n".join(sizes).encode()).hexdigest(), processes, start)
 
 
-def claim(out: Path, config: Config, seen: Seen) -> None:
+def claim(out: Path, config: Config, seen: Seen, steps: int = 0) -> None:
     """Write what this run is into `out`, or make sure that the run found there is the same one.
 
-    A run of the `step` schedule may be made longer: its steps so far are those of the longer run. One without any
-    checkpoint has learnt nothing, so that another takes its place.
+    A run may be made longer where its steps so far are those of the longer run: always with the `step` schedule, and
+    with `warmup_stable_decay` until its rate falls. One without any checkpoint has learnt nothing, so that another
+    takes its place.
+
+    Args:
+        out: folder of the run.
+        config: of the run.
+        seen: its frames, processes and first weights.
+        steps: optimizer steps of the run that is there.
 
     Raises:
         TrainingError: the run there is another one, or drew from other frames, or in more or fewer processes, or
@@ -79,7 +87,7 @@ def claim(out: Path, config: Config, seen: Seen) -> None:
     path, frames_path = out / CONFIG_FILE, out / FRAMES_FILE
     require_own_file(path, COMMAND, is_own_config)
     found = read_settings(Seen, frames_path, (), {}) if frames_path.exists() else None
-    refusal = _why_another(path, config) if path.exists() else None
+    refusal = _why_another(path, config, seen, steps) if path.exists() else None
     refusal = refusal or (found and _why_other_frames(frames_path, found, seen))
     if refusal and any((out / "checkpoints").glob("*.ckpt")):
         raise TrainingError(refusal)
@@ -121,22 +129,32 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool) -> ExpectedI
     return measured
 
 
-def _why_another(path: Path, config: Config) -> str | None:
+def _why_another(path: Path, config: Config, seen: Seen, steps: int) -> str | None:
     """In what words `config` is another run than the one that `path` is of; None if it is the same, or longer."""
     found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
     found = to_dict(found_config)
     if found_config.train.precision == "auto":  # of an older version, which did not write down what it became
         found["train"]["precision"] = config.train.precision
     longer = config.train.epochs > found_config.train.epochs
-    if longer and config.train.schedule == "step":
+    recipe = found_config.train
+    planned = recipe.epochs * steps_per_epoch(recipe, seen.frames, seen.processes)
+    extendable = recipe.schedule == "step" or (
+        recipe.schedule == "warmup_stable_decay" and steps <= cooldown_start(recipe, planned)
+    )
+    if longer and extendable:
         found["train"]["epochs"] = config.train.epochs
     difference = _first_difference(found, to_dict(config))
     if difference is None:
         return None
     if longer and difference.startswith("train.epochs"):
         return (
-            f"{path}: the run there was started with {difference}; a one_cycle schedule is planned for its whole "
-            f"length: start a new run in another --out with --init {path.parent / 'checkpoints' / 'last.ckpt'}"
+            f"{path}: the run there was started with {difference}; "
+            + (
+                f"the learning rate has fallen since step {cooldown_start(recipe, planned)} of {planned}"
+                if recipe.schedule == "warmup_stable_decay"
+                else "a one_cycle schedule is planned for its whole length"
+            )
+            + f": start a new run in another --out with --init {path.parent / 'checkpoints' / 'last.ckpt'}"
         )
     return f"{path}: the run there was started with {difference}; choose another --out, or delete it"
 

@@ -1,19 +1,24 @@
 """`asca export` on checkpoints and on bundles that hold their weights: what is written, and what is refused."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.bundle import WEIGHTS
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.data.scans.scan_reader import write_scan
 from asca_pillars.models.checkpoint import load_checkpoint, weights_sha256
+from asca_pillars.pillars.grid import PillarGrid
 from tests.export.test_sparse_bundle import sparse_checkpoint
-from tests.export.tiny import SCANS
+from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.in_process import run_here
 from tests.saved_checkpoint import save_checkpoint
+from tests.scenes import SPEC
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +63,27 @@ def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path
         assert load_pillar_bundle(folder).spec.classes[0].score_threshold == score
     weights, kept = (load_checkpoint(each / WEIGHTS).detector.state_dict() for each in (with_weights, folder))
     assert weights_sha256(weights) == weights_sha256(kept)
+
+
+def test_the_same_weights_look_elsewhere(scans: Path, tmp_path: Path) -> None:
+    grid = PillarGrid((4.8, 29.76), (-9.6, 9.6), SPEC.grid.z_range_m, v_max_m=0.24, v_y_m=0.24, zones=1)
+    spec = dataclasses.replace(SPEC.with_score_threshold(0.02), grid=grid)
+    save_checkpoint(tmp_path / "last.ckpt", tiny_checkpoint("none", spec, neck="sparse"))
+    tail = ("--scans", scans)
+    for name, ranges in (("ahead", ()), ("around", ("--range", "-20.16", "29.76", "-9.6", "9.6"))):
+        exported = run_here("export", tmp_path / "last.ckpt", "-o", tmp_path / name, *ranges, *tail)
+        assert exported.returncode == 0, exported.stderr
+    ahead, around = (Detector(tmp_path / name) for name in ("ahead", "around"))
+    assert around.spec.ranges.x_m == (-20.16, 29.76)
+    points = SCANS[0][SCANS[0][:, 0] >= 4.8]
+    narrow, wide = ahead(points).boxes, around(points).boxes
+    assert len(narrow) > 3 and _all_in(narrow[narrow[:, 0] > 8], wide) and _all_in(wide[wide[:, 0] > 8], narrow)
+    refused = run_here("export", tmp_path / "last.ckpt", "--range", "0", "1.5", "0", "3", "-o", tmp_path / "no", *tail)
+    assert refused.returncode == 2 and "x_range_m" in refused.stderr
+
+
+def _all_in(boxes: NDArray[np.float32], others: NDArray[np.float32]) -> bool:
+    return bool((np.abs(boxes[:, None] - others[None]).max(-1).min(1) < 1e-3).all())
 
 
 def test_what_has_no_masked_form_is_refused_before_scans_are_read(with_weights: Path, tmp_path: Path) -> None:

@@ -234,6 +234,19 @@ def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> N
         claim(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"), SEEN)
 
 
+def test_a_stable_run_may_be_made_longer_until_its_rate_falls(tmp_path: Path) -> None:
+    def of(epochs: int) -> Config:
+        recipe = TrainConfig(epochs=epochs, batch_size=1, schedule="warmup_stable_decay", cooldown=0.25)
+        return dataclasses.replace(CONFIG, train=recipe)
+
+    seen = Seen(10, "ab", 1)  # ten steps an epoch: of four epochs the last ten steps fall
+    claim(tmp_path, of(4), seen)
+    learn(tmp_path)
+    with pytest.raises(TrainingError, match=r"fallen since step 30 of 40: start .*--init .*last\.ckpt"):
+        claim(tmp_path, of(8), seen, steps=31)
+    claim(tmp_path, of(8), seen, steps=30)
+
+
 def test_a_run_that_learnt_nothing_gives_way(tmp_path: Path) -> None:
     """The corrected command may be given again, and nothing of the mistaken one stays."""
     claim(tmp_path, CONFIG, SEEN)

@@ -10,8 +10,10 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
+from asca_pillars.config import TrainConfig
 from asca_pillars.training.callbacks import weight_average
 from asca_pillars.training.module import DetectionModule
+from asca_pillars.training.schedules import cooldown_start, warmup_stable_decay
 from tests.training.test_loop import with_train
 
 EPOCHS, RANKS, FRAMES = 5, 3, 29
@@ -54,6 +56,22 @@ def test_one_cycle_rises_for_three_tenths_of_the_run_and_ends_with_it() -> None:
         lowest + (1e-3 - lowest) * (1 + np.cos(np.pi * (step - peak) / (end - peak))) / 2 for step in range(peak, 20)
     ]
     np.testing.assert_allclose(used, up + down, rtol=1e-6)
+
+
+def test_a_stable_rate_rises_stays_and_falls_to_the_last_step() -> None:
+    used = rates(schedule="warmup_stable_decay", warmup_steps=3, cooldown=0.25)  # 20 steps, the last five fall
+    up = [0.25, 0.5, 0.75]
+    down = [5 / 6, 4 / 6, 3 / 6, 2 / 6, 1 / 6]
+    np.testing.assert_allclose(used, [1e-3 * factor for factor in [*up, *[1] * 12, *down]], rtol=1e-9)
+
+
+def test_a_longer_stable_run_begins_as_the_shorter_one() -> None:
+    recipe = TrainConfig(schedule="warmup_stable_decay", warmup_steps=3, cooldown=0.25)
+    for total in (1, 7, 20, 33):
+        until = cooldown_start(recipe, total)
+        same = [warmup_stable_decay(recipe, total, step) for step in range(until)]
+        assert same == [warmup_stable_decay(recipe, 100, step) for step in range(until)]
+        assert all(warmup_stable_decay(recipe, total, step) > 0 for step in range(total))
 
 
 def test_weights_decay_beside_the_gradient_and_not_through_it() -> None:

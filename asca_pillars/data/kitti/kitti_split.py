@@ -7,6 +7,7 @@ root/training/velodyne/000000.bin   root/testing/velodyne/...
      ImageSets/train.txt, val.txt ...: one frame id per line
 """
 
+import json
 import struct
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ from asca_pillars.files import atomic_path
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.input_files import read_text, require_content
 
+SIMULATION_FILE = "simulation.json"
+"""What `asca simulate` notes of its frames, in the dataset's folder."""
 _PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # the signature, then length and name of the first chunk
 
 
@@ -42,9 +45,24 @@ class KittiSplit:
     root: str | Path
     name: str = "training"
 
-    has_camera = True
     one_reflectance_scale = False
     mounting = Mounting()
+
+    @cached_property
+    def has_camera(self) -> bool:
+        """Whether labels stand only where a camera sees: everywhere but in what `asca simulate --view around` wrote.
+
+        Raises:
+            DatasetError: the note of the simulation is damaged.
+        """
+        path = Path(self.root) / SIMULATION_FILE
+        try:
+            about = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return True
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{path}: cannot be read ({' '.join(str(error).split())}); simulate it anew") from None
+        return not (isinstance(about, dict) and about.get("field_of_view") == "around")
 
     @property
     def pool(self) -> str:
@@ -150,7 +168,7 @@ class KittiSplit:
         return points
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(N,) all of the positions: the layout does not say whether labels stand beyond the camera's view, too."""
+        """(N,) all of the positions."""
         return np.ones(len(positions), bool)
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:

@@ -1,5 +1,6 @@
 """The folder layout, and real frames where there are some."""
 
+import json
 import math
 import os
 import struct
@@ -18,6 +19,7 @@ from asca_pillars.data.kitti import (
     write_labels,
 )
 from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.errors import DatasetError
 from tests.cameras import assert_one_line
 
 BOX_FIELDS = ("height_m", "width_m", "length_m", "x_m", "y_m", "z_m", "rotation_y")
@@ -86,6 +88,16 @@ def test_image_size_is_read_from_the_png_or_assumed(root):
     for damaged in (b"", start[:20], b"\xff\xd8\xff\xe0" + bytes(40), start[:16] + bytes(8)):
         split.image_path("000001").write_bytes(damaged)
         assert_one_line(split.image_path("000001"), ["no PNG"], lambda: split.image_size_wh("000001"))
+
+
+def test_labels_stand_all_around_where_the_simulator_says_so(root):
+    assert KittiSplit(root).has_camera
+    for view, camera in (("around", False), ("full", True), ("camera", True)):
+        (root / "simulation.json").write_text(json.dumps({"seed": 1, "field_of_view": view}))
+        assert KittiSplit(root).has_camera is camera
+    (root / "simulation.json").write_text("{")
+    with pytest.raises(DatasetError, match=r"simulation\.json"):
+        _ = KittiSplit(root).has_camera
 
 
 def test_a_list_that_is_not_text_is_named(root):
