@@ -4,21 +4,23 @@ import contextlib
 import math
 import multiprocessing
 import os
+import signal
+import traceback
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeVar
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, NamedTuple, TypeVar
 
 from rich.console import Console
 from rich.progress import track
 
-from asca_pillars.errors import WorkerError
+from asca_pillars.errors import AscaError, WorkerError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # How many threads linear algebra, OpenCV and PyTorch use.
 _THREADS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OMP_NUM_THREADS")
-_LOOK_AGAIN_S = 1.0
-_job: Callable[[Any], Any] | None = None
 
 
 def in_processes(
@@ -44,47 +46,110 @@ def in_processes(
 
     Raises:
         Exception: that of the job.
-        WorkerError: a process was killed.
+        WorkerError: a process was killed, or cannot be started.
     """
     workers = min(workers, math.ceil(len(todo) / at_once))
     with contextlib.ExitStack() as stack:
         if workers > 1:
-            stack.enter_context(one_thread_per_process())
-            others = {process.pid for process in multiprocessing.active_children()}
-            # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
-            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(workers, _take_job, (job,)))
-            own = {process.pid for process in multiprocessing.active_children()} - others
-            shares = (todo[first : first + at_once] for first in range(0, len(todo), at_once))
-            results = _while_all_live(pool.imap(_do_job, shares), own)
+            pool = stack.enter_context(_pool(job, workers))
+            results = _shared_out(todo, at_once, pool)
         else:
             results = map(job, todo)
         yield from track(results, title, total=len(todo), console=console, disable=not progress)
 
 
-def _while_all_live(shares: Any, processes: set[int | None]) -> Iterator[Any]:
-    """The results of `pool.imap`, which waits forever for those of a process that was killed."""
-    while True:
+_Pool = dict[Any, BaseProcess]
+"""Processes by the pipe (`Connection`) that each has of its own.
+
+The pools of the standard library have queues in common, whose locks a process takes with it when it is killed: the
+others, and the one that started them, then wait forever.
+"""
+
+
+class _Failed(NamedTuple):
+    """In the place of a result, the error of the job."""
+
+    error: Exception
+
+
+@contextlib.contextmanager
+def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
+    """Processes that do a job for the items that they are sent, and end with the block.
+
+    Raises:
+        WorkerError: one cannot be started.
+    """
+    # Fork would copy the threads of whatever library runs here; a fresh interpreter per worker cannot hang.
+    context = multiprocessing.get_context("spawn")
+    pool: _Pool = {}
+    try:
         try:
-            yield from shares.next(timeout=_LOOK_AGAIN_S)
-        except StopIteration:
-            return
-        except multiprocessing.TimeoutError:
-            if dead := processes - {process.pid for process in multiprocessing.active_children()}:
+            with one_thread_per_process():
+                for _ in range(workers):
+                    here, there = context.Pipe()
+                    with there:
+                        process = context.Process(target=_work, args=(job, there), daemon=True)
+                        process.start()
+                    pool[here] = process
+        except OSError as error:
+            raise WorkerError(f"a worker process cannot be started ({error}); use fewer workers") from None
+        yield pool
+    finally:
+        for connection, process in pool.items():
+            connection.close()
+            process.kill()  # it waits for items, or nobody waits for what it does
+        for process in pool.values():
+            process.join()
+
+
+def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]:
+    """The results of the items, in their order.
+
+    Raises:
+        Exception: that of the job.
+        WorkerError: a process was killed.
+    """
+    starts = iter(range(0, len(todo), at_once))
+    at: dict[Any, int] = {}  # the first item of what each process is at
+    done: dict[int, list[Any]] = {}
+    for wanted in range(0, len(todo), at_once):
+        while wanted not in done:
+            try:
+                for connection in pool.keys() - at.keys():
+                    if (start := next(starts, None)) is not None:
+                        connection.send(todo[start : start + at_once])
+                        at[connection] = start
+                for connection in wait(list(at)):
+                    done[at.pop(connection)] = connection.recv()  # type: ignore[union-attr]
+            except (EOFError, ConnectionError):
+                dead = sum(process.exitcode is not None for process in pool.values()) or 1
                 raise WorkerError(
-                    f"{len(dead)} of {len(processes)} worker processes were killed, perhaps for want of memory; "
-                    "use fewer workers"
+                    f"{dead} of {len(pool)} worker processes were killed, perhaps for want of memory; use fewer workers"
                 ) from None
+        for result in done.pop(wanted):
+            if isinstance(result, _Failed):
+                raise result.error
+            yield result
 
 
-def _take_job(job: Callable[[Any], Any]) -> None:
-    """In a new process: keep the job. Sent with the items, it would be pickled again with each few of them."""
-    global _job
-    _job = job
+def _work(job: Callable[[Any], Any], connection: Connection) -> None:
+    """In a new process: do the job for items as long as there are some."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches it, too; the process that started it ends it
+    with contextlib.suppress(EOFError, ConnectionError):  # that one has ended
+        while True:
+            connection.send(_results(job, connection.recv()))
 
 
-def _do_job(items: Sequence[Any]) -> list[Any]:
-    assert _job is not None
-    return [_job(item) for item in items]
+def _results(job: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    results: list[Any] = []
+    for item in items:
+        try:
+            results.append(job(item))
+        except Exception as error:
+            if not isinstance(error, AscaError):
+                error.add_note(traceback.format_exc())
+            return [*results, _Failed(error)]
+    return results
 
 
 @contextlib.contextmanager

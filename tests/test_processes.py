@@ -1,9 +1,14 @@
 """Jobs in processes: the results of one process, in its order, whatever their number."""
 
+import errno
 import os
 import signal
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import cv2
@@ -60,6 +65,78 @@ def test_a_process_that_is_killed_ends_the_work() -> None:
     results = in_processes(killed, range(40), 2, "Killed", progress=False)
     with pytest.raises(WorkerError, match=r"1 of 2 worker processes were killed, .*; use fewer workers"):
         list(results)
+
+
+def killed_later(number: int) -> int:
+    if number == 0:
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return number
+
+
+def test_a_process_that_is_killed_while_it_waits_ends_the_work() -> None:
+    """In a pool of the standard library it takes the lock of the common queue with it."""
+    results = in_processes(killed_later, range(8), 2, "Killed", at_once=1, progress=False)
+    assert next(results) == 0
+    time.sleep(1)
+    with pytest.raises(WorkerError, match="were killed"):
+        list(results)
+
+
+class TwoArgumentsError(Exception):
+    """Cannot be unpickled, as the errors of several libraries."""
+
+    def __init__(self, first: str, second: str) -> None:
+        super().__init__(first + second)
+
+
+def fails_oddly(number: int) -> int:
+    if number == 5:
+        raise TwoArgumentsError("one", "two")
+    return number
+
+
+def test_an_error_that_cannot_be_sent_ends_the_work() -> None:
+    with pytest.raises(TypeError, match="second"):
+        list(in_processes(fails_oddly, range(40), 2, "Odd", progress=False))
+
+
+def test_a_process_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Refused(SpawnProcess):
+        def start(self) -> None:
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("multiprocessing.context.SpawnContext.Process", Refused)
+    with pytest.raises(WorkerError, match="cannot be started .*; use fewer workers"):
+        list(squares(50, 2))
+
+
+def asleep(number: int) -> int:
+    print(os.getpid(), flush=True)
+    time.sleep(1)
+    return number
+
+
+MAIN = """
+from asca_pillars.processes import in_processes
+from tests.test_processes import asleep
+if __name__ == "__main__":
+    list(in_processes(asleep, range(100), 2, "Asleep", at_once=1, progress=False))
+"""
+
+
+def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
+    (tmp_path / "main.py").write_text(MAIN)
+    command = [sys.executable, str(tmp_path / "main.py")]
+    path = os.pathsep.join([str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")])
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=os.environ | {"PYTHONPATH": path}
+    ) as main:
+        assert main.stdout is not None
+        processes: set[int] = set()
+        while len(processes) < 2:
+            processes.add(int(main.stdout.readline()))
+        main.kill()
+        main.communicate(timeout=30)  # until the last process that could write there has ended
 
 
 def test_the_job_is_sent_once(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Labelled frames: points with the boxes and classes that a detector is to find in them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -14,6 +14,15 @@ from asca_pillars.geometry.ranges import Ranges
 
 # What KITTI's protocol treats as neither right nor wrong for a class.
 NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
+
+
+def other_spelling(name: str, types: Iterable[str]) -> str | None:
+    """The one of `types` that differs from `name` in case, blanks or punctuation alone; None if there is none."""
+    return next((kind for kind in types if kind != name and _letters(kind) == _letters(name)), None)
+
+
+def _letters(name: str) -> str:
+    return "".join(letter for letter in name.casefold() if letter.isalnum())
 
 
 class Motion(NamedTuple):

@@ -47,7 +47,7 @@ def require_own_simulation(root: Path, about_keys: Sequence[str], folders: Itera
     Raises:
         OutputError: something else is there, such as a list that was edited, or a link.
     """
-    require_own(root, COMMAND, {ABOUT_FILE: json_object(*about_keys)}, folders=("ImageSets", *folders))
+    require_own(root, COMMAND, {SIMULATION_FILE: json_object(*about_keys)}, folders=("ImageSets", *folders))
     for name in ("train", "val"):
         require_own_file(root / "ImageSets" / f"{name}.txt", COMMAND, _names_successive_frames)
 

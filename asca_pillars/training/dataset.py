@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 from asca_pillars.config import Config
 from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.data.training_frames import TrainingFrames, open_frames
-from asca_pillars.errors import AscaError
+from asca_pillars.errors import AscaError, WorkerError
 from asca_pillars.models.build import build_preparation
 from asca_pillars.models.trainable import Movable, Preparation
 
@@ -95,6 +95,8 @@ class LabeledDataset(Dataset[Sample | AscaError]):
             return self.sample(*index)
         except AscaError as error:
             return error
+        except (OSError, MemoryError) as error:
+            return WorkerError(f"frame {self.frame_ids[index[1]]} cannot be loaded ({error or type(error).__name__})")
 
     def sample(self, epoch: int, number: int) -> Sample:
         """One sample.

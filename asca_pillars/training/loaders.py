@@ -1,6 +1,10 @@
 """Training and validation batches, loaded by processes of their own."""
 
-from collections.abc import Callable
+import atexit
+import contextlib
+import multiprocessing
+import weakref
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +12,76 @@ import lightning as L  # noqa: N812  (Lightning's own convention)
 from torch.utils.data import DataLoader
 
 from asca_pillars.config import Config
+from asca_pillars.errors import WorkerError
 from asca_pillars.training.dataset import Collate, LabeledDataset, open_dataset
-from asca_pillars.training.loader_processes import leave_interrupts_to_the_loop, loader_context
+from asca_pillars.training.loader_processes import loader_context, start_loader_process
 from asca_pillars.training.sampler import EpochSampler
+from asca_pillars.training.shared_batches import ShareCollated
+
+LOOK_AGAIN_S = 5
+"""Seconds without a batch after which the loop looks whether all processes live."""
+MOST_LOOKS = 180
+"""Looks without a batch after which it gives up: a quarter of an hour, in which the run was not suspended."""
+_REMEDY = (
+    "lower data.workers or set data.workers=0, or give a container more memory (--memory, --shm-size); the same command "
+    "goes on from the last checkpoint"
+)
+
+
+class BatchLoader(DataLoader[Any]):
+    """A `DataLoader` that ends with one line, and never waits forever, when its processes fail."""
+
+    _processes: frozenset[Any] = frozenset()
+
+    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
+        """The batches.
+
+        Raises:
+            WorkerError: a process has ended, cannot be started or cannot send a batch, or there is none for too long.
+        """
+        if self.num_workers == 0:
+            yield from super().__iter__()
+            return
+        batches: Any = None
+        looks = 0
+        while True:
+            try:
+                batches = self._start() if batches is None else batches
+                batch = next(batches)
+            except StopIteration:
+                return
+            except (OSError, EOFError, RuntimeError) as error:
+                text = " ".join(str(error).split())
+                if text.startswith("Caught "):  # as torch begins what the work in a process raised
+                    raise
+                late = text.startswith("DataLoader timed out")
+                looks += 1
+                if late and looks < MOST_LOOKS:
+                    continue
+                _kill(self)
+                reason = f"no batch in {looks * LOOK_AGAIN_S} seconds" if late else text
+                raise WorkerError(f"the processes that load batches failed ({reason}); {_REMEDY}") from None
+            looks = 0
+            yield batch
+
+    def _start(self) -> Iterator[Any]:
+        """Batches of one epoch; notes the processes that the first one starts."""
+        # torch's loader leaves a traceback where it gets no lock; here are as many as its queues have, and some more.
+        _ = [loader_context().Lock() for _ in range(4 * self.num_workers + 8)]
+        others = set(multiprocessing.active_children())
+        batches = super().__iter__()
+        if started := set(multiprocessing.active_children()) - others:
+            self._processes |= started
+            # Python's own exit sends them a SIGTERM, which they do not follow the first time, and waits for them.
+            atexit.register(_kill, weakref.proxy(self))
+        return batches
+
+
+def _kill(loader: BatchLoader) -> None:
+    """End the processes of a loader, if it has any: one that is stopped or keeps waiting hears nothing else."""
+    with contextlib.suppress(ReferenceError):  # the loader is gone, and they with it
+        for process in loader._processes:
+            process.kill()
 
 
 class DetectionData(L.LightningDataModule):
@@ -42,12 +113,16 @@ class DetectionData(L.LightningDataModule):
             rank=trainer.global_rank if trainer else 0,
             world_size=trainer.world_size if trainer else 1,
         )
-        return DataLoader(
+        collate = Collate(frames.preparation)
+        if self.workers == 0:
+            return BatchLoader(frames, batch_sampler=sampler, collate_fn=collate)
+        return BatchLoader(
             frames,
             batch_sampler=sampler,
             num_workers=self.workers,
-            collate_fn=Collate(frames.preparation),
-            persistent_workers=self.workers > 0,
-            worker_init_fn=leave_interrupts_to_the_loop,
-            multiprocessing_context=loader_context() if self.workers else None,
+            collate_fn=ShareCollated(collate),
+            persistent_workers=True,
+            worker_init_fn=start_loader_process,
+            multiprocessing_context=loader_context(),
+            timeout=LOOK_AGAIN_S,
         )

@@ -19,6 +19,7 @@ from rich.console import Console
 from asca_deploy.bundle import WEIGHTS
 from asca_pillars.config import Config, ModelConfig, TrainConfig
 from asca_pillars.data.open_split import open_split
+from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.errors import TrainingError
 from asca_pillars.locks import only_writer, recover
 from asca_pillars.models.checkpoint import save_weights
@@ -79,7 +80,7 @@ def train(
             NaN.
         TrainingInterruptedError: Ctrl-C; the run is saved.
         OutputError: another process trains in `out`.
-        DatasetError, ScanError: the data cannot be read.
+        DatasetError, ScanError: the data cannot be read, or no training frame has a box of any class.
         BundleError, ExportError, ConfigError: the first stage of two cannot be used, or `init` is a bundle without
             weights.
     """
@@ -108,9 +109,12 @@ def _train(
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
     trainer = _trainer(config, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes)
+    say = rank_zero_only(Console(markup=False, highlight=False).print)
+    for name, training in ((config.data.train_set, True), (config.data.val_set, False)):
+        for warning in require_boxes(open_split(data_root, name), config, training=training):
+            say(warning, style="yellow", soft_wrap=True)
     data = DetectionData(config, data_root)
     claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights), steps_of(resumed))
-    say = rank_zero_only(Console(markup=False, highlight=False).print)
     if damage is not None and goes_on:
         say(f"{damage}: going on from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():

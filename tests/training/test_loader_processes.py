@@ -24,7 +24,7 @@ def test_a_process_starts_with_what_it_needs_and_without_the_loop() -> None:
 
 
 def answer(connection: Connection) -> None:
-    leave_interrupts_to_the_loop(0)
+    leave_interrupts_to_the_loop()
     connection.send("ready")
     while connection.recv() is None:
         connection.send("still here")

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.config import DataConfig, InsertConfig
-from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.data.frames import LabeledFrame, other_spelling
 from asca_pillars.data.insertion.free_maps import load_free_space
 from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
 from asca_pillars.data.insertion.free_space import FreeSpace
@@ -102,10 +102,12 @@ def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, 
 
 def _nothing_to_insert(split: LabeledSplit, name: str, min_points: int, objects: int) -> str:
     if not objects:
-        return (
-            f"{split.root}: list `{split.name}` has no {name} with a point in it; "
-            "`asca inspect --propose` writes a configuration with the classes that are labelled"
-        )
+        types = {kind for frame_id in split.frame_ids for kind in split.label_types(frame_id)}
+        other = other_spelling(name, sorted(types))
+        remedy = "`asca inspect --propose` writes a configuration with the classes that are labelled"
+        if other is not None:
+            remedy = f"the labels spell it '{other}'; rename it there or in model.spec.classes"
+        return f"{split.root}: list `{split.name}` has no {name} with a point in it; {remedy}"
     return (
         f"{split.root}: list `{split.name}` has no {name} with {min_points} or more points to insert; "
         "lower augment.insert.min_points, or name the other classes in augment.insert.proportions"

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
+from asca_pillars.data.frames import other_spelling
 from asca_pillars.data.input_check import TOLERANCE_M
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
@@ -78,9 +79,8 @@ def _why_none(facts: ClassFacts, inspection: Inspection, spec: InspectedSpec, mi
 
 
 def _why_no_boxes(name: str, inspection: Inspection) -> str:
-    for other in inspection.types:
-        if other.casefold() == name.casefold():
-            return f"the labels spell it '{other}'; rename it there or in model.spec.classes"
+    if (other := other_spelling(name, inspection.types)) is not None:
+        return f"the labels spell it '{other}'; rename it there or in model.spec.classes"
     there = ", ".join(f"{kind} {count}" for kind, count in inspection.types.items()) or "none at all"
     if inspection.sampled:
         advice = f"look at all frames with --frames {inspection.frames_in_split}, or list other frames in ImageSets/"

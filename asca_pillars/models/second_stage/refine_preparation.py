@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
+from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 from asca_pillars.config import DataConfig
 from asca_pillars.data.augment import move_scene
@@ -35,31 +37,20 @@ class PreparedRefinement(NamedTuple):
     """(S,) those that the loss counts."""
 
 
-@dataclass(frozen=True)
-class LabeledProposals:
+class LabeledProposals(NamedTuple):
     """Proposals of B frames with their neighbours and targets."""
 
     inputs: RefineInputs
     targets: RefineTargets
-    learnt: torch.Tensor
+    learnt: Tensor
     """(R,) bool, the proposals that the loss counts."""
     proposals: tuple[Detections, ...]
     """Of each frame."""
 
     def to(self, device: Any) -> "LabeledProposals":
         """The same with its tensors on `device`."""
-        here = self.inputs
-        inputs = RefineInputs(
-            points=here.points.to(device),
-            keypoints=here.keypoints.to(device),
-            bev=here.bev.to(device),
-            ball_indices=tuple(part.to(device) for part in here.ball_indices),
-            grid_points=here.grid_points.to(device),
-            grid_indices=tuple(part.to(device) for part in here.grid_indices),
-            roi_features=here.roi_features.to(device),
-        )
-        targets = RefineTargets(*(value.to(device) for value in self.targets))
-        return LabeledProposals(inputs, targets, self.learnt.to(device), self.proposals)
+        moved: LabeledProposals = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
+        return moved
 
 
 class ProposalSource(Protocol):

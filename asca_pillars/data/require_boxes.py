@@ -1,0 +1,89 @@
+"""A look at the labels before a training: without a box that can be learnt it would run to its end in vain."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich.progress import track
+
+from asca_pillars.config import Config
+from asca_pillars.data.frames import other_spelling, read_frame, within_ranges
+from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.errors import DatasetError
+
+FRAMES_WITH_POINTS = 50
+"""Frames with boxes whose points are looked at before all of them are taken to be without points."""
+
+
+@dataclass
+class _Labels:
+    """Boxes of a list so far: by type, by class within the detector's ranges, and whether one has enough points."""
+
+    types: Counter[str] = field(default_factory=Counter)
+    in_ranges: Counter[str] = field(default_factory=Counter)
+    frames_read: int = 0
+    one_with_points: bool = False
+
+
+def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> list[str]:
+    """Make sure that a list has boxes of the classes that are to be learnt; a line for each class that has none.
+
+    Frames are read only until every class was found.
+
+    Args:
+        split: the training or the validation list.
+        config: classes, ranges, and how many points a box needs.
+        training: whether it is refused if there is no box at all. A validation list is refused only if its labels spell
+            the classes in another way.
+
+    Raises:
+        DatasetError: there is no box of any class that could be learnt; a label or scan cannot be read.
+    """
+    names = config.model.spec.class_names
+    labels = _Labels()
+    order = np.random.default_rng(0).permutation(len(split.frame_ids)).tolist()
+    for number in track(order, "Looking for boxes of each class", transient=True):
+        _add(labels, split, split.frame_ids[number], config)
+        if labels.one_with_points and all(labels.in_ranges[name] for name in names):
+            return []
+    missing = [name for name in names if not labels.in_ranges[name]]
+    place = f"{split.root}: list `{split.name}`"
+    if len(missing) == len(names):
+        respelled = any(other_spelling(name, labels.types) for name in names)
+        text = f"{place} has no box of {', '.join(names)}: {_why(missing, labels)}"
+        if training or respelled:
+            raise DatasetError(text)
+        return [f"{text}; recall cannot be measured"]
+    if training and not labels.one_with_points:
+        raise DatasetError(
+            f"{place}: none of the boxes in {labels.frames_read} frames has data.min_points = {config.data.min_points} "
+            "points inside; labels (and calib) must belong to the scans: see `asca inspect`"
+        )
+    cannot = "it cannot be learnt" if training else "its recall cannot be measured"
+    return [f"{place} has no box of {name}, {cannot}: {_why([name], labels)}" for name in missing]
+
+
+def _add(labels: _Labels, split: LabeledSplit, frame_id: str, config: Config) -> None:
+    spec, data = config.model.spec, config.data
+    boxes, types = split.labeled_boxes(frame_id)
+    labels.types.update(types)
+    held = spec.ranges.hold_centers(boxes)
+    own = [name for name, inside in zip(types, held, strict=True) if inside and name in spec.class_names]
+    labels.in_ranges.update(own)
+    if own and not labels.one_with_points and labels.frames_read < FRAMES_WITH_POINTS:
+        labels.frames_read += 1
+        view = data.camera_view and split.has_camera
+        frame = read_frame(split, frame_id, spec.class_names, camera_view=view, min_points=data.min_points)
+        labels.one_with_points = bool((within_ranges(frame, spec.ranges).labels >= 0).any())
+
+
+def _why(names: list[str], labels: _Labels) -> str:
+    spellings = {name: other for name in names if (other := other_spelling(name, labels.types)) is not None}
+    if spellings:
+        listed = ", ".join(f"'{other}'" for other in spellings.values())
+        return f"the labels spell {'it' if len(spellings) == 1 else 'them'} {listed}; rename there or in model.spec.classes"
+    if outside := [name for name in names if labels.types[name]]:
+        count = sum(labels.types[name] for name in outside)
+        return f"{count} lie outside the ranges of model.spec.grid; widen them, see `asca inspect`"
+    there = ", ".join(f"{kind} {count}" for kind, count in labels.types.most_common(10)) or "none at all"
+    return f"labels there: {there}; list other frames in ImageSets/, or take other classes (`asca inspect --propose`)"

@@ -1,0 +1,93 @@
+"""Processes that load batches: when one fails, the run ends with one line, and never waits for it."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from asca_pillars.config import Config, TrainConfig
+from asca_pillars.errors import WorkerError
+from asca_pillars.pillar_config import NetworkConfig, PillarModel
+from asca_pillars.schema import to_dict
+from asca_pillars.training import loaders
+from asca_pillars.training.loader_processes import loader_context, start_loader_process
+from asca_pillars.training.loaders import BatchLoader
+from tests.scenes import SPEC, write_dataset
+from tests.training.failing_numbers import Numbers
+
+
+def loader_of(what: str, timeout: float = 1) -> BatchLoader:
+    return BatchLoader(
+        Numbers(what),  # type: ignore[arg-type]
+        batch_size=2,
+        num_workers=2,
+        collate_fn=list,
+        persistent_workers=True,
+        worker_init_fn=start_loader_process,
+        multiprocessing_context=loader_context(),
+        timeout=timeout,
+    )
+
+
+def test_batches_come_in_order_epoch_after_epoch() -> None:
+    loader = loader_of("")
+    for _ in range(2):
+        assert list(loader) == [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9], [10, 11]]
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [("SIGKILL", "exited unexpectedly"), ("unsendable", "exited unexpectedly"), ("SIGSTOP", "no batch in 4 seconds")],
+)
+def test_a_process_that_fails_ends_the_run(what: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loaders, "MOST_LOOKS", 4)
+    monkeypatch.setattr(loaders, "LOOK_AGAIN_S", 1)
+    start = time.monotonic()
+    with pytest.raises(WorkerError, match=f"{said}.*data.workers=0") as caught:
+        list(loader_of(what))
+    assert "\n" not in str(caught.value)
+    assert time.monotonic() - start < 60
+
+
+@pytest.mark.parametrize("size", ["1m", "4k"])
+def test_training_where_shared_memory_is_small(size: str, tmp_path: Path) -> None:
+    """It goes on, or ends with the remedy where there is no room for the locks of a queue."""
+    alone = ["unshare", "--mount", "--map-root-user"]
+    small = [*alone, "sh", "-c", f'mount -t tmpfs -o size={size} tmpfs /dev/shm && exec "$0" "$@"']
+    if sys.platform != "linux" or subprocess.run([*small, "true"], capture_output=True).returncode:
+        pytest.skip("a file system of its own cannot be mounted here")
+    data = write_dataset(tmp_path / "data", 9)
+    network = NetworkConfig(pillar_channels=8, block_channels=(8, 8, 8), block_convs=(1, 1, 1), upsample_channels=8)
+    config = Config(model=PillarModel(spec=SPEC, network=network), train=TrainConfig(epochs=1, batch_size=4))
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(config)))
+    command = [sys.executable, "-m", "asca_pillars.cli", "train", str(tmp_path / "config.yaml"), "--data", str(data)]
+    run = subprocess.run(
+        [*small, *command, "--out", str(tmp_path / "run")], capture_output=True, text=True, timeout=300
+    )
+    if size == "4k":
+        assert run.returncode == 2 and len(run.stderr.splitlines()) == 1
+        assert "data.workers=0" in run.stderr and "--shm-size" in run.stderr
+    else:
+        assert run.returncode == 0, run.stderr
+        assert (tmp_path / "run" / "checkpoints" / "last.ckpt").exists()
+
+
+LEFT_OPEN = """
+from tests.training.test_loaders import loader_of
+if __name__ == "__main__":
+    loader = loader_of("")
+    next(iter(loader))
+"""
+
+
+def test_a_program_ends_whose_loader_was_left_open(tmp_path: Path) -> None:
+    """Loader processes do not follow the first SIGTERM, and Python sends them no second one."""
+    (tmp_path / "main.py").write_text(LEFT_OPEN)
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    subprocess.run(
+        [sys.executable, str(tmp_path / "main.py")], check=True, timeout=120, env=os.environ | {"PYTHONPATH": path}
+    )

@@ -1,0 +1,124 @@
+"""Batches between processes: the same tensors, and none of them through /dev/shm."""
+
+import os
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_flatten
+
+from asca_pillars.config import Config
+from asca_pillars.errors import DatasetError, WorkerError
+from asca_pillars.pillar_config import NetworkConfig, PillarModel
+from asca_pillars.training.dataset import Batch, Collate, open_dataset
+from asca_pillars.training.loader_processes import loader_context
+from asca_pillars.training.shared_batches import ShareCollated, SharedInputs
+from tests.models.pv_rcnn.tiny_pv_rcnn import tiny_config
+from tests.models.second_stage.tiny_refine import opened_config, write_first_stage
+from tests.scenes import SPEC, write_dataset
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
+
+
+class Inner(NamedTuple):
+    tensors: tuple[Tensor, ...]
+    count: int
+
+
+class Outer(NamedTuple):
+    inner: Inner
+    nothing: None
+    array: np.ndarray
+
+
+def made_up() -> Outer:
+    generator = torch.Generator().manual_seed(3)
+    tensors = (
+        torch.rand((7, 3), generator=generator),
+        torch.zeros((0, 4), dtype=torch.int64),
+        torch.tensor(5, dtype=torch.int8),
+        torch.rand((4, 6), generator=generator, dtype=torch.float64).T,  # not contiguous
+        torch.tensor([True, False, True]),
+        torch.arange(100_000, dtype=torch.int32),
+    )
+    return Outer(Inner(tensors, 3), None, np.arange(4))
+
+
+def send(connection: Connection) -> None:
+    connection.send(SharedInputs(made_up()))
+    connection.recv()
+
+
+def test_another_process_gets_the_same_tensors() -> None:
+    context = loader_context()
+    here, there = context.Pipe()
+    process = context.Process(target=send, args=(there,))
+    process.start()
+    found, expected = here.recv(), made_up()
+    assert isinstance(found, Outer) and found.inner.count == 3 and found.nothing is None
+    assert np.array_equal(found.array, expected.array)
+    for own, other in zip(found.inner.tensors, expected.inner.tensors, strict=True):
+        assert own.dtype == other.dtype and own.shape == other.shape and torch.equal(own, other)
+        assert own.data_ptr() % 64 == 0
+    found.inner.tensors[0].zero_()  # it may be written
+    here.send(None)
+    process.join()
+    assert int(found.inner.tensors[5][-1]) == 99_999  # and lives on when the other has ended
+    here.close()
+    there.close()
+
+
+def a_batch(inputs: Any) -> Batch:
+    return Batch(["000000"], [np.zeros((0, 7), np.float32)], [np.zeros(0, np.int64)], inputs)
+
+
+def inputs_of(family: str, root: Path) -> Any:
+    """A batch of two frames of this family of detectors."""
+    network = NetworkConfig(neck="sparse" if family == "sparse" else "dense")
+    configs = {
+        "pv_rcnn": tiny_config,
+        "pillar_refine": lambda: opened_config(write_first_stage(root / "first.ckpt")),
+    }
+    make = configs.get(family, lambda: Config(model=PillarModel(spec=SPEC, network=network)))
+    frames = open_dataset(write_dataset(root / "data", 3), make(), training=True)
+    batch = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
+    assert isinstance(batch, Batch)
+    return batch.inputs
+
+
+@pytest.mark.parametrize("family", ["pillar", "sparse", "pv_rcnn", "pillar_refine"])
+def test_no_tensor_of_any_family_is_left_to_torch(family: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torch stores what it pickles for another process in /dev/shm."""
+
+    def refuse(tensor: Tensor) -> Any:
+        raise AssertionError(f"{tuple(tensor.shape)} goes through /dev/shm")
+
+    inputs = inputs_of(family, tmp_path)
+    count = sum(isinstance(leaf, Tensor) for leaf in tree_flatten(inputs)[0])
+    assert count > 5
+    monkeypatch.setitem(ForkingPickler._extra_reducers, Tensor, refuse)  # type: ignore[attr-defined]
+    with pytest.raises(AssertionError, match="goes through"):
+        ForkingPickler.dumps(a_batch(inputs))
+    batch = ShareCollated(lambda _: a_batch(inputs))([])
+    assert isinstance(batch, Batch)
+    found = ForkingPickler.loads(ForkingPickler.dumps(batch)).inputs
+    assert type(found) is type(inputs)
+    assert sum(isinstance(leaf, Tensor) for leaf in tree_flatten(found)[0]) == count
+
+
+def test_errors_pass_and_a_batch_that_finds_no_room_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    error = DatasetError("a frame is damaged")
+    assert ShareCollated(lambda _: error)([]) is error
+
+    def full(_: str) -> int:
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr("os.memfd_create", full)
+    found = ShareCollated(lambda _: a_batch(made_up()))([error, error])
+    assert isinstance(found, WorkerError)
+    assert "2 frames" in str(found) and "Too many open files" in str(found) and "data.workers=0" in str(found)
