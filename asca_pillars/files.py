@@ -90,14 +90,13 @@ def write_json(path: str | Path, content: Any) -> None:
     Raises:
         ValueError: a number is NaN or infinite; JSON has no such thing.
     """
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text as UTF-8, through `atomic_path`."""
+    """Write a text as UTF-8 with the same bytes on every system, through `atomic_path`."""
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def is_hidden(relative: Path) -> bool:

@@ -138,6 +138,15 @@ def test_a_box_below_the_score_finds_nothing_and_is_told() -> None:
     assert [one.kind for one in detections] == ["localization", "found"]
 
 
+def test_a_detection_that_found_one_object_is_on_no_other() -> None:
+    behind = np.add(CAR, [3 * np.cos(0.2), 3 * np.sin(0.2), 0, 0, 0, 0, 0])  # BEV IoU 1 / 7
+    (first, second), (detection,) = match_frame(
+        frame([("Car", CAR), ("Car", behind)], [("Car", 0.9, CAR)]), 0, "Car", 0.3
+    )
+    assert first.found and detection.kind == "found"
+    assert not second.found and second.detection is None
+
+
 def test_objects_without_points_or_beyond_the_limits() -> None:
     hidden, small = np.add(CAR, [0, 6, 0, 0, 0, 0, 0]), np.add(CAR, [0, -12, 0, 0, 0, 0, 0])
     made = frame(
