@@ -8,6 +8,7 @@ next process that writes into the same folder removes it.
 import contextlib
 import ctypes
 import errno
+import hashlib
 import json
 import os
 import re
@@ -21,6 +22,9 @@ from asca_pillars.errors import OutputError
 from asca_pillars.locks import CAN_LOCK, locked
 
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.asca-[0-9a-f]{8}(?P<retired>-old)?(?:\.[^.]*)?")
+_NOT_PLAIN = re.compile(r"[^A-Za-z0-9._-]")
+_RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # devices of Windows
+_LONGEST_NAME = 100  # characters; systems allow 255 bytes, suffixes and the names of temporary files included
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _cleared: set[Path] = set()  # folders whose leftovers this process has looked for
 _shares_folders = False
@@ -182,6 +186,34 @@ def recover(folder: str | Path, *, again: bool = False) -> None:
                 path.replace(folder / match["name"])
             else:
                 shutil.rmtree(path)
+
+
+def portable_name(text: str) -> str:
+    """The name of one file for a text that comes from data: itself if it is a plain name on every system.
+
+    Anything but ASCII letters, digits, dot, dash and underscore becomes an underscore. What had to be changed gets a
+    digest of the text, so that different texts keep different names.
+    """
+    plain = _NOT_PLAIN.sub("_", text)
+    usual = text[:1] not in (".", "-", "") and text[-1:] != "." and not _RESERVED.match(text)
+    if plain == text and usual and len(text) <= _LONGEST_NAME:
+        return text
+    digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return f"_{plain.strip('._-')[: _LONGEST_NAME - 10]}-{digest}"
+
+
+def file_inside(folder: Path, name: str) -> Path | None:
+    """The file that a name from data stands for, relative to `folder`; None if there is none, or it leads out of it.
+
+    Links in the folder are followed: whoever made the folder put them there.
+    """
+    relative = Path(name)
+    if relative.is_absolute() or relative.drive or ".." in relative.parts:
+        return None
+    try:
+        return folder / relative if (folder / relative).is_file() else None
+    except (OSError, ValueError):  # too long, or characters that no name has
+        return None
 
 
 def is_hidden(relative: Path) -> bool:
