@@ -6,6 +6,7 @@ on the disk. What a command may replace is in `own_files`.
 
 import contextlib
 import errno
+import hashlib
 import json
 import os
 import secrets
@@ -18,7 +19,17 @@ from asca_pillars.errors import OutputError
 from asca_pillars.locks import CAN_LOCK, RETIRED, is_temporary, locked
 from asca_pillars.own_files import Recognizer, require_no_link, require_replaceable
 
+<<<<<<< HEAD
 _LONGEST_NAME_BYTES = 255  # of a file, on nearly every file system
+=======
+_TEMPORARY = re.compile(r"\.(?P<name>.+)\.asca-[0-9a-f]{8}(?P<retired>-old)?(?:\.[^.]*)?")
+_NOT_PLAIN = re.compile(r"[^A-Za-z0-9._-]")
+_RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # devices of Windows
+_LONGEST_NAME = 100  # characters; systems allow 255 bytes, suffixes and the names of temporary files included
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_cleared: set[Path] = set()  # folders whose leftovers this process has looked for
+_shares_folders = False
+>>>>>>> importing
 
 
 @contextlib.contextmanager
@@ -97,6 +108,34 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text as UTF-8 with the same bytes on every system, through `atomic_path`."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def portable_name(text: str) -> str:
+    """The name of one file for a text that comes from data: itself if it is a plain name on every system.
+
+    Anything but ASCII letters, digits, dot, dash and underscore becomes an underscore. What had to be changed gets a
+    digest of the text, so that different texts keep different names.
+    """
+    plain = _NOT_PLAIN.sub("_", text)
+    usual = text[:1] not in (".", "-", "") and text[-1:] != "." and not _RESERVED.match(text)
+    if plain == text and usual and len(text) <= _LONGEST_NAME:
+        return text
+    digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return f"_{plain.strip('._-')[: _LONGEST_NAME - 10]}-{digest}"
+
+
+def file_inside(folder: Path, name: str) -> Path | None:
+    """The file that a name from data stands for, relative to `folder`; None if there is none, or it leads out of it.
+
+    Links in the folder are followed: whoever made the folder put them there.
+    """
+    relative = Path(name)
+    if relative.is_absolute() or relative.drive or ".." in relative.parts:
+        return None
+    try:
+        return folder / relative if (folder / relative).is_file() else None
+    except (OSError, ValueError):  # too long, or characters that no name has
+        return None
 
 
 def is_hidden(relative: Path) -> bool:

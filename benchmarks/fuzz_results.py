@@ -39,6 +39,7 @@ from asca_pillars.commands.writable_file import require_writable
 from asca_pillars.config import Config, load_config
 from asca_pillars.data.boxes.box_records import read_frame_file
 from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.importing.imported import MARKER, require_own_dataset
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError, OutputError
@@ -256,7 +257,7 @@ def _marks(folder: Path) -> list[Kind]:
     found = f"{LABEL} 0.900000\n".replace("0.00 0", "-1 -1").encode()
 
     def detect(out: Path) -> None:
-        with ResultWriter(out, [Path("1")], pictures=True):
+        with ResultWriter(out, [Path("1")], pictures=True, scope=DetectorScope((), None)):
             pass
 
     def evaluate(out: Path) -> None:

@@ -60,13 +60,13 @@ def import_dataset(
     from asca_pillars.commands.scan_input import scan_settings
     from asca_pillars.data.importing.argoverse2 import read_argoverse2
     from asca_pillars.data.importing.box_files import read_box_files
-    from asca_pillars.data.importing.imported import Importer, renamed, require_own_dataset, write_imported
+    from asca_pillars.data.importing.imported import Importer, renamed, require_own_dataset, usable, write_imported
     from asca_pillars.data.importing.kitti_raw import read_kitti_raw
     from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
     from asca_pillars.data.importing.nuscenes import read_nuscenes
     from asca_pillars.data.importing.waymo_parquet import read_waymo
     from asca_pillars.data.scan_settings import ScanSettings
-    from asca_pillars.errors import ConfigError
+    from asca_pillars.errors import ConfigError, printable
 
     if (scans is not None) != (source_format == "boxes"):
         raise ConfigError("--scans FOLDER goes with --from boxes, and only with it: other formats say where scans are")
@@ -96,8 +96,11 @@ def import_dataset(
     else:
         imported = importers[source_format](source)
     names = dict(text.split("=", 1) for text in rename or ())
-    counts = write_imported(out, renamed(imported, names), val_share)
+    imported = renamed(usable(imported), names)
+    counts = write_imported(out, imported, val_share)
     boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"
     console = Console(markup=False, highlight=False)
     console.print(f"{out}: {counts.train} frames to train on, {counts.val} to validate; boxes: {boxes}", soft_wrap=True)
+    for line in (*imported.left_out.lines(), *([counts.doubt] if counts.doubt else [])):
+        console.print(printable(line), style="yellow", soft_wrap=True)
     console.print(f"Next: asca inspect {out} -c asca_small_sim --propose own.yaml", soft_wrap=True)

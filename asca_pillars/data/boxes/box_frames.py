@@ -8,9 +8,11 @@ import numpy as np
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, read_time, records_from
 from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans
 from asca_pillars.errors import DatasetError
-from asca_pillars.files import is_hidden
+from asca_pillars.files import file_inside, is_hidden
 
 DATASET_FILE = "dataset.yaml"
+_DEEPEST = 64
+"""Folders of a path in a label that are looked at."""
 
 
 class BoxFrame(NamedTuple):
@@ -54,8 +56,17 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             same = frames.setdefault(frame_id_of(path, scans), BoxFrame(path, labels, nothing)).scan
             if same != path:
                 raise DatasetError(f"{same} and {path}: both would be frame {frame_id_of(path, scans)}; rename one")
+<<<<<<< HEAD
     for scan, records, place, time_s, _ in read_frames(labels):
         path = _find_scan(scan, scans, place)
+=======
+    for scan, records, place, time_s in read_frames(labels):
+        path = _find_scan(scan, scans)
+        if path is None:
+            raise DatasetError(
+                f"{place}: no scan {scan[:200]} below {scans}; correct the name, or `scans` in {DATASET_FILE}"
+            )
+>>>>>>> importing
         frame_id = frame_id_of(path, scans)
         if frame_id in places:
             raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
@@ -70,15 +81,13 @@ def frame_id_of(path: Path, scans: Path) -> str:
     return path.relative_to(scans).with_suffix("").as_posix()
 
 
-def _find_scan(scan: str, scans: Path, place: str) -> Path:
+def _find_scan(scan: str, scans: Path) -> Path | None:
     """The longest end of the path `scan` that is a file below `scans`: a label may name its scan from elsewhere."""
     parts = PurePosixPath(scan.replace("\\", "/")).parts
-    if ".." not in parts:
-        for first in range(len(parts)):
-            tail = Path(*parts[first:])
-            if not tail.is_absolute() and (scans / tail).is_file():
-                return scans / tail
-    raise DatasetError(f"{place}: no scan {scan[:200]} below {scans}; correct the name, or `scans` in {DATASET_FILE}")
+    if ".." in parts:
+        return None
+    ends = ("/".join(parts[first:]) for first in range(max(len(parts) - _DEEPEST, 0), len(parts)))
+    return next((path for end in ends if (path := file_inside(scans, end)) is not None), None)
 
 
 def _is_label(relative: Path) -> bool:

@@ -13,6 +13,7 @@ kinds of files hold records:
 """
 
 import csv
+import io
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,7 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+<<<<<<< HEAD
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
+=======
+from asca_pillars.data.yaw_units import LARGEST_YAW_RAD, why_no_yaw
+>>>>>>> importing
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.input_files import read_text
@@ -30,6 +35,8 @@ from asca_pillars.input_files import read_text
 FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
 _SHORT = {name.rpartition("_")[0]: name for name in FIELDS}
 _TOO_LARGE = 1e6  # of any number; a box is never a thousand kilometres away
+_DECIMALS = 4  # that are written
+_LAST_TIME_S = 1e18  # beyond int64's nanoseconds
 
 
 class BoxRecords(NamedTuple):
@@ -124,9 +131,9 @@ def json_line(
     boxes = []
     for box, kind, score, track_id in zip(*records, strict=True):
         record: dict[str, Any] = {"class": kind}
-        record |= {name: round(float(value), 4) for name, value in zip(FIELDS, box, strict=True)}
+        record |= {name: round(float(value), _DECIMALS) for name, value in zip(FIELDS, box, strict=True)}
         if not math.isnan(score):
-            record["score"] = round(float(score), 4)
+            record["score"] = round(float(score), _DECIMALS)
         if track_id is not None:
             record["track_id"] = track_id
         boxes.append(record)
@@ -139,8 +146,15 @@ def json_line(
     return json.dumps(line) + "\n"
 
 
+def can_be_written(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which boxes (N, 7) can be read again from what `json_line` writes of them."""
+    written = np.round(np.asarray(boxes, np.float64), _DECIMALS)
+    within = (np.abs(written) < _TOO_LARGE).all(axis=1)  # not where a number is not finite
+    return np.asarray(within & (written[:, 3:6] > 0).all(axis=1) & (np.abs(written[:, 6]) <= LARGEST_YAW_RAD))
+
+
 def _json_lines(path: Path) -> Iterator[NamedRecords]:
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(io.StringIO(_text(path)), start=1):  # text within JSON may hold other line breaks
         if not line.strip():
             continue
         place = f"{path}:{number}"
@@ -154,9 +168,9 @@ def _json_lines(path: Path) -> Iterator[NamedRecords]:
 
 def _time_s(content: Any) -> float | None:
     time_s = content.get("time_s") if isinstance(content, dict) else None
-    if isinstance(time_s, bool) or not isinstance(time_s, int | float) or not math.isfinite(time_s):
+    if isinstance(time_s, bool) or not isinstance(time_s, int | float):
         return None
-    return float(time_s)
+    return float(time_s) if abs(time_s) < _LAST_TIME_S else None  # compared: a whole number may exceed any float
 
 
 def _json_records(content: Any, place: str) -> BoxRecords:
@@ -170,13 +184,14 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
     text = _text(path)
     if not text.strip():
         return
-    reader = csv.reader(text.splitlines(), skipinitialspace=True)
-    names = [name.strip() for name in next(reader)]
+    reader = csv.reader(io.StringIO(text, newline=None), skipinitialspace=True)
+    cells_of_rows = _cells(reader, path)
+    names = [name.strip() for name in next(cells_of_rows, [])]
     if len(names) == 1 and ";" in names[0]:
         raise DatasetError(f"{path}:1: columns are separated by semicolons; separate them by commas")
     if twice := [name for name in names if names.count(name) > 1]:
         raise DatasetError(f"{path}:1: the column `{twice[0]}` is there twice; remove one")
-    for cells in _cells(reader, path):
+    for cells in cells_of_rows:
         if not any(cell.strip() for cell in cells):
             continue
         if len(cells) != len(names):
@@ -214,6 +229,8 @@ def _records(placed: Iterable[tuple[str, Any]]) -> BoxRecords:
         for name, size in zip(FIELDS[3:6], box[3:6], strict=True):
             if size <= 0:
                 raise DatasetError(f"{place}: {name} is {size:g}; a box has a positive size: correct or remove it")
+        if (reason := why_no_yaw(box[6])) is not None:
+            raise DatasetError(f"{place}: yaw_rad {reason}")
         boxes.append(box)
         types.append(kind.strip())
         scores.append(_number(full["score"], "score", place) if full.get("score") is not None else math.nan)

@@ -4,13 +4,15 @@ Boxes and sweeps are in the vehicle's frame: x forward, y left, z up, origin on 
 is labelled by the boxes of its own timestamp. Format: https://argoverse.github.io/user-guide/datasets/lidar.html
 """
 
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 from rich.progress import track
 
-from asca_pillars.data.boxes.box_records import records_from
+from asca_pillars.data.boxes.box_records import can_be_written, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.foreign_values import LeftOut, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.scans.feather import feather_table
 from asca_pillars.data.scans.find_scans import files_below
@@ -37,34 +39,44 @@ def read_argoverse2(root: Path) -> Imported:
     logs = sorted(path.parent for path in files_below(root) if path.name == "annotations.feather")
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
-    frames = [frame for log in track(logs, "Reading logs", transient=True) for frame in _frames(log)]
+    left_out = LeftOut()
+    frames = [frame for log in track(logs, "Reading logs", transient=True) for frame in _frames(log, left_out)]
     settings = BoxDataset(
         sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root), sensor_position=SENSOR_POSITION_M
     )
-    return Imported(settings, frames)
+    return Imported(settings, frames, left_out)
 
 
-def _frames(log: Path) -> list[ImportedFrame]:
+def _frames(log: Path, left_out: LeftOut) -> list[ImportedFrame]:
     path = log / "annotations.feather"
     numbers = ("timestamp_ns", *_CENTER, *_SIZE, *_TURN)
     table = feather_table(path, numbers, ("track_uuid", "category"), DatasetError)
-    turns = of_quaternions(np.column_stack([table[name] for name in _TURN]))
-    yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
-    boxes = np.column_stack([*(table[name] for name in (*_CENTER, *_SIZE)), yaw]).astype(np.float64)
-    if not (np.isfinite(boxes).all() and (boxes[:, 3:6] > 0).all()):
-        row = int(np.argmin(np.isfinite(boxes).all(axis=1) & (boxes[:, 3:6] > 0).all(axis=1)))
-        values = ", ".join(f"{name} {table[name][row]:g}" for name in (*_CENTER, *_SIZE, *_TURN))
-        raise DatasetError(
-            f"{path}: row {row} is no box with finite numbers, positive sizes and a rotation ({values}); "
-            "download it again"
-        )
+    stamps = table["timestamp_ns"]
+    if stamps.dtype.kind not in "iu":
+        raise DatasetError(f"{path}: column `timestamp_ns` has no whole numbers; copy the file again")
+    with np.errstate(invalid="ignore", over="ignore"):
+        turns = of_quaternions(np.column_stack([table[name] for name in _TURN]).astype(np.float64))
+        yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
+        boxes = np.column_stack([*(table[name] for name in (*_CENTER, *_SIZE)), yaw]).astype(np.float64)
+        can = can_be_written(boxes)
+    kept: dict[int, list[int]] = defaultdict(list)
+    for row in range(len(stamps)):
+        try:
+            text_of(table["category"][row], "category")
+            text_of(table["track_uuid"][row], "track_uuid")
+            if not can[row]:
+                values = ", ".join(f"{name} {table[name][row]:g}" for name in (*_CENTER, *_SIZE, *_TURN))
+                raise ValueError(f"no box with finite numbers, positive sizes and a rotation ({values})")
+            kept[int(stamps[row])].append(row)
+        except ValueError as reason:
+            kept[int(stamps[row])]  # the sweep stays
+            left_out.add("boxes", f"{path}, row {row}", reason)
     frames = []
-    for stamp in np.unique(table["timestamp_ns"]).tolist():
+    for stamp, rows in sorted(kept.items()):
         folders = (log / "sensors" / "lidar", log / "lidar")
         scan = next((scan for folder in folders if (scan := folder / f"{stamp}.feather").is_file()), None)
         if scan is None:
             continue  # a part of a log may have been downloaded
-        own = table["timestamp_ns"] == stamp
-        records = records_from(boxes[own], table["category"][own].tolist(), None, table["track_uuid"][own].tolist())
-        frames.append(ImportedFrame(scan, records, log.name))
+        types, tracks = (table[name][rows].tolist() for name in ("category", "track_uuid"))
+        frames.append(ImportedFrame(scan, records_from(boxes[rows], types, None, tracks), log.name))
     return frames

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from asca_pillars.data.boxes.box_frames import find_frames
 from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.foreign_values import LeftOut
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.scan_settings import ScanSettings
 from asca_pillars.schema import parse, to_dict
@@ -30,4 +31,4 @@ def read_box_files(labels: Path, scans: Path, settings: ScanSettings) -> Importe
         for frame in find_frames(labels, scans).values()
     ]
     stated = to_dict(settings) | {"pose": None if settings.pose is None else str(Path(settings.pose).resolve())}
-    return Imported(parse(BoxDataset, stated | {"scans": str(scans)}, "import"), frames)
+    return Imported(parse(BoxDataset, stated | {"scans": str(scans)}, "import"), frames, LeftOut())

@@ -11,15 +11,22 @@ from typing import NamedTuple
 
 import yaml
 
-from asca_pillars.data.boxes.box_frames import DATASET_FILE, frame_id_of
-from asca_pillars.data.boxes.box_records import BoxRecords, json_line
+from asca_pillars.data.boxes.box_frames import DATASET_FILE, find_frames, frame_id_of
+from asca_pillars.data.boxes.box_records import BoxRecords, can_be_written, json_line, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.foreign_values import LeftOut, text_of
 from asca_pillars.data.kitti import write_image_set
 from asca_pillars.data.scans.find_scans import natural_order
+from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import ConfigError, DatasetError, OutputError
+<<<<<<< HEAD
 from asca_pillars.files import atomic_path, write_text
 from asca_pillars.own_files import json_lines, require_own, require_own_file, starting_with
 from asca_pillars.schema import to_dict
+=======
+from asca_pillars.files import atomic_path, file_inside, require_own
+from asca_pillars.schema import parse, to_dict
+>>>>>>> importing
 
 COMMAND = "asca import"
 LABELS_FILE = "labels.jsonl"
@@ -37,10 +44,14 @@ class ImportedFrame(NamedTuple):
 
 
 class Imported(NamedTuple):
-    """The frames of a source, and how its scans are to be read; `settings.scans` is the folder that they are below."""
+    """The frames of a source, how its scans are to be read, and what of the source cannot be used.
+
+    `settings.scans` is the folder that the scans are below.
+    """
 
     settings: BoxDataset
     frames: Sequence[ImportedFrame]
+    left_out: LeftOut
 
 
 Importer = Callable[[Path], Imported]
@@ -48,19 +59,85 @@ Importer = Callable[[Path], Imported]
 
 
 class ImportCounts(NamedTuple):
-    """What was written: frames of both lists, and boxes by class."""
+    """What was written: frames of both lists, boxes by class, and what looks odd about them."""
 
     train: int
     val: int
     boxes: dict[str, int]
+    doubt: str | None
+
+
+def usable(imported: Imported) -> Imported:
+    """The same without the boxes and frames that could not be read again from a dataset; those are counted.
+
+    Names of classes lose line breaks and blanks at their ends.
+
+    Raises:
+        DatasetError: no frame remains, or no box because none can be used.
+    """
+    scans, left_out = Path(imported.settings.scans), imported.left_out
+    frames: dict[str, ImportedFrame] = {}
+    boxes = 0
+    for frame in imported.frames:
+        try:
+            frame_id = _readable_id(frame, scans)
+            if frame_id in frames:
+                raise ValueError(f"{frames[frame_id].scan.name} is the same frame")
+            text_of(frame.recording, "the recording")
+        except ValueError as reason:
+            left_out.add("frames", frame.scan, reason)
+            continue
+        time_s = frame.time_s if frame.time_s is not None and math.isfinite(frame.time_s) else None
+        records = _usable_records(frame, left_out)
+        boxes += len(records.types)
+        frames[frame_id] = frame._replace(records=records, time_s=time_s)
+    if not frames or (left_out.counts and not boxes):
+        first = next(iter(left_out.lines()), "give the folder that holds the recordings")
+        raise DatasetError(f"{scans}: no {'box' if frames else 'labelled scan'} there that can be used; {first}")
+    return imported._replace(frames=list(frames.values()))
+
+
+def _readable_id(frame: ImportedFrame, scans: Path) -> str:
+    """The frame's id; ValueError if a list of ids or the labels could not name it."""
+    if not frame.scan.is_relative_to(scans):
+        raise ValueError(f"the scan is not below {scans}")
+    name, frame_id = frame.scan.relative_to(scans).as_posix(), frame_id_of(frame.scan, scans)
+    frame_id.encode()  # of bytes that are no text there is no list
+    if "\\" in name or file_inside(scans, name) is None:
+        raise ValueError(f"no scan {name[:200]!r} below {scans}")
+    if frame_id.splitlines() != [frame_id.strip("\ufeff").strip()]:
+        raise ValueError("blanks at the ends of its name, or a line break in it; rename it")
+    return frame_id
+
+
+def _usable_records(frame: ImportedFrame, left_out: LeftOut) -> BoxRecords:
+    boxes, types, scores, track_ids = frame.records
+    kept: dict[int, str] = {}
+    for row, (kind, can) in enumerate(zip(types, can_be_written(boxes), strict=True)):
+        try:
+            name = text_of(kind, "the class")
+            if not can:
+                numbers = ", ".join(f"{value:g}" for value in boxes[row])
+                raise ValueError(f"no box of a {name} has the center, size and yaw {numbers}")
+            kept[row] = name
+        except ValueError as reason:
+            left_out.add("boxes", frame.scan, reason)
+    rows = list(kept)
+    tracks = [None if track_ids[row] is None else str(track_ids[row]) for row in rows]
+    return records_from(boxes[rows], list(kept.values()), scores[rows], tracks)
 
 
 def renamed(imported: Imported, names: Mapping[str, str]) -> Imported:
     """The same with classes of other names; several may get one name.
 
     Raises:
-        ConfigError: a class that no box has.
+        ConfigError: a class that no box has, or a new name that is none.
     """
+    for name in names.values():
+        try:
+            text_of(name, "the new name")
+        except ValueError as reason:
+            raise ConfigError(f"--rename: {reason}; give a name of one line") from None
     there = {kind for frame in imported.frames for kind in frame.records.types}
     if unknown := sorted(set(names) - there):
         raise ConfigError(
@@ -100,28 +177,51 @@ def require_own_dataset(out: Path, source: Path | None = None) -> None:
 def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCounts:
     """Write dataset.yaml, labels.jsonl, and the lists train and val, which share no recording where there are several.
 
+    Args:
+        out: folder of the dataset.
+        imported: frames that are `usable`.
+        val_share: share of the recordings or, of only one, of its frames that is for validation.
+
     Raises:
-        DatasetError: there is no frame.
+        DatasetError: the labels could not be read again; nothing that was there is replaced.
+        ConfigError: the settings of the scans are impossible.
         OutputError: `out` holds something else.
     """
     scans = Path(imported.settings.scans)
     frames = sorted(
         imported.frames, key=lambda frame: (natural_order(Path(frame.recording)), natural_order(frame.scan))
     )
-    if not frames:
-        raise DatasetError(f"{scans}: no labelled scan there; give the folder that holds the recordings")
     require_own_dataset(out)
+<<<<<<< HEAD
     with atomic_path(out / LABELS_FILE) as temporary, temporary.open("w", encoding="utf-8") as file:
+=======
+    usual = to_dict(BoxDataset())
+    content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
+    settings = yaml.safe_dump(content, sort_keys=False)
+    parse(BoxDataset, yaml.safe_load(settings), str(out / DATASET_FILE))
+    with atomic_path(out / "labels.jsonl") as temporary:
+        with temporary.open("w", encoding="utf-8") as file:
+            for frame in frames:
+                file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records, frame.time_s))
+        read = find_frames(temporary, scans)
+>>>>>>> importing
         for frame in frames:
-            file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records, frame.time_s))
+            if read.pop(frame_id_of(frame.scan, scans)).records.types != frame.records.types:
+                raise DatasetError(f"{frame.scan}: its boxes cannot be read again; report this")
     train, val = _lists(frames, val_share)
     for name, own in (("train", train), ("val", val)):
         write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
+<<<<<<< HEAD
     usual = to_dict(BoxDataset())
     content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
     write_text(out / DATASET_FILE, MARKER + yaml.safe_dump(content, sort_keys=False))
+=======
+    with atomic_path(out / DATASET_FILE) as temporary:
+        temporary.write_text(MARKER + settings, encoding="utf-8")
+>>>>>>> importing
     boxes = Counter(kind for frame in frames for kind in frame.records.types)
-    return ImportCounts(len(train), len(val), dict(boxes.most_common()))
+    doubt = doubt_of_yaws([frame.records.boxes[:, 6] for frame in frames])
+    return ImportCounts(len(train), len(val), dict(boxes.most_common()), doubt)
 
 
 def _lists(frames: list[ImportedFrame], val_share: float) -> tuple[list[ImportedFrame], list[ImportedFrame]]:

@@ -6,14 +6,17 @@ development kit, https://www.cvlibs.net/datasets/kitti/raw_data.php
 """
 
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+from rich.progress import track
 
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.foreign_values import LeftOut, numbers, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG, TYPES
 from asca_pillars.data.scans.find_scans import files_below, visible_files
@@ -21,6 +24,8 @@ from asca_pillars.errors import DatasetError
 from asca_pillars.input_files import read_text
 
 LABELS = "tracklet_labels.xml"
+_DOCTYPE = "<!DOCTYPE boost_serialization>"
+"""Stands in KITTI's own files."""
 
 
 class _Labels(NamedTuple):
@@ -40,12 +45,14 @@ def read_kitti_raw(root: Path) -> Imported:
     drives = sorted(path.parent for path in files_below(root.resolve()) if path.name == LABELS)
     if not drives:
         raise DatasetError(f"{root}: no {LABELS} below; give a folder of KITTI's drives, with their tracklets")
-    frames = [frame for drive in drives for frame in _frames(drive)]
-    return Imported(BoxDataset(scans=str(root.resolve()), labeled_view_deg=LABELED_VIEW_DEG), frames)
+    left_out = LeftOut()
+    bar = track(drives, "Reading drives", transient=True)
+    frames = [frame for drive in bar for frame in _frames(drive, left_out)]
+    return Imported(BoxDataset(scans=str(root.resolve()), labeled_view_deg=LABELED_VIEW_DEG), frames, left_out)
 
 
-def _frames(drive: Path) -> list[ImportedFrame]:
-    labels = _read_tracklets(drive / LABELS)
+def _frames(drive: Path, left_out: LeftOut) -> list[ImportedFrame]:
+    labels = _read_tracklets(drive / LABELS, left_out)
     frames = []
     for scan in visible_files(drive / "velodyne_points" / "data", "*.bin"):
         own = labels.get(int(scan.stem) if scan.stem.isdecimal() else -1, _Labels([], [], []))
@@ -54,30 +61,54 @@ def _frames(drive: Path) -> list[ImportedFrame]:
     return frames
 
 
-def _read_tracklets(path: Path) -> dict[int, _Labels]:
+def _read_tracklets(path: Path, left_out: LeftOut) -> dict[int, _Labels]:
     """The labels of each frame."""
     labels: dict[int, _Labels] = defaultdict(lambda: _Labels([], [], []))
     try:
+<<<<<<< HEAD
         text = read_text(path, DatasetError, errors="replace")
         if "<!ENTITY" in text:  # an entity may unfold to any size
             raise ValueError("it declares entities")
+=======
+        text = path.read_text(encoding="utf-8", errors="replace")
+        if "<!DOCTYPE" in text.replace(_DOCTYPE, "", 1):  # entities and attributes of one may unfold to any size
+            raise ValueError(f"another DOCTYPE than {_DOCTYPE}")
+>>>>>>> importing
         tracklets = ElementTree.fromstring(text).findall("tracklets/item")
-        for number, tracklet in enumerate(tracklets):
-            height, width, length = (float(tracklet.findtext(name, "")) for name in "hwl")
-            kind = tracklet.findtext("objectType", "").strip()
-            first = int(tracklet.findtext("first_frame", ""))
-            if not kind or not min(height, width, length) > 0:
-                raise ValueError(f"tracklet {number} has no type or no size")
-            for offset, pose in enumerate(tracklet.findall("poses/item")):
-                x, y, bottom, yaw = (float(pose.findtext(name, "")) for name in ("tx", "ty", "tz", "rz"))
-                if not np.isfinite([x, y, bottom, yaw, height, width, length]).all():
-                    raise ValueError(f"tracklet {number} has a number that is not finite")
-                own = labels[first + offset]
-                own.boxes.append([x, y, bottom + height / 2, length, width, height, yaw])
-                own.types.append(TYPES.get(kind, kind))
-                own.tracks.append(str(number))
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None
     except (ElementTree.ParseError, ValueError) as error:
         raise DatasetError(f"{path}: no tracklets of KITTI ({error}); download the file again") from None
+    for number, tracklet in enumerate(tracklets):
+        try:
+            _add(labels, number, tracklet, left_out, path)
+        except ValueError as reason:
+            left_out.add("tracklets", f"{path}, tracklet {number}", reason)
     return dict(labels)
+
+
+def _add(
+    labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: LeftOut, path: Path
+) -> None:
+    """Add the boxes of a tracklet to their frames; ValueError if it has no type, size or first frame."""
+    height, width, length = _numbers(tracklet, "hwl")
+    kind = text_of(tracklet.findtext("objectType", ""), "objectType")
+    if not min(height, width, length) > 0:
+        raise ValueError(f"no size ({height:g}, {width:g}, {length:g})")
+    first = int(tracklet.findtext("first_frame", ""))
+    for offset, pose in enumerate(tracklet.findall("poses/item")):
+        try:
+            x, y, bottom, yaw = _numbers(pose, ("tx", "ty", "tz", "rz"))
+        except ValueError as reason:
+            left_out.add("boxes", f"{path}, tracklet {number}, pose {offset}", reason)
+            continue
+        own = labels[first + offset]
+        own.boxes.append([x, y, bottom + height / 2, length, width, height, yaw])
+        own.types.append(TYPES.get(kind, kind))
+        own.tracks.append(str(number))
+
+
+def _numbers(element: ElementTree.Element, names: Sequence[str]) -> list[float]:
+    stated = [float(element.findtext(name, "")) for name in names]
+    values: list[float] = numbers(stated, len(names), ", ".join(names)).tolist()
+    return values

@@ -8,8 +8,11 @@ https://www.cvlibs.net/datasets/kitti/eval_tracking.php
 from collections import defaultdict
 from pathlib import Path
 
+from rich.progress import track
+
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.foreign_values import LeftOut
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects, parse_object, read_calibration
 from asca_pillars.data.scans.find_scans import visible_files
@@ -20,6 +23,7 @@ LABELED_VIEW_DEG = 81.0
 """Of KITTI's left color camera: 1242 pixels at a focal length of 721."""
 TYPES = {"Person": "Person_sitting", "Person (sitting)": "Person_sitting"}
 """Names in KITTI's recordings, here and in the raw ones, of what its object benchmark calls otherwise."""
+_LONGEST_FRAME = 20  # digits of a frame's number
 _Tracked = tuple[KittiObject, str]
 
 
@@ -36,14 +40,17 @@ def read_kitti_tracking(root: Path) -> Imported:
     labels = visible_files(folder / "label_02", "*.txt")
     if not labels:
         raise DatasetError(f"{folder}: no label_02/*.txt there; give the folder of KITTI's tracking benchmark")
-    frames = [frame for path in labels for frame in _frames(folder.resolve(), path)]
-    return Imported(BoxDataset(scans=str(folder.resolve() / "velodyne"), labeled_view_deg=LABELED_VIEW_DEG), frames)
+    left_out = LeftOut()
+    bar = track(labels, "Reading sequences", transient=True)
+    frames = [frame for path in bar for frame in _frames(folder.resolve(), path, left_out)]
+    settings = BoxDataset(scans=str(folder.resolve() / "velodyne"), labeled_view_deg=LABELED_VIEW_DEG)
+    return Imported(settings, frames, left_out)
 
 
-def _frames(folder: Path, labels: Path) -> list[ImportedFrame]:
+def _frames(folder: Path, labels: Path, left_out: LeftOut) -> list[ImportedFrame]:
     sequence = labels.stem
     calibration = read_calibration(folder / "calib" / f"{sequence}.txt")
-    tracked = _read_tracked(labels)
+    tracked = _read_tracked(labels, left_out)
     frames = []
     for scan in visible_files(folder / "velodyne" / sequence, "*.bin"):
         number = int(scan.stem) if scan.stem.isdecimal() else -1
@@ -58,7 +65,7 @@ def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
     return records_from(boxes, [TYPES.get(item.type, item.type) for item in objects], None, [track for _, track in own])
 
 
-def _read_tracked(path: Path) -> dict[int, list[_Tracked]]:
+def _read_tracked(path: Path, left_out: LeftOut) -> dict[int, list[_Tracked]]:
     """The objects of each frame with their track's number."""
     try:
         lines = read_text(path, DatasetError, errors="replace").splitlines()
@@ -69,7 +76,11 @@ def _read_tracked(path: Path) -> dict[int, list[_Tracked]]:
         words = line.split()
         if not words:
             continue
-        if len(words) < 2 or not words[0].isdecimal():
-            raise DatasetError(f"{path}:{number}: does not begin with a frame's number; give KITTI's tracking labels")
-        tracked[int(words[0])].append((parse_object(words[2:], f"{path}:{number}"), words[1]))
+        if len(words) < 2 or not (words[0].isdecimal() and len(words[0]) < _LONGEST_FRAME):
+            left_out.add("lines", f"{path}:{number}", "does not begin with a frame's number")
+            continue
+        try:
+            tracked[int(words[0])].append((parse_object(words[2:], f"{path}:{number}"), words[1]))
+        except DatasetError as error:
+            left_out.add("lines", path, error)
     return dict(tracked)

@@ -7,17 +7,22 @@ Tables by their published schema, https://www.nuscenes.org/nuscenes#data-format:
 a size width, length, height. Categories of the detection task get its class names, others keep their own.
 """
 
+import contextlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
 
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.foreign_values import LeftOut, entry, numbers, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.errors import DatasetError
+from asca_pillars.files import file_inside
 from asca_pillars.geometry.rotations import of_quaternions
 from asca_pillars.input_files import read_text
 
@@ -39,7 +44,8 @@ DETECTION_CLASSES = {
     "vehicle.truck": "truck",
 }
 
-_Table = dict[str, dict[str, Any]]
+_Row = dict[str, Any]
+_Table = dict[str, _Row]
 _Doubles = NDArray[np.float64]
 
 
@@ -54,67 +60,94 @@ def read_nuscenes(root: Path) -> Imported:
     """
     tables = _tables_folder(root)
     data = tables.absolute().parent.resolve()
-    try:
-        height_m = _sensor_height_m(tables)
-        frames = _frames(tables, data)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise DatasetError(f"{tables}: the tables do not fit together (at {error}); download them again") from None
-    settings = BoxDataset(sensor_height=height_m, axes="y-forward", reflectance_scale=255.0, columns=5, scans=str(data))
-    return Imported(settings, frames)
+    left_out = LeftOut()
+    names = ("sensor", "calibrated_sensor", "ego_pose", "sample", "scene", "category", "instance", "sample_annotation")
+    read = {name: _table(tables, name, left_out) for name in (*names, "sample_data")}
+    frames = _frames(read, tables, data, left_out)
+    settings = BoxDataset(
+        sensor_height=_sensor_height_m(read), axes="y-forward", reflectance_scale=255.0, columns=5, scans=str(data)
+    )
+    return Imported(settings, frames, left_out)
 
 
-def _sensor_height_m(tables: Path) -> float | None:
+def _sensor_height_m(tables: Mapping[str, _Table]) -> float | None:
     """The median over the vehicles' calibrations; None without any."""
-    channels = {token: row["channel"] for token, row in _table(tables, "sensor").items()}
-    sensors = _table(tables, "calibrated_sensor").values()
-    heights = [row["translation"][2] for row in sensors if channels[row["sensor_token"]] == CHANNEL]
+    heights = []
+    for row in tables["calibrated_sensor"].values():
+        with contextlib.suppress(ValueError):  # named where a frame needs it
+            if _channel(row, tables) == CHANNEL:
+                heights.append(numbers(entry(row, "translation"), 3, "translation")[2])
     return round(float(np.median(heights)), 3) if heights else None
 
 
-def _frames(tables: Path, data: Path) -> list[ImportedFrame]:
-    poses, sensors = _table(tables, "ego_pose"), _table(tables, "calibrated_sensor")
-    samples, scenes = _table(tables, "sample"), _table(tables, "scene")
-    channels = {token: row["channel"] for token, row in _table(tables, "sensor").items()}
-    types = {token: row["name"] for token, row in _table(tables, "category").items()}
-    kinds = {token: types[row["category_token"]] for token, row in _table(tables, "instance").items()}
-    labels: dict[str, list[dict[str, Any]]] = {}
-    for row in _table(tables, "sample_annotation").values():
-        labels.setdefault(row["sample_token"], []).append(row)
+def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: LeftOut) -> list[ImportedFrame]:
+    labels: dict[str, list[_Row]] = {}
+    for token, row in tables["sample_annotation"].items():
+        try:
+            labels.setdefault(text_of(entry(row, "sample_token"), "sample_token"), []).append(row)
+        except ValueError as reason:
+            left_out.add("boxes", f"{folder}/sample_annotation.json, {token}", reason)
     frames = []
-    for row in _table(tables, "sample_data").values():
-        sensor = sensors[row["calibrated_sensor_token"]]
-        scan = data / row["filename"]
-        if not row["is_key_frame"] or channels[sensor["sensor_token"]] != CHANNEL or not scan.is_file():
-            continue
-        records = _records(labels.get(row["sample_token"], []), poses[row["ego_pose_token"]], sensor, kinds)
-        if not (np.isfinite(records.boxes).all() and (records.boxes[:, 3:6] > 0).all()):
-            raise ValueError(f"sample {row['sample_token']}: a box with a number that is not finite or no size")
-        frames.append(ImportedFrame(scan, records, scenes[samples[row["sample_token"]]["scene_token"]]["name"]))
+    for token, row in track(tables["sample_data"].items(), "Reading frames", transient=True):
+        try:
+            sensor = _linked(row, "calibrated_sensor", tables)
+            if row.get("is_key_frame") is not True or _channel(sensor, tables) != CHANNEL:
+                continue
+            sample = _linked(row, "sample", tables)
+            scene = text_of(entry(_linked(sample, "scene", tables), "name"), "the scene's name")
+            filename = entry(row, "filename")
+            scan = file_inside(data, filename) if isinstance(filename, str) else None
+            if scan is None:
+                if isinstance(filename, str) and ".." not in Path(filename).parts and not Path(filename).is_absolute():
+                    continue  # a part of the dataset may have been downloaded
+                raise ValueError(f"filename is {str(filename)[:80]!r}, no file below {data}")
+            changes = [_change(frame) for frame in (_linked(row, "ego_pose", tables), sensor)]
+            own = labels.get(row["sample_token"], [])
+            frames.append(ImportedFrame(scan, _records(own, changes, tables, folder, left_out), scene))
+        except ValueError as reason:
+            left_out.add("frames", f"{folder}/sample_data.json, {token}", reason)
     return frames
 
 
 def _records(
-    labels: list[dict[str, Any]], pose: dict[str, Any], sensor: dict[str, Any], kinds: dict[str, str]
+    labels: list[_Row], changes: list[tuple[_Doubles, _Doubles]], tables: Mapping[str, _Table], folder: Path,
+    left_out: LeftOut,
 ) -> BoxRecords:
     boxes, types, tracks = [], [], []
     for label in labels:
-        center, turn = np.array(label["translation"], np.float64), _rotation(label["rotation"])
-        for frame in (pose, sensor):
-            back = _rotation(frame["rotation"]).T
-            center, turn = back @ (center - frame["translation"]), back @ turn
-        width, length, height = label["size"]
+        try:
+            turn, center = _change(label)
+            for back, origin in changes:
+                center, turn = back.T @ (center - origin), back.T @ turn
+            width, length, height = numbers(entry(label, "size"), 3, "size")
+            kind = text_of(entry(_linked(_linked(label, "instance", tables), "category", tables), "name"), "the category")
+        except ValueError as reason:
+            left_out.add("boxes", f"{folder}/sample_annotation.json, {label['token']}", reason)
+            continue
         boxes.append([*center, length, width, height, np.arctan2(turn[1, 0], turn[0, 0])])
-        kind = kinds[label["instance_token"]]
         types.append(DETECTION_CLASSES.get(kind, kind))
         tracks.append(label["instance_token"])
     return records_from(np.array(boxes).reshape(-1, 7), types, None, tracks)
 
 
-def _rotation(quaternion: list[float]) -> _Doubles:
-    turn = of_quaternions(np.array(quaternion))
+def _change(row: _Row) -> tuple[_Doubles, _Doubles]:
+    """The rotation (3, 3) and the position (3,), metres, that a row states of what it is about in its parent frame."""
+    turn = of_quaternions(numbers(entry(row, "rotation"), 4, "rotation"))
     if not np.isfinite(turn).all():
-        raise ValueError(f"rotation {quaternion}")
-    return turn
+        raise ValueError(f"rotation is {row['rotation']}, no quaternion")
+    return turn, numbers(entry(row, "translation"), 3, "translation")
+
+
+def _channel(sensor: _Row, tables: Mapping[str, _Table]) -> str:
+    return text_of(entry(_linked(sensor, "sensor", tables), "channel"), "channel")
+
+
+def _linked(row: _Row, name: str, tables: Mapping[str, _Table]) -> _Row:
+    """The row of the table `name` that a row names; ValueError if it names none."""
+    token = entry(row, f"{name}_token")
+    if not isinstance(token, str) or token not in tables[name]:
+        raise ValueError(f"{name}.json has no row {str(token)[:80]!r}")
+    return tables[name][token]
 
 
 def _tables_folder(root: Path) -> Path:
@@ -127,11 +160,25 @@ def _tables_folder(root: Path) -> Path:
     return found[0]
 
 
-def _table(folder: Path, name: str) -> _Table:
+def _table(folder: Path, name: str, left_out: LeftOut) -> _Table:
+    """The rows of a table by their tokens."""
     path = folder / f"{name}.json"
     try:
+<<<<<<< HEAD
         return {row["token"]: row for row in json.loads(read_text(path, DatasetError))}
+=======
+        rows = json.loads(path.read_text(encoding="utf-8"))
+>>>>>>> importing
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); nuScenes' metadata has this table") from None
-    except (ValueError, TypeError, KeyError):
-        raise DatasetError(f"{path}: no table of nuScenes, a list of rows with a token; download it again") from None
+    except (ValueError, RecursionError):
+        rows = None
+    if not isinstance(rows, list):
+        raise DatasetError(f"{path}: no table of nuScenes, a list of rows with a token; download it again")
+    table = {}
+    for number, row in enumerate(rows):
+        try:
+            table[text_of(entry(row, "token"), "token")] = row
+        except ValueError as reason:
+            left_out.add("rows", f"{path}, row {number}", reason)
+    return table

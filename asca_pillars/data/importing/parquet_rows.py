@@ -13,6 +13,8 @@ _BATCH = 8  # rows that are in memory at once: a range image has millions of num
 def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
     """The rows of a file by column: numbers and texts as they are, lists as NumPy arrays, None where there is nothing.
 
+    None also stands for a value that Python has no form of, such as a date in the year 300,000.
+
     Raises:
         DatasetError: no parquet file, or one without these columns.
         AscaError: pyarrow is not installed.
@@ -31,11 +33,14 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
             for batch in file.iter_batches(_BATCH, columns=list(columns)):
                 for row in range(batch.num_rows):
                     yield {name: _plain(batch.column(name)[row]) for name in columns}
-    except (pyarrow.ArrowException, OSError) as reason:
+    except (pyarrow.ArrowException, OSError, KeyError) as reason:  # KeyError: two columns of one name
         text = " ".join(str(reason).split())[:100]
         raise DatasetError(f"{path}: no readable parquet file ({text}); copy it again") from None
 
 
 def _plain(value: Any) -> Any:
     items = getattr(value, "values", None)  # of a list; None of a list that is null
-    return value.as_py() if items is None else items.to_numpy(zero_copy_only=False)
+    try:
+        return items.to_numpy(zero_copy_only=False) if hasattr(items, "to_numpy") else value.as_py()
+    except (ValueError, TypeError, LookupError, OverflowError, NotImplementedError):  # Arrow's own are among them
+        return None

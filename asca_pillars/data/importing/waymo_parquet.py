@@ -6,6 +6,7 @@ points are moved to the time of the labels. Columns: https://github.com/waymo-re
 v2/perception.
 """
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,12 +19,18 @@ from rich.progress import track
 from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.importing.foreign_values import LeftOut, numbers, text_of, whole_number
 from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
 from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
 from asca_pillars.data.scans.find_scans import visible_files
 from asca_pillars.errors import DatasetError
+<<<<<<< HEAD
 from asca_pillars.files import atomic_path, write_text
+=======
+from asca_pillars.files import atomic_path, portable_name
+from asca_pillars.geometry.frame_change import is_rigid
+>>>>>>> importing
 
 TOP = 1
 """The roof's sensor."""
@@ -59,111 +66,159 @@ def read_waymo(root: Path, out: Path) -> Imported:
     require_own_dataset(out)
     if not (out / DATASET_FILE).exists():
         # It marks the folder from the start, so that an import that was killed can be given again.
+<<<<<<< HEAD
         write_text(out / DATASET_FILE, MARKER)
     bar = track(segments, "Reading segments", transient=True)
     frames = [frame for path in bar for frame in _frames(root, path, out.resolve() / "scans")]
     top = _calibrations(root / "lidar_calibration" / segments[0].name).get(TOP)
+=======
+        temporary.write_text(MARKER, encoding="utf-8")
+    scans, left_out = out.resolve() / "scans", LeftOut()
+    frames: list[ImportedFrame] = []
+    for path in track(segments, "Reading segments", transient=True):
+        labels = _labels(root / "lidar_box" / path.name, left_out)
+        nothing = records_from(np.zeros((0, 7)), ())
+        folder = scans / portable_name(path.stem)
+        for time in _write_scans(root, path, folder, left_out):
+            frames.append(ImportedFrame(_scan_path(folder, time), labels.get(time, nothing), path.stem))
+    top = _calibrations(root / "lidar_calibration" / segments[0].name, LeftOut()).get(TOP)
+>>>>>>> importing
     x, y, z = np.zeros(3) if top is None else np.round(top.vehicle_from_lidar[:3, 3], 3).tolist()
-    settings = BoxDataset(
-        sensor_height=0.0, reflectance_scale=1.0, scans=str(out.resolve() / "scans"), sensor_position=(x, y, z)
-    )
-    return Imported(settings, frames)
+    settings = BoxDataset(sensor_height=0.0, reflectance_scale=1.0, scans=str(scans), sensor_position=(x, y, z))
+    return Imported(settings, frames, left_out)
 
 
-def _frames(root: Path, lidar: Path, scans: Path) -> Iterator[ImportedFrame]:
-    labels = _labels(root / "lidar_box" / lidar.name)
-    nothing = records_from(np.zeros((0, 7)), ())
-    for time in _write_scans(root, lidar, scans / lidar.stem):
-        yield ImportedFrame(scans / lidar.stem / f"{time}.npy", labels.get(time, nothing), lidar.stem)
+def _scan_path(folder: Path, time: int) -> Path:
+    return folder / f"{portable_name(str(time))}.npy"
 
 
-def _write_scans(root: Path, lidar: Path, folder: Path) -> list[int]:
-    """Write the scans of a segment that are not there yet; the times of all of them."""
-    missing = Counter(row[_TIME] for row in parquet_rows(lidar, (_TIME,)))
+def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> list[int]:
+    """Write the scans of a segment that are not there yet; the times of all that are there then."""
+    missing: Counter[int] = Counter()
+    for number, row in enumerate(parquet_rows(lidar, (_TIME,))):
+        try:
+            missing[whole_number(row[_TIME], _TIME)] += 1
+        except ValueError as reason:
+            left_out.add("range images", f"{lidar}, row {number}", reason)
     times = sorted(missing)
-    missing = Counter({time: rows for time, rows in missing.items() if not (folder / f"{time}.npy").exists()})
+    missing = Counter({time: rows for time, rows in missing.items() if not _scan_path(folder, time).exists()})
     if not missing:
         return times
-    calibrations = _calibrations(root / "lidar_calibration" / lidar.name)
-    vehicle_poses = _vehicle_poses(root / "vehicle_pose" / lidar.name)
-    pixel_poses = _pixel_poses(root / "lidar_pose" / lidar.name) if vehicle_poses else iter(())
+    calibrations = _calibrations(root / "lidar_calibration" / lidar.name, left_out)
+    vehicle_poses = _vehicle_poses(root / "vehicle_pose" / lidar.name, left_out)
+    pixel_poses = _pixel_poses(root / "lidar_pose" / lidar.name, left_out) if vehicle_poses else iter(())
     early: dict[int, NDArray[np.float32]] = {}
     points: dict[int, list[NDArray[np.float32]]] = defaultdict(list)
     columns = (_TIME, _LASER, *(f"{image}.{part}" for image in _IMAGES for part in ("values", "shape")))
-    for row in parquet_rows(lidar, columns):
+    for number, row in enumerate(parquet_rows(lidar, columns)):
         time, laser = row[_TIME], row[_LASER]
-        if time not in missing:
+        if not isinstance(time, int) or time not in missing:
             continue
-        if laser not in calibrations:
-            raise DatasetError(f"{lidar}: sensor {laser} has no calibration; download lidar_calibration/ again")
-        if laser == TOP:  # the only one whose pixels have poses
-            while time not in early and (other := next(pixel_poses, None)) is not None:
-                early |= {other[0]: other[1]} if other[0] in missing else {}
-        poses = early.pop(time, None) if laser == TOP else None
-        for image in (_image(row, name, lidar) for name in _IMAGES):
-            if image is not None:
-                points[time].append(range_image_points(image, calibrations[laser], poses, vehicle_poses.get(time)))
+        try:
+            if not isinstance(laser, int) or laser not in calibrations:
+                raise ValueError(f"sensor {str(laser)[:40]} has no usable calibration")
+            if laser == TOP:  # the only one whose pixels have poses
+                while time not in early and (other := next(pixel_poses, None)) is not None:
+                    early |= {other[0]: other[1]} if other[0] in missing else {}
+            poses = early.pop(time, None) if laser == TOP else None
+            for image in (_image(row, name) for name in _IMAGES):
+                if image is not None:
+                    points[time].append(
+                        range_image_points(image, calibrations[laser], poses, vehicle_poses.get(time))
+                    )
+        except ValueError as reason:  # a scan without one of its sensors would pass for a whole one
+            left_out.add("frames", f"{lidar}, row {number}", reason)
+            del missing[time]
+            points.pop(time, None)
+            times.remove(time)
+            continue
         missing[time] -= 1
         if not missing[time]:  # all sensors of the frame
-            with atomic_path(folder / f"{time}.npy") as temporary, temporary.open("wb") as file:
+            with atomic_path(_scan_path(folder, time)) as temporary, temporary.open("wb") as file:
                 np.save(file, np.concatenate([*points.pop(time, []), np.zeros((0, 4), np.float32)]))
     return times
 
 
-def _labels(path: Path) -> dict[int, BoxRecords]:
+def _labels(path: Path, left_out: LeftOut) -> dict[int, BoxRecords]:
     """The boxes of each frame."""
-    own: dict[int, list[dict[str, Any]]] = defaultdict(list)
-    for row in parquet_rows(path, (_TIME, _OBJECT, f"{_BOX}.type", *_BOX_COLUMNS)):
-        own[row[_TIME]].append(row)
-    return {
-        time: records_from(
-            np.array([[row[name] for name in _BOX_COLUMNS] for row in rows], np.float64),
-            [TYPES.get(row[f"{_BOX}.type"], "Unknown") for row in rows],
-            None,
-            [row[_OBJECT] for row in rows],
-        )
-        for time, rows in own.items()
-    }
+    boxes: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
+    types: dict[int, list[str]] = defaultdict(list)
+    objects: dict[int, list[str | None]] = defaultdict(list)
+    for number, row in enumerate(parquet_rows(path, (_TIME, _OBJECT, f"{_BOX}.type", *_BOX_COLUMNS))):
+        try:
+            time = whole_number(row[_TIME], _TIME)
+            kind = whole_number(row[f"{_BOX}.type"], f"{_BOX}.type")
+            box = numbers([row[name] for name in _BOX_COLUMNS], 7, "the box")
+            identity = None if row[_OBJECT] is None else text_of(row[_OBJECT], _OBJECT)
+        except ValueError as reason:
+            left_out.add("boxes", f"{path}, row {number}", reason)
+            continue
+        boxes[time].append(box)
+        types[time].append(TYPES.get(kind, "Unknown"))
+        objects[time].append(identity)
+    return {time: records_from(np.array(own), types[time], None, objects[time]) for time, own in boxes.items()}
 
 
-def _calibrations(path: Path) -> dict[int, LidarCalibration]:
+def _calibrations(path: Path, left_out: LeftOut) -> dict[int, LidarCalibration]:
     """Of each sensor, by its number."""
     columns = (_LASER, _EXTRINSIC, *(f"{_INCLINATION}.{part}" for part in ("values", "min", "max")))
     found = {}
-    for row in parquet_rows(path, columns):
-        inclinations = row[f"{_INCLINATION}.values"]
-        found[row[_LASER]] = LidarCalibration(
-            np.reshape(row[_EXTRINSIC], (4, 4)),
-            inclinations if inclinations is not None and len(inclinations) else None,
-            row[f"{_INCLINATION}.min"],
-            row[f"{_INCLINATION}.max"],
-        )
+    for number, row in enumerate(parquet_rows(path, columns)):
+        try:
+            stated = row[f"{_INCLINATION}.values"]
+            given = isinstance(stated, np.ndarray) and len(stated) > 0
+            ends = [row[f"{_INCLINATION}.{end}"] for end in ("min", "max")]
+            lowest, highest = (0.0, 0.0) if given else numbers(ends, 2, "the inclination's ends").tolist()
+            found[whole_number(row[_LASER], _LASER)] = LidarCalibration(
+                _rigid(row[_EXTRINSIC], _EXTRINSIC),
+                numbers(stated, None, "the inclinations") if given else None,
+                lowest,
+                highest,
+            )
+        except ValueError as reason:
+            left_out.add("calibrations", f"{path}, row {number}", reason)
     return found
 
 
-def _vehicle_poses(path: Path) -> dict[int, Doubles]:
+def _rigid(values: Any, name: str) -> Doubles:
+    """A transformation (4, 4) of 16 numbers."""
+    matrix = numbers(values, 16, name).reshape(4, 4)
+    if not is_rigid(matrix):
+        raise ValueError(f"{name} is no rotation and shift")
+    return matrix
+
+
+def _vehicle_poses(path: Path, left_out: LeftOut) -> dict[int, Doubles]:
     """(4, 4) of each frame from the vehicle to the world; empty where they were not downloaded."""
-    if not path.is_file():
-        return {}
-    return {row[_TIME]: np.reshape(row[_VEHICLE_POSE], (4, 4)) for row in parquet_rows(path, (_TIME, _VEHICLE_POSE))}
+    poses: dict[int, Doubles] = {}
+    for number, row in enumerate(parquet_rows(path, (_TIME, _VEHICLE_POSE)) if path.is_file() else ()):
+        try:
+            poses[whole_number(row[_TIME], _TIME)] = _rigid(row[_VEHICLE_POSE], _VEHICLE_POSE)
+        except ValueError as reason:
+            left_out.add("poses", f"{path}, row {number}", reason)
+    return poses
 
 
-def _pixel_poses(path: Path) -> Iterator[tuple[int, NDArray[np.float32]]]:
+def _pixel_poses(path: Path, left_out: LeftOut) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Time and (H, W, 6) of each frame, of the sensor that has them; nothing where they were not downloaded."""
-    if not path.is_file():
-        return
     columns = (_TIME, _LASER, f"{_PIXEL_POSE}.values", f"{_PIXEL_POSE}.shape")
-    for row in parquet_rows(path, columns):
-        image = _image(row, _PIXEL_POSE, path) if row[_LASER] == TOP else None
-        if image is not None:
-            yield row[_TIME], image
+    for number, row in enumerate(parquet_rows(path, columns) if path.is_file() else ()):
+        try:
+            image = _image(row, _PIXEL_POSE) if row[_LASER] == TOP else None
+            if image is not None:
+                yield whole_number(row[_TIME], _TIME), image
+        except ValueError as reason:
+            left_out.add("poses", f"{path}, row {number}", reason)
 
 
-def _image(row: dict[str, Any], name: str, path: Path) -> NDArray[np.float32] | None:
-    """A range image (H, W, C); None where the sensor has none."""
+def _image(row: dict[str, Any], name: str) -> NDArray[np.float32] | None:
+    """A range image (H, W, C); None where the sensor has none, ValueError where it is damaged."""
     values, shape = row[f"{name}.values"], row[f"{name}.shape"]
     if values is None or shape is None or not len(values):
         return None
-    if len(shape) != 3 or int(np.prod(shape)) != len(values):
-        raise DatasetError(f"{path}: {name} has {len(values)} values for the shape {list(shape)}; copy the file again")
-    return np.asarray(values, np.float32).reshape(shape)
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
+        raise ValueError(f"{name} has no numbers")
+    sizes = [int(size) for size in numbers(shape, 3, f"{name}.shape").tolist()]
+    if min(sizes) <= 0 or math.prod(sizes) != len(values):
+        raise ValueError(f"{name} has {len(values)} values for the shape {sizes}")
+    return values.astype(np.float32).reshape(sizes)

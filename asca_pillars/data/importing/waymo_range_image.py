@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.rotations import of_roll_pitch_yaw
 
 Doubles = NDArray[np.float64]
+_CHANNELS = 2
+"""That are read: range and intensity."""
+_FAR_M = 1000.0
+"""No sensor measures as far."""
 
 
 class LidarCalibration(NamedTuple):
@@ -39,9 +43,18 @@ def range_image_points(
         pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of the vehicle in the world when a pixel was measured; None:
             it stood still.
         world_from_vehicle: (4, 4) at the label time; with `pixel_poses`.
+
+    Raises:
+        ValueError: the image has other channels, or another number of rows than the sensor has lasers, or than the
+            poses.
     """
-    rows, columns = np.nonzero(image[..., 0] > 0)
-    height, width = image.shape[:2]
+    height, width, channels = image.shape
+    lasers = height if calibration.inclinations_rad is None else len(calibration.inclinations_rad)
+    if channels < _CHANNELS or height != lasers:
+        raise ValueError(f"a range image of shape {list(image.shape)} for {lasers} lasers")
+    if pixel_poses is not None and pixel_poses.shape != (height, width, 6):
+        raise ValueError(f"poses of shape {list(pixel_poses.shape)} for a range image of {list(image.shape)}")
+    rows, columns = np.nonzero((image[..., 0] > 0) & (image[..., 0] < _FAR_M))
     extrinsic = calibration.vehicle_from_lidar
     upwards = calibration.inclinations_rad
     if upwards is None:
@@ -59,4 +72,5 @@ def range_image_points(
         world = np.einsum("nij,nj->ni", of_roll_pitch_yaw(poses[:, :3]), points) + poses[:, 3:]
         points = (world - world_from_vehicle[:3, 3]) @ world_from_vehicle[:3, :3]
     reflectance = np.tanh(np.maximum(image[rows, columns, 1], 0))
-    return np.column_stack([points, reflectance]).astype(np.float32)
+    found = np.column_stack([points, reflectance])
+    return found[(np.abs(found) < np.finfo(np.float32).max).all(axis=1)].astype(np.float32)

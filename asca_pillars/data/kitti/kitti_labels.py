@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, image_boxes
+from asca_pillars.data.yaw_units import why_no_yaw
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import wrap_angle
@@ -165,7 +166,7 @@ def parse_object(words: Sequence[str], place: str) -> KittiObject:
     truncated, occluded, alpha, x1, y1, x2, y2, height, width, length, x, y, z, rotation_y, *score = values
     if not occluded.is_integer():
         raise DatasetError(f"{place}: occluded is {words[2]}; KITTI has the whole numbers 0 to 3, or -1")
-    return KittiObject(
+    item = KittiObject(
         type=words[0],
         truncated=truncated,
         occluded=int(occluded),
@@ -180,6 +181,9 @@ def parse_object(words: Sequence[str], place: str) -> KittiObject:
         rotation_y=rotation_y,
         score=score[0] if score else None,
     )
+    if item.has_box_3d and (reason := why_no_yaw(rotation_y)) is not None:
+        raise DatasetError(f"{place}: rotation_y {reason}")
+    return item
 
 
 def is_detection_text(text: str) -> bool:

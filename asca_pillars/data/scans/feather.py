@@ -27,13 +27,15 @@ def feather_table(
 ) -> dict[str, Any]:
     """Columns of numbers and columns of texts of a feather file, each an array (N,).
 
+    Where nothing stands, a whole number is -1, another number NaN and a text None.
+
     Raises:
         AscaError: pyarrow is not installed.
         error: no feather file, or a column is missing or of another kind.
     """
     try:
         import pyarrow
-        from pyarrow import feather
+        from pyarrow import compute, feather
     except ModuleNotFoundError:
         raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
     try:
@@ -47,9 +49,15 @@ def feather_table(
         raise error(
             f"{path}: no column `{missing[0]}` (there are: {', '.join(table.column_names)}); give a file of Argoverse 2"
         )
-    arrays = {name: table[name].to_numpy() for name in (*numbers, *texts)}
-    wrong = [name for name in numbers if arrays[name].dtype.kind not in "iuf"]
-    wrong += [name for name in texts if not all(isinstance(value, str) for value in arrays[name])]
-    if wrong:
-        raise error(f"{path}: column `{wrong[0]}` is not what Argoverse 2 has there; copy the file again")
+    arrays = {}
+    for name in (*numbers, *texts):
+        try:
+            column = table[name]
+            column = compute.fill_null(column, -1) if pyarrow.types.is_signed_integer(column.type) else column
+            arrays[name] = column.to_numpy()
+        except (pyarrow.ArrowException, KeyError, ValueError):  # a name that stands there twice, text that is none
+            arrays[name] = np.zeros(0, bool)
+        of_texts = arrays[name].dtype.kind == "O" and all(isinstance(value, str | None) for value in arrays[name])
+        if not (of_texts if name in texts else arrays[name].dtype.kind in "iuf"):
+            raise error(f"{path}: column `{name}` is not what Argoverse 2 has there; copy the file again")
     return arrays

@@ -14,6 +14,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.errors import DatasetError
 
 _SAME_TIME_S = 1e-3
+_DEEPEST = 64  # folders of a scan's path that are looked at
 
 
 def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedRecords]:
@@ -89,6 +90,7 @@ def _frame_of_line(
 
 def _frame_of_scan(scan: str, frame_ids: set[str]) -> str | None:
     """The frame whose id is the longest end of a scan's path; None if there is none."""
-    parts = PurePosixPath(scan.replace("\\", "/")).with_suffix("").parts
+    path = PurePosixPath(scan.replace("\\", "/"))
+    parts = path.with_suffix("").parts[-_DEEPEST:] if path.name else ()
     ends = ("/".join(parts[first:]) for first in range(len(parts)))
     return next((end for end in ends if end in frame_ids), None)

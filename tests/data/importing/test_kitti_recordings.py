@@ -1,5 +1,6 @@
 """Imports of KITTI's tracking benchmark and raw recordings, small ones in their published formats, made here."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
+from asca_pillars.data.importing.imported import usable
 from asca_pillars.data.importing.kitti_raw import read_kitti_raw
 from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
 from asca_pillars.errors import DatasetError
@@ -107,20 +109,53 @@ def test_sitting_persons_have_the_name_that_training_and_scores_know(tmp_path: P
         assert {kind for frame in imported.frames for kind in frame.records.types} == {"Person_sitting"}
 
 
+def write_drive(root: Path, tracklets: str) -> Path:
+    for number in range(3):
+        write_scan(root / "drive" / "velodyne_points" / "data" / f"{number:010d}.bin")
+    (root / "drive" / "tracklet_labels.xml").write_text(tracklets)
+    return root
+
+
+ATTRIBUTES = "<!DOCTYPE boost_serialization [<!ATTLIST item x CDATA 'y'>]>"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("<h>2</h>", "<h>-2</h>", "tracklet 0 has no type or no size"),
-        ("<tx>12</tx>", "<tx>nan</tx>", "tracklet 0 has a number that is not finite"),
-        ("<l>4.5</l>", "", "could not convert"),
         ("</tracklets>", "", "mismatched tag"),
-        ("<!DOCTYPE boost_serialization>", "<!DOCTYPE b [<!ENTITY a 'b'>]>", "it declares entities"),
+        ("<!DOCTYPE boost_serialization>", "<!DOCTYPE b [<!ENTITY a 'b'>]>", "another DOCTYPE than"),
+        ("<!DOCTYPE boost_serialization>", ATTRIBUTES, "another DOCTYPE than"),
+        ("<!DOCTYPE boost_serialization>", "<!DOCTYPE boost_serialization>" + ATTRIBUTES, "another DOCTYPE than"),
     ],
 )
-def test_damaged_tracklets_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_files_that_are_no_tracklets_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     (tmp_path / "tracklet_labels.xml").write_text(TRACKLETS.replace(old, new))
     with pytest.raises(DatasetError, match=f"tracklet_labels.xml: no tracklets of KITTI .*{message}"):
         read_kitti_raw(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message", "left"),
+    [
+        ("<h>2</h>", "<h>-2</h>", r"tracklets: 1, .*tracklet 0: no size \(-2, 1\.8, 4\.5\)", 0),
+        ("<h>2</h>", "<h>0.00001</h>", "boxes: 2, .*no box of a Van", 0),
+        ("<tx>12</tx>", "<tx>nan</tx>", "boxes: 1, .*tracklet 0, pose 0: .*not 4 finite numbers", 1),
+        ("<rz>0.4</rz>", "<rz>90</rz>", "boxes: 1, .*no box of a Van", 1),
+        ("<l>4.5</l>", "", "tracklets: 1, .*could not convert", 0),
+        ("<objectType>Van</objectType>", "", "tracklets: 1, .*objectType is '', no name", 0),
+        ("<first_frame>1", "<first_frame>x", "tracklets: 1, .*invalid literal", 0),
+    ],
+)
+def test_one_bad_tracklet_costs_itself(tmp_path: Path, old: str, new: str, message: str, left: int) -> None:
+    assert old in TRACKLETS
+    source = write_drive(tmp_path, TRACKLETS.replace(old, new, 1))
+    imported = read_kitti_raw(source)
+    if left:
+        output = invoke("import", source, tmp_path / "out", "--from", "kitti-raw")
+        assert f"Van {left}" in output and re.search(message, output)
+    else:
+        with pytest.raises(DatasetError, match=message):
+            usable(imported)
 
 
 def test_mistakes_are_named(tmp_path: Path) -> None:
@@ -129,6 +164,13 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no label_02/\*\.txt there"):
         read_kitti_tracking(tmp_path)
     labels = write_tracking(tmp_path) / "training" / "label_02" / "0000.txt"
-    labels.write_text("Car 0 0 0")
-    with pytest.raises(DatasetError, match=r"0000\.txt:1: does not begin with a frame's number"):
-        read_kitti_tracking(tmp_path)
+    good = labels.read_text()
+    labels.write_text(f"Car 0 0 0\n1 2 Car 0 0 0\n{good}")
+    imported = usable(read_kitti_tracking(tmp_path))
+    (line,) = imported.left_out.lines()
+    assert re.search(r"lines: 2, the first: .*0000\.txt:1: does not begin with a frame's number", line)
+    assert sum(len(frame.records.types) for frame in imported.frames) == 2
+    for path in labels.parent.iterdir():
+        path.write_text("Car 0 0 0")
+    with pytest.raises(DatasetError, match=r"no box there that can be used; .*0000\.txt:1: does not begin"):
+        usable(read_kitti_tracking(tmp_path))
