@@ -9,6 +9,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -19,17 +20,10 @@ from asca_pillars.errors import OutputError
 from asca_pillars.locks import CAN_LOCK, RETIRED, is_temporary, locked
 from asca_pillars.own_files import Recognizer, require_no_link, require_replaceable
 
-<<<<<<< HEAD
 _LONGEST_NAME_BYTES = 255  # of a file, on nearly every file system
-=======
-_TEMPORARY = re.compile(r"\.(?P<name>.+)\.asca-[0-9a-f]{8}(?P<retired>-old)?(?:\.[^.]*)?")
 _NOT_PLAIN = re.compile(r"[^A-Za-z0-9._-]")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # devices of Windows
 _LONGEST_NAME = 100  # characters; systems allow 255 bytes, suffixes and the names of temporary files included
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
-_cleared: set[Path] = set()  # folders whose leftovers this process has looked for
-_shares_folders = False
->>>>>>> importing
 
 
 @contextlib.contextmanager

@@ -56,21 +56,16 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             same = frames.setdefault(frame_id_of(path, scans), BoxFrame(path, labels, nothing)).scan
             if same != path:
                 raise DatasetError(f"{same} and {path}: both would be frame {frame_id_of(path, scans)}; rename one")
-<<<<<<< HEAD
     for scan, records, place, time_s, _ in read_frames(labels):
-        path = _find_scan(scan, scans, place)
-=======
-    for scan, records, place, time_s in read_frames(labels):
-        path = _find_scan(scan, scans)
-        if path is None:
+        found = _find_scan(scan, scans)
+        if found is None:
             raise DatasetError(
                 f"{place}: no scan {scan[:200]} below {scans}; correct the name, or `scans` in {DATASET_FILE}"
             )
->>>>>>> importing
-        frame_id = frame_id_of(path, scans)
+        frame_id = frame_id_of(found, scans)
         if frame_id in places:
             raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
-        frames[frame_id], places[frame_id] = BoxFrame(path, labels, records, time_s), place
+        frames[frame_id], places[frame_id] = BoxFrame(found, labels, records, time_s), place
     if not frames:
         raise DatasetError(f"{labels}: no frame in it; write a line for each scan, as docs/DATA.md says")
     return frames

@@ -23,11 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-<<<<<<< HEAD
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
-=======
 from asca_pillars.data.yaw_units import LARGEST_YAW_RAD, why_no_yaw
->>>>>>> importing
 from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.input_files import read_text

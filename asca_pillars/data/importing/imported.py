@@ -19,14 +19,9 @@ from asca_pillars.data.kitti import write_image_set
 from asca_pillars.data.scans.find_scans import natural_order
 from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import ConfigError, DatasetError, OutputError
-<<<<<<< HEAD
-from asca_pillars.files import atomic_path, write_text
+from asca_pillars.files import atomic_path, file_inside, write_text
 from asca_pillars.own_files import json_lines, require_own, require_own_file, starting_with
-from asca_pillars.schema import to_dict
-=======
-from asca_pillars.files import atomic_path, file_inside, require_own
 from asca_pillars.schema import parse, to_dict
->>>>>>> importing
 
 COMMAND = "asca import"
 LABELS_FILE = "labels.jsonl"
@@ -192,33 +187,22 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
         imported.frames, key=lambda frame: (natural_order(Path(frame.recording)), natural_order(frame.scan))
     )
     require_own_dataset(out)
-<<<<<<< HEAD
-    with atomic_path(out / LABELS_FILE) as temporary, temporary.open("w", encoding="utf-8") as file:
-=======
     usual = to_dict(BoxDataset())
     content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
     settings = yaml.safe_dump(content, sort_keys=False)
     parse(BoxDataset, yaml.safe_load(settings), str(out / DATASET_FILE))
-    with atomic_path(out / "labels.jsonl") as temporary:
+    with atomic_path(out / LABELS_FILE) as temporary:
         with temporary.open("w", encoding="utf-8") as file:
             for frame in frames:
                 file.write(json_line(frame.scan.relative_to(scans).as_posix(), frame.records, frame.time_s))
         read = find_frames(temporary, scans)
->>>>>>> importing
         for frame in frames:
             if read.pop(frame_id_of(frame.scan, scans)).records.types != frame.records.types:
                 raise DatasetError(f"{frame.scan}: its boxes cannot be read again; report this")
     train, val = _lists(frames, val_share)
     for name, own in (("train", train), ("val", val)):
         write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
-<<<<<<< HEAD
-    usual = to_dict(BoxDataset())
-    content = {key: value for key, value in to_dict(imported.settings).items() if value != usual[key]}
-    write_text(out / DATASET_FILE, MARKER + yaml.safe_dump(content, sort_keys=False))
-=======
-    with atomic_path(out / DATASET_FILE) as temporary:
-        temporary.write_text(MARKER + settings, encoding="utf-8")
->>>>>>> importing
+    write_text(out / DATASET_FILE, MARKER + settings)
     boxes = Counter(kind for frame in frames for kind in frame.records.types)
     doubt = doubt_of_yaws([frame.records.boxes[:, 6] for frame in frames])
     return ImportCounts(len(train), len(val), dict(boxes.most_common()), doubt)

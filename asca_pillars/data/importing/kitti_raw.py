@@ -65,15 +65,9 @@ def _read_tracklets(path: Path, left_out: LeftOut) -> dict[int, _Labels]:
     """The labels of each frame."""
     labels: dict[int, _Labels] = defaultdict(lambda: _Labels([], [], []))
     try:
-<<<<<<< HEAD
         text = read_text(path, DatasetError, errors="replace")
-        if "<!ENTITY" in text:  # an entity may unfold to any size
-            raise ValueError("it declares entities")
-=======
-        text = path.read_text(encoding="utf-8", errors="replace")
         if "<!DOCTYPE" in text.replace(_DOCTYPE, "", 1):  # entities and attributes of one may unfold to any size
             raise ValueError(f"another DOCTYPE than {_DOCTYPE}")
->>>>>>> importing
         tracklets = ElementTree.fromstring(text).findall("tracklets/item")
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None
@@ -87,9 +81,7 @@ def _read_tracklets(path: Path, left_out: LeftOut) -> dict[int, _Labels]:
     return dict(labels)
 
 
-def _add(
-    labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: LeftOut, path: Path
-) -> None:
+def _add(labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: LeftOut, path: Path) -> None:
     """Add the boxes of a tracklet to their frames; ValueError if it has no type, size or first frame."""
     height, width, length = _numbers(tracklet, "hwl")
     kind = text_of(tracklet.findtext("objectType", ""), "objectType")

@@ -110,7 +110,10 @@ def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: Le
 
 
 def _records(
-    labels: list[_Row], changes: list[tuple[_Doubles, _Doubles]], tables: Mapping[str, _Table], folder: Path,
+    labels: list[_Row],
+    changes: list[tuple[_Doubles, _Doubles]],
+    tables: Mapping[str, _Table],
+    folder: Path,
     left_out: LeftOut,
 ) -> BoxRecords:
     boxes, types, tracks = [], [], []
@@ -120,7 +123,9 @@ def _records(
             for back, origin in changes:
                 center, turn = back.T @ (center - origin), back.T @ turn
             width, length, height = numbers(entry(label, "size"), 3, "size")
-            kind = text_of(entry(_linked(_linked(label, "instance", tables), "category", tables), "name"), "the category")
+            kind = text_of(
+                entry(_linked(_linked(label, "instance", tables), "category", tables), "name"), "the category"
+            )
         except ValueError as reason:
             left_out.add("boxes", f"{folder}/sample_annotation.json, {label['token']}", reason)
             continue
@@ -164,11 +169,7 @@ def _table(folder: Path, name: str, left_out: LeftOut) -> _Table:
     """The rows of a table by their tokens."""
     path = folder / f"{name}.json"
     try:
-<<<<<<< HEAD
-        return {row["token"]: row for row in json.loads(read_text(path, DatasetError))}
-=======
-        rows = json.loads(path.read_text(encoding="utf-8"))
->>>>>>> importing
+        rows = json.loads(read_text(path, DatasetError))
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); nuScenes' metadata has this table") from None
     except (ValueError, RecursionError):

@@ -25,12 +25,8 @@ from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
 from asca_pillars.data.scans.find_scans import visible_files
 from asca_pillars.errors import DatasetError
-<<<<<<< HEAD
-from asca_pillars.files import atomic_path, write_text
-=======
-from asca_pillars.files import atomic_path, portable_name
+from asca_pillars.files import atomic_path, portable_name, write_text
 from asca_pillars.geometry.frame_change import is_rigid
->>>>>>> importing
 
 TOP = 1
 """The roof's sensor."""
@@ -66,13 +62,7 @@ def read_waymo(root: Path, out: Path) -> Imported:
     require_own_dataset(out)
     if not (out / DATASET_FILE).exists():
         # It marks the folder from the start, so that an import that was killed can be given again.
-<<<<<<< HEAD
         write_text(out / DATASET_FILE, MARKER)
-    bar = track(segments, "Reading segments", transient=True)
-    frames = [frame for path in bar for frame in _frames(root, path, out.resolve() / "scans")]
-    top = _calibrations(root / "lidar_calibration" / segments[0].name).get(TOP)
-=======
-        temporary.write_text(MARKER, encoding="utf-8")
     scans, left_out = out.resolve() / "scans", LeftOut()
     frames: list[ImportedFrame] = []
     for path in track(segments, "Reading segments", transient=True):
@@ -82,7 +72,6 @@ def read_waymo(root: Path, out: Path) -> Imported:
         for time in _write_scans(root, path, folder, left_out):
             frames.append(ImportedFrame(_scan_path(folder, time), labels.get(time, nothing), path.stem))
     top = _calibrations(root / "lidar_calibration" / segments[0].name, LeftOut()).get(TOP)
->>>>>>> importing
     x, y, z = np.zeros(3) if top is None else np.round(top.vehicle_from_lidar[:3, 3], 3).tolist()
     settings = BoxDataset(sensor_height=0.0, reflectance_scale=1.0, scans=str(scans), sensor_position=(x, y, z))
     return Imported(settings, frames, left_out)
@@ -123,9 +112,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> li
             poses = early.pop(time, None) if laser == TOP else None
             for image in (_image(row, name) for name in _IMAGES):
                 if image is not None:
-                    points[time].append(
-                        range_image_points(image, calibrations[laser], poses, vehicle_poses.get(time))
-                    )
+                    points[time].append(range_image_points(image, calibrations[laser], poses, vehicle_poses.get(time)))
         except ValueError as reason:  # a scan without one of its sensors would pass for a whole one
             left_out.add("frames", f"{lidar}, row {number}", reason)
             del missing[time]
