@@ -1,4 +1,4 @@
-"""Every reader against damaged input: scans, settings, labels, calibrations, predictions, lists, manifests.
+"""Every reader against damaged input: scans, recordings, settings, labels, calibrations, predictions, manifests.
 
     python -m benchmarks.fuzz --minutes 20 --seed 7
 

@@ -12,19 +12,33 @@ import yaml
 from asca_deploy import default_bundle_path
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.config import Config, load_config
+from asca_pillars.data.boxes.box_records import read_frame_file, read_frames, read_time
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels
+from asca_pillars.data.mounting import read_pose
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from asca_pillars.schema import to_dict
 from asca_pillars.settings import shipped_configs
 from asca_pillars.sim.simulation_configs import load_simulation_config
 from asca_pillars.tables.voxel_spec import VoxelSpec
+from benchmarks.fuzz_recordings import read_recording, recording_seeds
 
 LABEL = "Car 0.00 0 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57"
 CALIBRATION = """P0: 721.5 0 609.6 0 0 721.5 172.9 0 0 0 1 0
 P2: 721.5 0 609.6 44.9 0 721.5 172.9 0.2 0 0 1 0.003
 R0_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27
+"""
+BOX = {"class": "Car", "x_m": 9.5, "y_m": -2, "z_m": -0.9, "length_m": 4, "width_m": 1.8, "height_m": 1.6, "yaw_rad": 3}
+METADATA = """rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: sqlite3
+  relative_file_paths: [bag_0.db3]
+  topics_with_message_count:
+    - topic_metadata: {name: /lidar, type: sensor_msgs/msg/PointCloud2, serialization_format: cdr}
+      message_count: 3
+  compression_format: ""
+  compression_mode: ""
 """
 
 
@@ -85,8 +99,26 @@ def kinds(folder: Path) -> list[Kind]:
         Kind(f"scan .{suffix}", folder / f"scan.{suffix}", seeds, read_points, 4.0, is_scan=True)
         for suffix, seeds in scan_seeds().items()
     ]
+    recordings = [
+        Kind(f"recording .{suffix}", folder / f"drive.{suffix}", seeds, read_recording, 2.0)
+        for suffix, seeds in recording_seeds().items()
+    ]
+    (folder / "bag").mkdir(exist_ok=True)
+    (folder / "bag" / "bag_0.db3").write_bytes(recording_seeds()["db3"][0])
+    box_files = [
+        Kind(f"boxes .{suffix}", folder / f"boxes.{suffix}", seeds, reader)
+        for suffix, seeds, reader in (
+            ("json", (json.dumps({"time_s": 1.5, "boxes": [BOX, BOX]}).encode(),), frame_boxes),
+            ("jsonl", (f"{json.dumps({'scan': 'a.bin', 'boxes': [BOX]})}\n".encode(),), named_boxes),
+            ("csv", (f"scan,{','.join(BOX)}\na.bin,{','.join(map(str, BOX.values()))}\n".encode(),), named_boxes),
+        )
+    ]
     return [
         *scans,
+        *recordings,
+        *box_files,
+        Kind("metadata.yaml", folder / "bag" / "metadata.yaml", (METADATA.encode(),), rosbag2, 0.5),
+        Kind("pose", folder / "pose.txt", (b"1 0 0 0\n0 1 0 0\n0 0 1 1.7\n0 0 0 1\n",), read_pose, 0.5),
         Kind("config", folder / "config.yaml", (*configs, *sections), lambda path: _numbers(load_config(path)), 0.25),
         Kind("simulation", folder / "sim.yaml", simulations, simulation, 0.2),
         Kind("override", folder / "override.txt", tuple(word.encode() for word in overrides), override, 0.5),
@@ -96,6 +128,21 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("ImageSets", folder / "root" / "ImageSets" / "val.txt", (b"000000\n000001\n",), image_set, 2.0),
         Kind("manifest", bundle / "bundle.json", ((bundle / "bundle.json").read_bytes(),), _manifest, 0.2),
     ]
+
+
+def frame_boxes(path: Path) -> Any:
+    """The boxes and the time of a file of one frame."""
+    return read_frame_file(path).boxes, read_time(path)
+
+
+def named_boxes(path: Path) -> Any:
+    """The boxes of a file of several frames."""
+    return [frame.records.boxes for frame in read_frames(path)]
+
+
+def rosbag2(path: Path) -> Any:
+    """The scans of the folder that a metadata.yaml lies in."""
+    return read_recording(path.parent)
 
 
 def read_points(path: Path) -> Any:

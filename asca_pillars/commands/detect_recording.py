@@ -119,7 +119,8 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
         damages.add(recording.damage)
         times_ns = [one.time_ns for one in journal.results() if one.detections is not None]
         if not times_ns:
-            raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{run.first()}")
+            why = run.first() or (f": {recording.damage}" if recording.damage else "")
+            raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{why}")
         if task.track:
             _check_times(times_ns, task, topic.name, poses, console)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))

@@ -16,6 +16,7 @@ from asca_deploy.manifest_file import read_manifest
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import BundleError, ConfigError
 from asca_pillars.files import atomic_directory, write_json
+from asca_pillars.input_files import require_content
 from asca_pillars.own_files import json_object, require_not_input, require_replaceable
 
 PAGE = "page.json"
@@ -99,6 +100,7 @@ def _modules() -> list[Path]:
 def _open_package(path: Path) -> tuple[str, Callable[[str], bytes]]:
     """Version of the package, and what reads one of its files."""
     try:
+        require_content(path, ConfigError)
         if path.is_dir():
             files = {name: (path / name).read_bytes() for name in ("package.json", *(f"dist/{n}" for n in ORT_FILES))}
         else:

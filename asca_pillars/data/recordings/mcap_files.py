@@ -30,6 +30,8 @@ _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 3, 4, 5, 6  # opcodes
 _FIRST_PRIVATE = 0x80  # opcode
 _RECORD, _MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _FOOTER_BYTES = 9 + 20 + 8  # with the magic that ends the file
+_MAX_OTHER_RECORDS = 2**18
+"""Of a chunk: twice as many as there are numbers of channels and schemas."""
 _MAX_OPEN_BYTES = 2**28
 """Chunks whose messages are merged by their times hold so many bytes; beyond, messages may be out of order."""
 
@@ -270,7 +272,7 @@ class McapRecording(Recording):
     def _messages_in(self, data: bytes, topic: str | None = None) -> Iterator[tuple[int, int, int]]:
         """Channel, start and end of messages in a chunk, as far as it can be read; learns channels and schemas."""
         channels = None if topic is None else self._known.channels_of(topic)
-        position = 0
+        position, others = 0, 0
         try:
             while position < len(data):
                 opcode, length = _RECORD.unpack_from(data, position)
@@ -281,7 +283,11 @@ class McapRecording(Recording):
                     number = data[start] | data[start + 1] << 8
                     if channels is None or number in channels:
                         yield number, start, position
-                elif opcode in (_SCHEMA, _CHANNEL):
+                    continue
+                others += 1
+                if others > _MAX_OTHER_RECORDS:
+                    raise ValueError(f"more than {_MAX_OTHER_RECORDS} records that are no messages")
+                if opcode in (_SCHEMA, _CHANNEL):
                     number = data[start] | data[start + 1] << 8
                     if number not in (self._known.schemas if opcode == _SCHEMA else self._known.channels):
                         self._known.learn(record := _schema_or_channel(opcode, data[start:position]))

@@ -12,6 +12,8 @@ from asca_pillars.errors import ScanError
 
 SEARCHED_MESSAGES = 300
 """How far scans with points are looked for: half a minute at 10 Hz, in which a sensor starts."""
+MAX_UNREADABLE = 10_000
+"""Messages in a row that cannot be read, after which no more are tried: a quarter of an hour at 10 Hz."""
 
 
 class RecordedScan(NamedTuple):
@@ -49,12 +51,20 @@ class RecordedScans:
 
     def read(self, start: int = 0) -> Iterator[RecordedScan]:
         """All scans from message `start` on; what damage ends the recording early, `recording.damage` tells."""
+        unreadable = 0
         for number, message in enumerate(self.recording.messages(self.topic.name)):
             if number < start:
                 continue
+            if unreadable == MAX_UNREADABLE:
+                self.recording.damage = (
+                    f"{self._place(number)}: {unreadable} before it cannot be read, none is tried after"
+                )
+                return
             try:
                 cloud = read_point_cloud(message, self._place(number))
+                unreadable = 0
             except ScanError as error:
+                unreadable += 1
                 yield RecordedScan(number, message.recorded_ns or 0, "", None, str(error))
                 continue
             yield RecordedScan(number, cloud.time_ns, cloud.frame_id, finite_scan(cloud.points, self.scale.scale))

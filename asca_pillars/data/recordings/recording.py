@@ -68,7 +68,8 @@ class Recording(ABC):
         if wanted is not None:
             named = [topic for topic in self.topics if topic.name == wanted]
             if not named:
-                raise ScanError(f"{self.path}: no topic {wanted[:80]}; there are {listed(self.topics)}")
+                lost = f"; {self.damage}" if self.damage else ""
+                raise ScanError(f"{self.path}: no topic {wanted[:80]}; there are {listed(self.topics)}{lost}")
             if not named[0].is_point_cloud and named[0].type != UNKNOWN_TYPE:
                 held = f"{self.path}: {wanted} holds {named[0].type}"
                 if conversion := conversion_of(named[0].type):

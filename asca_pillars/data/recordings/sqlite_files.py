@@ -24,13 +24,11 @@ class SqliteRecording(Recording):
     """
 
     def __init__(self, path: Path, file: Path | None = None) -> None:
-        import sqlite3
-
         self.path, self._file = path, file or path
         try:
             with closing(self._connected()) as database:
                 self._read_topics(database)
-        except sqlite3.Error as error:
+        except Exception as error:  # SQLite's own, and UnicodeDecodeError of what it says of damage
             raise ScanError(
                 f"{path}: no readable rosbag2 ({reason(error)}); copy it again, or mend it "
                 "(sqlite3 broken.db3 .recover | sqlite3 mended.db3)"
@@ -38,8 +36,6 @@ class SqliteRecording(Recording):
 
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages of a topic by time; a row without data, or with damaged data, is a message without data."""
-        import sqlite3
-
         self.damage, count = None, 0
         numbers = self._numbers[topic]
         if formats := self._formats[topic] - {"cdr"}:
@@ -55,7 +51,7 @@ class SqliteRecording(Recording):
                     is_usable = isinstance(recorded_ns, int) and 0 <= recorded_ns <= LAST_NS
                     yield Message(recorded_ns if is_usable else None, self._data(database, row), "cdr")
                     count += 1
-            except sqlite3.Error as error:
+            except Exception as error:
                 self.damage = f"{self.path}: ends early, after {count} messages of {topic} ({reason(error)})"
 
     def _connected(self) -> "sqlite3.Connection":
@@ -67,13 +63,11 @@ class SqliteRecording(Recording):
         return connection
 
     def _read_topics(self, database: "sqlite3.Connection") -> None:
-        import sqlite3
-
         tables = database.execute(
             "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
         )
         if tables.fetchone()[0] != 2:
-            raise sqlite3.DatabaseError("it has no tables messages and topics")
+            raise ValueError("it has no tables messages and topics")
         counts = dict(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall())
         topics: list[Topic] = []
         self._numbers: dict[str, list[Any]] = {}
@@ -91,11 +85,9 @@ class SqliteRecording(Recording):
 
     @staticmethod
     def _data(database: "sqlite3.Connection", row: int) -> bytes:
-        import sqlite3
-
         try:
             found = database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
-        except sqlite3.Error:  # damaged pages
+        except Exception:  # damaged pages
             return b""
         return found[0] if found is not None and isinstance(found[0], bytes) else b""
 

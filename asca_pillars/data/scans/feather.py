@@ -9,6 +9,9 @@ from asca_pillars.data.scans.records import StoredPoints
 from asca_pillars.errors import AscaError, ScanError
 from asca_pillars.input_files import require_content
 
+_FEW_ROWS = 2**23
+"""Rows that a file may have however small it is; a column of equal numbers is compressed to nearly nothing."""
+
 
 def read_feather(path: Path) -> StoredPoints:
     """The points of a sweep, intensity as it is stored.
@@ -35,11 +38,14 @@ def feather_table(
     """
     try:
         import pyarrow
-        from pyarrow import compute, feather
+        from pyarrow import compute, dataset, feather
     except ModuleNotFoundError:
         raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
     try:
         require_content(path, error)
+        rows, most = dataset.dataset(path, format="feather").count_rows(), max(_FEW_ROWS, 2 * path.stat().st_size)
+        if rows > most:
+            raise error(f"{path}: {rows} rows, at most {most} are read of a file of its size; copy or export it again")
         table = feather.read_table(path, memory_map=False)
     except (pyarrow.ArrowException, OSError) as reason:
         raise error(

@@ -5,7 +5,7 @@ const AGAIN = "the file is damaged or incomplete";
 const MAX_HEADER_BYTES = 65536;
 const SPACE = "[ \\t\\n\\r\\v\\f]"; // of ASCII; \s is more, U+FEFF among it
 const WORDS = new RegExp(`${SPACE}+`);
-const LFS_POINTER = "version https://git-lfs";
+const LFS_POINTER = /^version https:\/\/git-lfs/;
 
 /**
  * Finite points of a file, and what was done to get them.
@@ -18,7 +18,7 @@ export function readScan(name, buffer) {
   const readers = { bin: readBin, pcd: readPcd };
   if (!Object.hasOwn(readers, suffix)) throw new Error(`${name}: scans are .bin and .pcd files`);
   if (buffer.byteLength === 0) throw new Error(`${name}: the file is empty`);
-  if (buffer.byteLength <= 1024 && text(new Uint8Array(buffer)).startsWith(LFS_POINTER)) {
+  if (buffer.byteLength <= 1024 && LFS_POINTER.test(text(new Uint8Array(buffer)))) {
     throw new Error(`${name}: is a pointer of Git LFS, its content was not fetched; run git lfs pull`);
   }
   try {

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
 
+from asca_pillars.data.recordings import recorded_scans
 from asca_pillars.data.recordings.open_recording import is_recording, open_recording
 from asca_pillars.data.recordings.recorded_scans import SEARCHED_MESSAGES, RecordedScans
 from asca_pillars.errors import ScanError
@@ -202,6 +203,19 @@ def test_scans_that_cannot_be_read_are_told_one_by_one(tmp_path: Path) -> None:
     assert [one.scan is None for one in scans] == [False, True, True]
     assert "a.mcap, /lidar, message 1: no readable PointCloud2" in str(scans[1].trouble)
     assert "message 2: no field z" in str(scans[2].trouble)
+
+
+def test_messages_that_cannot_be_read_are_not_tried_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded_scans, "MAX_UNREADABLE", 5)
+    good, times = clouds(3), stamps(16)
+    messages = [(times[0], good[0][1]), *((time, b"torn") for time in times[1:5]), (times[5], good[1][1])]
+    messages += [*((time, b"torn") for time in times[6:11]), (times[11], good[2][1])]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
+    scans = list(RecordedScans(recording, recording.point_cloud_topic(), 1.0).read())
+    assert len(scans) == 11 and [one.number for one in scans if one.scan is not None] == [0, 5]
+    assert recording.damage is not None and "message 11: 5 before it cannot be read" in recording.damage
 
 
 def test_the_reflectance_scale_is_decided_once_for_the_recording(tmp_path: Path) -> None:

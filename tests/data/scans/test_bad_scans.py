@@ -68,6 +68,17 @@ def test_an_lzf_stream_is_followed_no_further_than_the_points_need(tmp_path):
         read(tmp_path, "a.pcd", content[:start] + packed)
 
 
+def test_a_feather_file_that_unpacks_to_gigabytes_is_refused_before_it_is_read(tmp_path):
+    feather = pytest.importorskip("pyarrow.feather")
+    import pyarrow
+
+    zeros = np.zeros(2**23 + 1, np.uint8)
+    columns = dict.fromkeys(("x", "y", "z", "intensity"), zeros)
+    feather.write_feather(pyarrow.table(columns), tmp_path / "1.feather", compression="zstd")
+    with pytest.raises(ScanError, match=r"1\.feather: 8388609 rows, at most 8388608 are read"):
+        read_scan(tmp_path / "1.feather")
+
+
 def test_files_with_too_many_points_are_refused_before_they_are_read(tmp_path, monkeypatch):
     with (tmp_path / "a.bin").open("wb") as file:
         file.truncate(40 * 10**9)
