@@ -29,7 +29,7 @@ def warped(rng: np.random.Generator, body: Primitives, most_m: float) -> Primiti
     moves, what has a shape around it (an ellipsoid) keeps it.
     """
     direction = rng.standard_normal((_WAVES, 3))
-    length = np.exp(rng.uniform(*np.log(_WAVELENGTH_M), _WAVES))
+    length = np.exp(rng.uniform(np.log(_WAVELENGTH_M[0]), np.log(_WAVELENGTH_M[1]), _WAVES))
     number = 2 * np.pi * direction / (np.linalg.norm(direction, axis=1) * length)[:, None]
     phase = rng.uniform(0.0, 2 * np.pi, _WAVES)
     shift = rng.uniform(-most_m / _WAVES, most_m / _WAVES, (_WAVES, 3))
