@@ -32,8 +32,8 @@ def main(
     """Print a column for each list."""
     split = KittiSplit(folder)
     fits: dict[str, tuple[Fit, ...]] = {}
-    for name in lists or [None]:
-        frame_ids = split.frame_ids if name is None else (folder / "ImageSets" / f"{name}.txt").read_text().split()
+    for name in lists or [""]:
+        frame_ids = (folder / "ImageSets" / f"{name}.txt").read_text().split() if name else split.frame_ids
         rows = [_of_frame(split, frame_id) for frame_id in track(frame_ids, name or str(folder))]
         stacked = {kind: np.concatenate([row[kind] for row in rows]) for kind in CLASSES}
         for statistic, found in fits_of(stacked, name or folder.name).items():

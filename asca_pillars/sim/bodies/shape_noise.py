@@ -8,7 +8,7 @@ import numpy.typing as npt
 from asca_pillars.sim.bodies.primitives import Primitives
 
 Floats = npt.NDArray[np.float64]
-_WAVES = 3
+_WAVES = 2
 _WAVELENGTH_M = 1.0, 5.0
 _FEET_M = 0.5  # below, displacements fade towards the ground, on which a body stands
 _PATCH_M = 0.15, 0.45
@@ -29,7 +29,7 @@ def warped(rng: np.random.Generator, body: Primitives, most_m: float) -> Primiti
     moves, what has a shape around it (an ellipsoid) keeps it.
     """
     direction = rng.standard_normal((_WAVES, 3))
-    length = np.exp(rng.uniform(*np.log(_WAVELENGTH_M), _WAVES))
+    length = np.exp(rng.uniform(np.log(_WAVELENGTH_M[0]), np.log(_WAVELENGTH_M[1]), _WAVES))
     number = 2 * np.pi * direction / (np.linalg.norm(direction, axis=1) * length)[:, None]
     phase = rng.uniform(0.0, 2 * np.pi, _WAVES)
     shift = rng.uniform(-most_m / _WAVES, most_m / _WAVES, (_WAVES, 3))
@@ -38,7 +38,8 @@ def warped(rng: np.random.Generator, body: Primitives, most_m: float) -> Primiti
         flat = points.reshape(-1, 3)
         away = np.sin(flat @ number.T + phase) @ shift
         away[:, 2] *= np.minimum(np.abs(flat[:, 2]) / _FEET_M, 1.0)
-        return (flat + away).reshape(points.shape)
+        away += flat
+        return away.reshape(points.shape)
 
     return replace(body, triangles=moved(body.triangles), centers=moved(body.centers))
 

@@ -84,7 +84,7 @@ def fits_of(rows: Mapping[str, Floats], source: str) -> dict[str, tuple[Fit, ...
         rows: by class, as `object_fits` gives them, of one drive or folder.
         source: its name.
     """
-    result = {}
+    result: dict[str, tuple[Fit, ...]] = {}
     for name, statistics in SHOWN.items():
         for statistic in statistics:
             values = rows[name][:, COLUMNS.index(statistic)]
