@@ -101,7 +101,7 @@ def write_files(root: Path) -> None:
     (root / "boxes.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n" + "".join(map(_rows, frames)))
     scored = [frame.records._replace(scores=frame.records.scores * 0 + 0.9) for frame in frames]
     (root / "results").mkdir()
-    lines = [_with_score(json_line(frame.scan, records)) for frame, records in zip(frames, scored, strict=True)]
+    lines = [_detected(json_line(frame.scan, records)) for frame, records in zip(frames, scored, strict=True)]
     (root / "results" / "detections.jsonl").write_text("".join(lines))
 
     for name in ("kitti", "sim", "around"):
@@ -131,6 +131,7 @@ def _rows(frame: Any) -> str:
     return "".join(f"{frame.scan},{box['class']},{','.join(str(box[key]) for key in keys)}\n" for box in line["boxes"])
 
 
-def _with_score(line: str) -> str:
-    frame = json.loads(line)
+def _detected(line: str) -> str:
+    """As `asca detect` writes a line."""
+    frame = {**json.loads(line), "points_not_finite": 0}
     return json.dumps({**frame, "boxes": [{**box, "score": 0.9} for box in frame["boxes"]]}) + "\n"
