@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from asca_pillars.errors import OutputError
-from asca_pillars.files import atomic_directory, atomic_path, remove_directory
+from asca_pillars.files import atomic_directory, atomic_path, file_inside, portable_name, remove_directory
 from tests.bundle_folder import EXPORT, names, old_bundle
 
 
@@ -216,3 +216,53 @@ def test_other_threads_keep_their_umask(tmp_path: Path) -> None:
     finally:
         os.umask(previous)
     assert modes == {0o600}
+
+
+@pytest.mark.parametrize("text", ["1000", "segment-10_a.b", "0", "a" * 100])
+def test_a_plain_name_stays(text: str) -> None:
+    assert portable_name(text) == text
+
+
+HARMFUL = [
+    "",
+    ".",
+    "..",
+    "../../x",
+    "/etc/passwd",
+    "a/b",
+    "a\\b",
+    "C:x",
+    "a\nb",
+    "a b",
+    "-x",
+    ".x",
+    "x.",
+    "NUL",
+    "com1.txt",
+]
+
+
+@pytest.mark.parametrize("text", [*HARMFUL, "a" * 101, "\0", "\udc80", "ü", "\u2028"])
+def test_any_text_is_one_plain_name(text: str, tmp_path: Path) -> None:
+    name = portable_name(text)
+    assert len(name) <= 100 and set(name) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789._-")
+    assert (tmp_path / name).resolve().parent == tmp_path.resolve()
+    (tmp_path / name).touch(exist_ok=False)
+    assert portable_name(name) == name
+    assert name.partition(".")[0].casefold() not in ("nul", "com1")
+
+
+def test_different_texts_have_different_names() -> None:
+    texts = [*HARMFUL, "_", "a_b", "a?b", "a*b", "x", "ä", "ö"]
+    assert len({portable_name(text) for text in texts}) == len(texts)
+
+
+def test_a_name_from_data_leads_nowhere_else(tmp_path: Path) -> None:
+    folder = tmp_path / "data"
+    (folder / "a").mkdir(parents=True)
+    (folder / "a" / "x.bin").touch()
+    (tmp_path / "secret").touch()
+    assert file_inside(folder, "a/x.bin") == folder / "a" / "x.bin"
+    outside = ["../secret", str(tmp_path / "secret"), "a/../../secret", "a/../a/x.bin"]
+    for name in (*outside, "", "a", "none", "a\0", "x" * 5000, "a/" * 3000 + "x"):
+        assert file_inside(folder, name) is None

@@ -86,7 +86,7 @@ def usable(imported: Imported) -> Imported:
         records = _usable_records(frame, left_out)
         boxes += len(records.types)
         frames[frame_id] = frame._replace(records=records, time_s=time_s)
-    if not frames or (left_out.counts and not boxes):
+    if not frames or (not boxes and left_out.counts.keys() - {"frames"}):
         first = next(iter(left_out.lines()), "give the folder that holds the recordings")
         raise DatasetError(f"{scans}: no {'box' if frames else 'labelled scan'} there that can be used; {first}")
     return imported._replace(frames=list(frames.values()))

@@ -201,10 +201,12 @@ def _pixel_poses(path: Path, left_out: LeftOut) -> Iterator[tuple[int, NDArray[n
 def _image(row: dict[str, Any], name: str) -> NDArray[np.float32] | None:
     """A range image (H, W, C); None where the sensor has none, ValueError where it is damaged."""
     values, shape = row[f"{name}.values"], row[f"{name}.shape"]
-    if values is None or shape is None or not len(values):
+    if values is None or shape is None:
         return None
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
+    if not isinstance(values, np.ndarray) or (len(values) and values.dtype.kind not in "iuf"):
         raise ValueError(f"{name} has no numbers")
+    if not len(values):
+        return None
     sizes = [int(size) for size in numbers(shape, 3, f"{name}.shape").tolist()]
     if min(sizes) <= 0 or math.prod(sizes) != len(values):
         raise ValueError(f"{name} has {len(values)} values for the shape {sizes}")
