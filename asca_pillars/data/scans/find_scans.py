@@ -5,7 +5,6 @@ import os
 import re
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -61,23 +60,31 @@ def files_below(folder: Path) -> Iterator[Path]:
     folders, links = [folder], deque[Path]()
     while folders or links:
         here = folders.pop() if folders else links.popleft()
-        with suppress(OSError):
-            if (identity := _folder_identity(here)) in visited:
+        try:
+            if (identity := _folder_identity(here)) in visited or _is_prepared(here):
                 continue
             visited.add(identity)
-            if _is_prepared(here):
-                continue
-            for entry in sorted(os.scandir(here), key=lambda entry: entry.name):
-                if not entry.is_dir():
-                    yield here / entry.name
-                else:
-                    (links if entry.is_symlink() else folders).append(here / entry.name)
+            entries = sorted(os.scandir(here), key=lambda entry: entry.name)
+        except OSError:
+            continue
+        for entry in entries:
+            if not _is_folder(entry):
+                yield here / entry.name
+            else:
+                (links if entry.is_symlink() else folders).append(here / entry.name)
 
 
 def _folder_identity(folder: Path) -> tuple[int, int]:
     """What is the same on all paths to a folder; resolving a path of a thousand folders takes milliseconds."""
     status = folder.stat()
     return status.st_dev, status.st_ino
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # links that lead to each other
+        return False
 
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
@@ -108,7 +115,7 @@ def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
     folder_identity, resolved = cache(_folder_identity), cache(Path.resolve)
     for given in map(Path, paths):
         for scan in find_scans(given):
-            place = scan.resolve() if scan.is_symlink() else scan
+            place = scan.resolve() if scan.is_symlink() and scan.exists() else scan
             key = folder_identity(place.parent), place.name
             found.setdefault(key, (scan, given.parent if given.is_file() else given))
     scans = [scan for scan, _ in found.values()]

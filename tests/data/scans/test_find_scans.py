@@ -87,9 +87,10 @@ def test_names_that_are_too_long_for_results_are_shortened(tmp_path: Path, lette
 
 def test_links_to_nothing_are_named_when_they_are_read(tmp_path: Path) -> None:
     """As git-annex and DVC leave them where the content was not fetched."""
-    touch(tmp_path, "1.bin")
-    (tmp_path / "2.bin").symlink_to(tmp_path / "content")
-    assert names(tmp_path) == ["1", "2"]
+    touch(tmp_path, "1.bin", "9.bin")
+    (tmp_path / "2.bin").symlink_to(tmp_path / "annex" / "content")
+    (tmp_path / "3.bin").symlink_to(tmp_path / "3.bin")
+    assert names(tmp_path) == ["1", "2", "3", "9"]
     with pytest.raises(ScanError, match=r"2\.bin: cannot be read \(No such file"):
         read_scan(tmp_path / "2.bin")
 
