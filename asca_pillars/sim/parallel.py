@@ -74,7 +74,7 @@ def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
 
 
 def _names_successive_frames(path: Path) -> bool:
-    """Whether a list is one that is written here, of frames (000007) or of the scans of sequences (0002/000031)."""
+    """Return whether a list is one that is written here, of frames (000007) or of sequences (0002/000031)."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         rows = [[int(part) for part in line.split("/")] for line in lines]
