@@ -138,7 +138,7 @@ def is_hidden(relative: Path) -> bool:
 
 
 def _prepare(path: str | Path) -> Path:
-    """The place that `path` leads to, itself no link, in a folder that exists."""
+    """Return the place that `path` leads to, itself no link, in a folder that is made if it is missing."""
     require_no_link(path)
     target = Path(os.path.realpath(path))
     _make_folder(target.parent)

@@ -25,7 +25,7 @@ _TEMPORARY = re.compile(rf"\.(?P<name>.+)\.asca-[0-9a-f]{{8}}(?P<retired>{RETIRE
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file or folder has a name that is written under, instead of a final one."""
+    """Return whether a file or folder has a temporary name instead of a final one."""
     return _TEMPORARY.fullmatch(name) is not None
 
 

@@ -1,4 +1,4 @@
-"""What a command may replace: one rule for every file and folder that `asca` writes.
+"""The rule for what a command may replace, for every file and folder that `asca` writes.
 
 - What exists under a name that is to be written is replaced only if its content shows that the same command wrote it.
   An empty file may be replaced, for nothing is lost. Anything else is refused before the work: the user moves it away,
@@ -20,15 +20,15 @@ from asca_pillars.errors import OutputError
 from asca_pillars.locks import is_temporary, recover
 
 Recognizer: TypeAlias = Callable[[Path], bool]
-"""Whether an existing file is what the command writes under that name, by its content."""
+"""A function that tells by its content whether an existing file is one that the command writes under that name."""
 
 PICTURE_SOFTWARE = "asca-pillars"
-"""What a PNG that we write says in its text field Software."""
+"""Value of the text field Software in every PNG that we write."""
 _LARGEST_JSON_BYTES = 64 << 20
 
 
 def json_object(*keys: str, **values: Any) -> Recognizer:
-    """Recognizes a JSON object that has all of these keys, and these values."""
+    """Recognize a JSON object that has all of these keys, and these values."""
 
     def recognize(path: Path) -> bool:
         with path.open("rb") as file:
@@ -38,7 +38,7 @@ def json_object(*keys: str, **values: Any) -> Recognizer:
 
 
 def json_lines(*keys: str) -> Recognizer:
-    """Recognizes lines of JSON by the first of them, an object that has all of these keys; there may be no line yet."""
+    """Recognize lines of JSON by the first of them, an object that has all of these keys; there may be no line yet."""
 
     def recognize(path: Path) -> bool:
         with path.open("rb") as file:
@@ -49,7 +49,7 @@ def json_lines(*keys: str) -> Recognizer:
 
 
 def starting_with(text: str) -> Recognizer:
-    """Recognizes a text by its beginning."""
+    """Recognize a text by its beginning."""
 
     def recognize(path: Path) -> bool:
         with path.open("rb") as file:
@@ -59,7 +59,7 @@ def starting_with(text: str) -> Recognizer:
 
 
 def ending_with(text: str) -> Recognizer:
-    """Recognizes a text by its end."""
+    """Recognize a text by its end."""
 
     def recognize(path: Path) -> bool:
         end = text.encode()
@@ -81,7 +81,7 @@ def page_end(command: str) -> str:
 
 
 def is_own_picture(path: Path) -> bool:
-    """Whether it is a PNG that we wrote, by its text field Software."""
+    """Return whether it is a PNG that we wrote, by its text field Software."""
     with path.open("rb") as file:
         head = file.read(512)
     return head.startswith(b"\x89PNG") and b"tEXtSoftware\0" + PICTURE_SOFTWARE.encode() in head
@@ -223,7 +223,7 @@ def _has(content: bytes, keys: Iterable[str], values: Mapping[str, Any]) -> bool
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What is in a folder, without what is being written just now; nothing if there is no folder."""
+    """List what is in a folder, without what is being written just now; nothing if there is no folder."""
     if folder.is_symlink() and not folder.exists():
         raise OutputError(f"{folder}: is a link to nothing; make the folder that it leads to, or choose another one")
     if folder.exists() and not folder.is_dir():

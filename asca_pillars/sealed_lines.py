@@ -12,12 +12,12 @@ _BEFORE = len('["", ') + _DIGITS
 
 
 def sealed(text: str, key: str) -> str:
-    """The line of a JSON text that has no line break, with its end."""
+    """Return the line of a JSON text that has no line break, with its end."""
     return f'["{_digest(text, key)}", {text}]\n'
 
 
 def unsealed(line: bytes, key: str) -> str | None:
-    """The JSON text of a line that `sealed` made with the same key; None for anything else."""
+    """Return the JSON text of a line that `sealed` made with the same key; None for anything else."""
     try:
         text = line[_BEFORE:-2].decode()
     except UnicodeDecodeError:

@@ -1,4 +1,4 @@
-"""What commands write and read again, damaged: journals, shards, pages of bundles, boxes, marks of folders.
+"""Damage what commands write and read again: journals, shards, pages of bundles, boxes, marks of folders.
 
     python -m benchmarks.fuzz_results --inputs 40000 --seed 7
 
@@ -245,7 +245,7 @@ def _page(folder: Path) -> Kind:
 
 
 def _marks(folder: Path) -> list[Kind]:
-    """What shows that a folder or file is a command's own: it is never changed by the look at it."""
+    """Marks, which show that a folder or file is a command's own; looking at one never changes it."""
     picture = png_bytes(np.zeros((4, 4, 3), np.uint8))
     scan = json.dumps({"scan": "1.bin", "frame": "", "boxes": [], "points_not_finite": 0}).encode()
     report = json.dumps({"subject": "", "frames_asked": 1, "results": 1, "bands": [], "operating_points": []}).encode()

@@ -1,4 +1,4 @@
-"""What a command may replace: its own products, recognized by content, never an input, never through a link."""
+"""A command replaces its own products, recognized by content; never an input, never through a link."""
 
 import json
 from collections.abc import Callable

@@ -150,5 +150,5 @@ class _DamagedError(Exception):
 
 
 def _key(shard: Shard, number: int) -> str:
-    """What the digest of a line is under: it belongs to one item of one shard."""
+    """Return the key of a line's digest: the line belongs to one item of one shard."""
     return f"{shard.name} {number}"

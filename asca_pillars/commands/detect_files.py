@@ -56,14 +56,14 @@ _COMPANIONS: dict[str, Recognizer] = {
     KITTI_FILE: _is_tracking_text,
     UNREADABLE_FILE: json_lines("error", "scan"),
 }
-"""What other kinds of runs write beside RUN_FILE, about the same scans."""
+"""Files that other kinds of runs write beside RUN_FILE, about the same scans."""
 _OF_A_SCAN: dict[str, Recognizer] = {
     ".json": json_object("scan", "frame", "boxes", "points_not_finite"),
     ".txt": _is_kitti_text,
     "_bev.png": is_own_picture,
     "_image.png": is_own_picture,
 }
-"""What is written of a single scan, by the endings of its name."""
+"""Files of a single scan, by the endings of their names."""
 
 
 def claim(out: Path, markers: Mapping[str, Recognizer] | None = None, written: Collection[str] = ()) -> None:
@@ -153,14 +153,14 @@ class ResultWriter:
             self._named(name, ending).unlink(missing_ok=True)
 
     def _has_boxes(self, name: Path, boxes: list[dict[str, Any]]) -> bool:
-        """Whether what an earlier run wrote of the scan holds these boxes."""
+        """Return whether the scan's JSON of an earlier run holds these boxes."""
         path = self._named(name, ".json")
         if not path.exists() or not path.stat().st_size:
             return False
         return bool(json.loads(path.read_text(encoding="utf-8"))["boxes"] == boxes)
 
     def _write_camera_view(self, path: Path, name: Path, detections: Detections, calibration: Calibration) -> set[str]:
-        """What the camera sees as text, and drawn on its image; the endings of what was written."""
+        """Write the boxes that the camera sees as text, and draw them on its image; return the endings of the files."""
         image = self._image(path.parent.parent / "image_2" / f"{path.stem}.png")
         _write_kitti(self._named(name, ".txt"), detections, calibration, image)
         if image is not None and self._pictures:

@@ -71,7 +71,7 @@ SCHEMA = _object(
 
 
 def is_own_mcap(path: Path) -> bool:
-    """Whether it is an MCAP that a `FoxgloveFile` wrote, and no recording."""
+    """Return whether it is an MCAP that a `FoxgloveFile` wrote, and no recording."""
     with path.open("rb") as file:
         start = file.read(100)  # magic, then a header with the name of what wrote the file
     return start.startswith(b"\x89MCAP") and LIBRARY.encode() in start

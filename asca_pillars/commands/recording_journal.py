@@ -40,7 +40,7 @@ class ScanResult(NamedTuple):
 
 
 def is_journal(path: Path) -> bool:
-    """Whether it begins as a journal does."""
+    """Return whether a file begins as a journal does."""
     with path.open("rb") as file:
         return unsealed(file.readline(_LONGEST_HEAD_BYTES), _KEY) is not None
 

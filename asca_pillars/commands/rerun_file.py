@@ -19,7 +19,7 @@ _FLUSH_S = 60.0
 
 
 def is_own_rrd(path: Path) -> bool:
-    """Whether it is a file that a `RerunFile` wrote, and no recording of others."""
+    """Return whether it is a file that a `RerunFile` wrote, and no recording of others."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     return head.startswith(b"RRF") and APPLICATION.encode() in head

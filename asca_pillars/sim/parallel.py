@@ -1,6 +1,7 @@
 """Simulating frame after frame in several processes, into a folder that says what it holds."""
 
 import json
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -8,7 +9,7 @@ from typing import Any, TypeVar
 from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.files import write_text
-from asca_pillars.own_files import json_object, require_own, require_own_file
+from asca_pillars.own_files import json_object, require_no_link, require_own, require_own_file
 from asca_pillars.processes import in_processes
 
 COMMAND = "asca simulate"
@@ -52,6 +53,21 @@ def require_own_simulation(root: Path, about_keys: Sequence[str], folders: Itera
         require_own_file(root / "ImageSets" / f"{name}.txt", COMMAND, _names_successive_frames)
 
 
+def write_once(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` make a file of a frame. One that is there with the same bytes, of a run that was killed, stays.
+
+    Raises:
+        OutputError: a file of other bytes is there.
+    """
+    require_no_link(path)
+    if not path.exists() or not path.stat().st_size:
+        write(path)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / path.name)
+        require_own_file(path, COMMAND, lambda there: there.read_bytes() == Path(folder, path.name).read_bytes())
+
+
 def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
     """Note in simulation.json what the frames of a folder depend on; refuse a folder of other frames.
 
@@ -74,7 +90,7 @@ def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
 
 
 def _names_successive_frames(path: Path) -> bool:
-    """Whether a list is one that is written here, of frames (000007) or of the scans of sequences (0002/000031)."""
+    """Return whether a list is one that is written here, of frames (000007) or of sequences (0002/000031)."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         rows = [[int(part) for part in line.split("/")] for line in lines]

@@ -29,6 +29,7 @@ from asca_pillars.sim.parallel import (
     for_each,
     held_out,
     require_own_simulation,
+    write_once,
 )
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.scene_config import SceneConfig
@@ -197,6 +198,6 @@ def _is_complete(split: KittiSplit, index: int) -> bool:
 def _write_frame(root: Path, seed: int, config: SimulationConfig, index: int) -> None:
     split, name = KittiSplit(root), frame_id(index)
     frame = simulate_frame(seed, index, config)
-    write_calibration(split.calib_path(name), frame.calibration)
-    write_labels(split.label_path(name), frame.objects)
+    write_once(split.calib_path(name), lambda path: write_calibration(path, frame.calibration))
+    write_once(split.label_path(name), lambda path: write_labels(path, frame.objects))
     write_scan(split.scan_path(name), frame.points)

@@ -13,7 +13,7 @@ ENVIRONMENT_FILE = "environment.json"
 FRAMES_FILE = "frames.json"
 EXPECTED_INPUT_FILE = "expected_input.yaml"
 LOG_FILE = "train.log"
-"""Of a run of `asca ablate`."""
+"""Output of a run that `asca ablate` starts."""
 YAML_HEAD = f"# {written_by(COMMAND)}\n"
 _IS_ENVIRONMENT = json_object("command", "git_revision", "platform", "packages")
 _CONFIG_KEYS = ("name", "model", "data", "augment", "train")
@@ -45,17 +45,17 @@ def require_own_run(out: Path, init: str | Path | None = None) -> None:
 
 
 def is_own_config(path: Path) -> bool:
-    """Whether it is the resolved configuration of a run, of older versions as well."""
+    """Return whether it is the resolved configuration of a run, of older versions as well."""
     return starting_with(YAML_HEAD)(path) or _is_older(path, _CONFIG_KEYS)
 
 
 def is_own_expected_input(path: Path) -> bool:
-    """Whether it is what a run measured of its training scans, of older versions as well."""
+    """Return whether it holds what a run measured of its training scans, of older versions as well."""
     return starting_with(YAML_HEAD)(path) or _is_older(path, _EXPECTED_INPUT_KEYS)
 
 
 def _is_older(path: Path, keys: tuple[str, ...]) -> bool:
-    """Whether it was written before files said by whom: in the folder of a run, plain, and with every key."""
+    """Return whether it was written before files said by whom: in the folder of a run, plain, and with every key."""
     environment = path.with_name(ENVIRONMENT_FILE)
     if not environment.is_file() or not _IS_ENVIRONMENT(environment):
         return False

@@ -173,7 +173,7 @@ def _dies(*_: object) -> Iterator[None]:
 
 @pytest.fixture
 def journal(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of all scans, in tmp_path/killed."""
+    """A journal of all scans, in tmp_path/killed."""
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(steps, "tracked", _dies)
         run(drive, tmp_path / "killed", track=True, foxglove=tmp_path / "killed" / "boxes.mcap")

@@ -102,6 +102,21 @@ def test_lists_that_were_edited_are_not_written_anew(tmp_path: Path) -> None:
         assert train.read_text() == edited and len(list(tmp_path.rglob("*.bin"))) == 5
 
 
+@pytest.mark.parametrize("name", ["label_2", "calib"])
+def test_a_file_of_somebody_else_under_a_frame_s_name_is_kept(tmp_path: Path, name: str) -> None:
+    simulate(tmp_path, 3, report=False)
+    complete = written(tmp_path)
+    for scan in (tmp_path / "training" / "velodyne").glob("00000[12].bin"):
+        scan.unlink()  # as a killed run leaves a frame
+    simulate(tmp_path, 3, report=False)
+    assert written(tmp_path) == complete
+    theirs = tmp_path / "training" / name / "000003.txt"
+    theirs.write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1 10 0\n")
+    with pytest.raises(OutputError, match=r"000003\.txt: `asca simulate` did not write it"):
+        simulate(tmp_path, 4, report=False)
+    assert theirs.read_text().startswith("Car 0 0 0 1")
+
+
 def test_a_report_of_somebody_else_is_not_replaced(tmp_path: Path) -> None:
     root = write_set(tmp_path / "set")
     report = root / "report"
@@ -138,4 +153,8 @@ def test_sequences_go_on_beside_their_lists(tmp_path: Path) -> None:
     train = tmp_path / "ImageSets" / "train.txt"
     train.write_text("0000/000000\n0002/000001\n")
     with pytest.raises(OutputError, match=r"train\.txt: `asca simulate` did not write it"):
+        command.simulate(tmp_path, sequences=4, length=2, workers=1, config="vlp_16")
+    train.unlink()
+    (tmp_path / "dataset.yaml").write_text("axes: y-forward\n")
+    with pytest.raises(OutputError, match=r"dataset\.yaml: `asca simulate` did not write it"):
         command.simulate(tmp_path, sequences=4, length=2, workers=1, config="vlp_16")

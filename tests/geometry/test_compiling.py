@@ -40,7 +40,7 @@ def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def hits(source: Path) -> list[bool]:
-    """Of both kinds of functions, whether a process that imports and calls them takes them from the cache."""
+    """Return for both kinds of functions whether a process that imports and calls them takes them from the cache."""
     spec = spec_from_file_location("made_up_kernels", source)
     assert spec is not None and spec.loader is not None
     module: Any = module_from_spec(spec)

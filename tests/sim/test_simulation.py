@@ -63,7 +63,8 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     simulate(tmp_path / "a", 3, seed=1, config=CAMERA, progress=False)
     before = files(tmp_path / "a")
     (tmp_path / "a/training/velodyne/000001.bin").unlink()
-    (tmp_path / "a/training/label_2/000001.txt").write_text("half a li")
+    (tmp_path / "a/training/label_2/000001.txt").unlink()
+    (tmp_path / "a/training/calib/000001.txt").write_text("")
     kept = tmp_path / "a/training/velodyne/000002.bin"
     stamp = kept.stat().st_mtime_ns
     simulate(tmp_path / "a", 3, seed=1, config=CAMERA, progress=False)

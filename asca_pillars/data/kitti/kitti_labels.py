@@ -187,7 +187,7 @@ def parse_object(words: Sequence[str], place: str) -> KittiObject:
 
 
 def is_detection_text(text: str) -> bool:
-    """Whether it is of detections as `labels_text` writes them, with scores; labels have none."""
+    """Return whether it is a text of detections as `labels_text` writes it, with scores, which labels do not have."""
     try:
         objects = [parse_object(line.split(), "") for line in text.splitlines()]
     except DatasetError:

@@ -22,15 +22,25 @@ from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.kitti import in_image, write_image_set
 from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.files import atomic_path, write_json
+from asca_pillars.files import write_json, write_text
+from asca_pillars.own_files import require_own_file, starting_with
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
-from asca_pillars.sim.parallel import check_wishes, claim_simulation, for_each, held_out, require_own_simulation
+from asca_pillars.sim.parallel import (
+    COMMAND,
+    check_wishes,
+    claim_simulation,
+    for_each,
+    held_out,
+    require_own_simulation,
+    write_once,
+)
 from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
 from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
 from asca_pillars.sim.simulation import SimulationConfig, take_scan
 
 RATE_HZ = 10.0
+_DATASET = yaml.safe_dump({"labels": "labels", "columns": 4, "reflectance_scale": 1.0})
 PAUSE_S = 5.0  # from the last scan of a sequence to the first of the next, in the time stamps
 # Random streams of a sequence, beside those of single frames.
 _SCENE, _WAYS, _SENSOR, _BODIES, _NOISE = 10, 11, 12, 13, 14
@@ -135,8 +145,7 @@ def simulate_sequences(
     first_val = sequences - held_out(sequences, val_share)
     for name, own in (("train", range(first_val)), ("val", range(first_val, sequences))):
         write_image_set(root, name, [f"{one:04d}/{index:06d}" for one in own for index in range(length)])
-    with atomic_path(root / DATASET_FILE) as temporary:
-        temporary.write_text(yaml.safe_dump({"labels": "labels", "columns": 4, "reflectance_scale": 1.0}))
+    write_text(root / DATASET_FILE, _DATASET)
     return root
 
 
@@ -145,6 +154,7 @@ def require_own_sequences(out: Path) -> None:
     folders = [folder.relative_to(out) for name in ("scans", "labels") for folder in (out / name).glob("*/")]
     about_keys = ("seed", "length", "rate_hz", "scene", "lidar", "field_of_view")
     require_own_simulation(out, about_keys, ("scans", "labels", *folders))
+    require_own_file(out / DATASET_FILE, COMMAND, starting_with(_DATASET))
 
 
 @lru_cache(maxsize=1)
@@ -166,5 +176,6 @@ def _scan_path(root: Path, sequence: int, index: int) -> Path:
 def _write_frame(root: Path, plan: SequencePlan, item: tuple[int, int]) -> None:
     sequence, index = item
     frame = simulate_sequence_frame(plan, sequence, index)
-    write_json(root / "labels" / f"{sequence:04d}" / f"{index:06d}.json", frame.labels)
+    labels = root / "labels" / f"{sequence:04d}" / f"{index:06d}.json"
+    write_once(labels, lambda path: write_json(path, frame.labels))
     write_scan(_scan_path(root, sequence, index), frame.points)  # last: where it is, the frame is complete

@@ -27,7 +27,8 @@ def test_any_number_of_workers_writes_the_same_bytes_and_an_interrupted_run_goes
     assert len(one) == 2 * 2 * 3 + 4
     assert files(tmp_path / "two") == one
     (tmp_path / "one/scans/0001/000001.bin").unlink()
-    (tmp_path / "one/labels/0001/000001.json").write_text('{"boxes": ')
+    (tmp_path / "one/scans/0001/000002.bin").unlink()
+    (tmp_path / "one/labels/0001/000001.json").unlink()
     simulate_sequences(tmp_path / "one", 2, 3, 4, 1, VLP, val_share=0.5, progress=False)
     assert files(tmp_path / "one") == one
     with pytest.raises(DatasetError, match="another folder"):
