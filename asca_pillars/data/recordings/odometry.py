@@ -14,6 +14,8 @@ _Doubles = NDArray[np.float64]
 
 ODOMETRY_TYPES = ("nav_msgs/msg/Odometry", "nav_msgs/Odometry")
 
+_TOO_LARGE = 1e9  # of any number, metres: no map is a million kilometres wide
+
 BEYOND_NS = 200_000_000
 """How long before the first and after the last pose a scan may be: as long as two at 10 Hz."""
 
@@ -69,10 +71,10 @@ def read_poses(recording: Recording, topic: str) -> Poses:
         row = [place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]
         if time_ns is None:
             trouble = "no usable time stamp"
-        elif np.isfinite(row).all() and np.linalg.norm(row[3:]) > 0.5:
+        elif (np.abs(row) < _TOO_LARGE).all() and np.linalg.norm(row[3:]) > 0.5:  # not of NaN
             rows.append((time_ns, row))
         else:
-            trouble = "a pose that is not finite, or no rotation"
+            trouble = "a pose that is not finite or too far away, or no rotation"
     if not rows:
         raise ScanError(f"{recording.path}, {topic}: no pose can be used ({trouble}); leave --odometry out")
     rows.sort(key=lambda row: row[0])

@@ -3,6 +3,7 @@
 import bz2
 import gc
 import io
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -163,7 +164,7 @@ def test_files_that_unpack_to_gigabytes_are_refused(
 def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plain = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(3)})
     (tmp_path / "a.mcap.zst").write_bytes(zstandard.compress(plain.read_bytes()))
-    monkeypatch.setattr(decompression.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10}))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10}))
     with pytest.raises(ScanError, match=r"a\.mcap\.zst: unpacks to \d+ bytes, and .* has room for 10; set TMPDIR"):
         open_recording(tmp_path / "a.mcap.zst")
 

@@ -57,9 +57,10 @@ def test_one_pose_is_enough(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
-    path = write_mcap(
-        tmp_path / "a.mcap", {"/lidar": clouds(1)}, odometry=[(START_NS, odometry_message(START_NS, np.nan))]
-    )
+    turned = odometry_message(START_NS, 1.0)
+    turned.pose.pose.orientation.w = 1e300
+    useless = [odometry_message(START_NS, np.nan), odometry_message(START_NS, -1e300), turned]
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(1)}, odometry=[(START_NS, message) for message in useless])
     with pytest.raises(ScanError, match="no pose can be used"):
         read_poses(open_recording(path), "/odom")
     with pytest.raises(ScanError, match="/gps holds no nav_msgs/msg/Odometry; there is /odom"):

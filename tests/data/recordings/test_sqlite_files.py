@@ -122,6 +122,7 @@ def test_damaged_pages_cost_the_scans_on_them(tmp_path: Path) -> None:
 def test_poses_without_a_time_are_left_out(tmp_path: Path) -> None:
     message = odometry_message(0, 1.0)
     data = bytes(store().serialize_cdr(message, ODOMETRY))
+    rows: list[tuple[str, tuple[Any, ...]]]
     rows = [("INSERT INTO topics VALUES (2, '/odom', 'nav_msgs/msg/Odometry', 'cdr')", ())]
     rows += [("INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)", (t, data)) for t in (None, 1e300, 5)]
     poses = read_poses(open_recording(database(tmp_path / "a.db3", *rows)), "/odom")
