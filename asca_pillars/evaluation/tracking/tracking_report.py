@@ -25,6 +25,7 @@ CLEAR_IOU = 0.25
 MIN_POINTS = 5
 """Labels of fewer points are not counted, where the dataset says how many there are."""
 UNKNOWN_OCCLUSION = 3
+_FARTHEST_M = 1e6
 
 
 class ClassScore(NamedTuple):
@@ -224,6 +225,12 @@ def _about_run(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
+        about = dict(json.loads(path.read_text(encoding="utf-8")))
+        classes, ranges = about.get("classes") or [], about.get("ranges_m") or []
+        if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+            raise ValueError("classes are no list of names")
+        if np.shape(ranges) not in ((0,), (2, 2)) or not (np.abs(np.array(ranges, np.float64)) <= _FARTHEST_M).all():
+            raise ValueError("ranges_m are not two of x and y in metres")
+        return about | {"classes": classes, "ranges_m": np.array(ranges, np.float64).tolist() or None}
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise DatasetError(f"{path}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None
