@@ -72,7 +72,7 @@ def main(
     kind: Annotated[str | None, typer.Option(help="Only kinds whose name contains this.")] = None,
 ) -> None:
     """Give damaged files to what goes on from them, count what came of it."""
-    console = Console(markup=False, highlight=False)
+    console = Console(markup=False, highlight=False, width=140)
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="asca-fuzz-") as folder:
         counts, failures = fuzz_results(Path(folder), seed, inputs, first, kind, console)

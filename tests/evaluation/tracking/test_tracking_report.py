@@ -126,9 +126,21 @@ def test_a_class_that_is_never_found_is_scored_or_named(drives: Path, tmp_path: 
     report = score(drives, tmp_path, lines)
     missed = next(one for one in report.scores if one.name == "Pedestrian")
     assert missed.clear.misses == missed.clear.labels > 0 and "Pedestrian" not in report.not_scored
-    (tmp_path / "recording.json").write_text("{")
-    with pytest.raises(DatasetError, match=r"recording\.json: cannot be read"):
-        score(drives, tmp_path, lines)
+    for damaged in (
+        "{",
+        "[" * 9000,
+        "[1]",
+        '{"classes": "Car"}',
+        '{"classes": [1]}',
+        '{"ranges_m": [[0, 69]]}',
+        '{"ranges_m": [[0, null], [-30, 30]]}',
+        '{"ranges_m": [[0], [-30, 30]]}',
+        '{"ranges_m": [[0, 1e308], [-30, 30]]}',
+        '{"ranges_m": {"x": [0, 69]}}',
+    ):
+        (tmp_path / "recording.json").write_text(damaged)
+        with pytest.raises(DatasetError, match=r"recording\.json: cannot be read"):
+            score(drives, tmp_path, lines)
 
 
 BOX = {"class": "Car", "y_m": 0, "z_m": 0, "length_m": 4, "width_m": 2, "height_m": 1.5, "yaw_rad": 0, "score": 0.9}
