@@ -70,7 +70,7 @@ def host_path(points: NDArray[np.float32], bundle: PillarBundle) -> dict[str, Ca
     pillars = spec.pillarize(points)
     counts, rule = pillars.stats, bundle.pillar.active_cells
     stages: dict[str, Callable[[], Any]] = {
-        "input": lambda: (usable_points(points), check_input(points, counts, bundle.expected_input)),
+        "input": lambda: (usable_points(points), check_input(points, counts, bundle.expected_input, None, spec.ranges)),
         "pillarize": lambda: spec.pillarize(points),
         "decode": lambda: spec.decode(maps),
     }

@@ -11,12 +11,17 @@ from numpy.typing import NDArray
 from asca_pillars.data.expected_input import ExpectedInput
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.geometry.frame_report import ScanCounts
+from asca_pillars.geometry.ranges import Ranges
 
 _Floats: TypeAlias = NDArray[np.floating[Any]]
 
 OUTSIDE_SHARE = 0.95
 FAR_M, FAR_SHARE = 1000.0, 0.05
 """Of the points of a LiDAR's scan less than this share lies further away."""
+BEHIND_SHARE = 0.2
+"""Of the points beyond BODY_M: a revolution has about half of them behind its sensor, a view of 200 degrees a tenth."""
+BODY_M = 3.0
+"""Nearer returns are mostly those of the vehicle itself."""
 SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
 _FRAME_STEP = 2  # of the sample; angles and ranges take longer
 
@@ -34,15 +39,20 @@ class InputWarning(NamedTuple):
 
 
 def check_input(
-    points: NDArray[np.float32], counts: ScanCounts, expected: ExpectedInput, mounting: Mounting | None = None
+    points: NDArray[np.float32],
+    counts: ScanCounts,
+    expected: ExpectedInput,
+    mounting: Mounting | None = None,
+    looks_in: Ranges | None = None,
 ) -> list[InputWarning]:
-    """Compare a scan with the training scans.
+    """Compare a scan with the training scans, and with where the detector looks.
 
     Args:
         points: (N, 4) finite x, y, z in metres, model's frame, and reflectance.
         counts: what became of them on the detector's grid.
         expected: of the training scans.
         mounting: by which they came into that frame.
+        looks_in: the detector's ranges; None: it looks in every direction.
     """
     mounting = mounting or Mounting()
     fewest, most = expected.points_per_scan
@@ -67,6 +77,8 @@ def check_input(
             "state other axes (--axes)"
         )
         warnings.append(InputWarning("range", text))
+    elif looks_in is not None:
+        warnings.append(_behind_warning(sample[::_FRAME_STEP], looks_in))
     return [warning for warning in warnings if warning]
 
 
@@ -125,6 +137,15 @@ def _height_warning(ground: float | None, expected: ExpectedInput, mounting: Mou
         f"state the height above the ground (--sensor-height {height_m:.2f} or auto)"
     )
     return InputWarning("height", text)
+
+
+def _behind_warning(points: NDArray[np.float32], looks_in: Ranges) -> InputWarning | None:
+    away = points[np.abs(points[:, :2]).max(axis=1) > BODY_M]
+    share = looks_in.behind(away).mean() if len(away) else 0.0
+    if share < BEHIND_SHARE or np.hypot(*_mean_direction(*away[:, :2].T)) >= _SECTOR_LENGTH:
+        return None
+    text = f"{share:.0%} of the points lie behind the sensor, where the model does not look: look around (--around)"
+    return InputWarning("view", text)
 
 
 def _axes_remedy(axes: str | None, mounting: Mounting) -> str:
@@ -226,13 +247,20 @@ def _sector(x: _Floats, y: _Floats, radius: _Floats) -> FrameDoubt | None:
     away = radius > 0
     if not away.any():
         return None
-    mean_x, mean_y = float((x[away] / radius[away]).mean()), float((y[away] / radius[away]).mean())
+    mean_x, mean_y = _mean_direction(x[away], y[away])
     middle_deg = float(np.degrees(np.arctan2(mean_y, mean_x)))
     if np.hypot(mean_x, mean_y) < _SECTOR_LENGTH or abs(middle_deg) < _MAX_OFF_AHEAD_DEG:
         return None
     quadrant = round(middle_deg / 90) % 4
     text = f"the points fill a sector about {middle_deg:+.0f} degrees, and ahead is 0: x may not be forward"
     return FrameDoubt("axes", text, _AXES[quadrant])
+
+
+def _mean_direction(x: _Floats, y: _Floats) -> tuple[float, float]:
+    """Mean of the unit vectors towards points, (N,) each, none of them at the origin."""
+    with np.errstate(over="ignore"):  # infinitely far has no direction
+        radius = np.hypot(x, y)
+    return float((x / radius).mean()), float((y / radius).mean())
 
 
 def _across(radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> FrameDoubt | None:

@@ -19,6 +19,16 @@ class Ranges(NamedTuple):
         x, y, z = ((low + by, high + by) for (low, high), by in zip(self, by_m, strict=True))
         return Ranges(x, y, z)
 
+    def behind(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Which points (N, >=2), metres, LiDAR frame, lie in a direction in which the detector does not look: (N,).
+
+        It looks in a direction if it sees as far there as it does ahead or to its nearer side, whichever is less; where
+        its range begins is no matter. None of the points, if it does not see ahead and to both sides.
+        """
+        reach_m = min(self.x_m[1], -self.y_m[0], self.y_m[1])
+        x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
+        return np.asarray((reach_m > 0) & (x * reach_m < min(self.x_m[0], 0.0) * np.hypot(x, y)))
+
     def hold_centers(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Which boxes (N, 7), metres, LiDAR frame, have their center inside, seen from above: (N,)."""
         x, y = boxes[:, 0], boxes[:, 1]

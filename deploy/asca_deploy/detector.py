@@ -213,8 +213,9 @@ class Detector:
         frame.laps.append(("input", perf_counter()))
         prepared = self.pipeline.prepare(points, frame.laps)
         if not frame.counts:
-            expected = self.bundle.expected_input
-            frame.warnings[:0] = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting)
+            expected, looks_in = self.bundle.expected_input, self.spec.ranges if self.view == "ahead" else None
+            found = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting, looks_in)
+            frame.warnings[:0] = found
             frame.laps.append(("input", perf_counter()))
         frame.counts.append(prepared.counts)
         return prepared

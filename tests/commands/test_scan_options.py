@@ -54,10 +54,18 @@ def test_the_sample_seen_otherwise_gives_its_own_boxes(tmp_path: Path, sample: N
 def test_all_around(tmp_path: Path) -> None:
     result, (found,) = detect(tmp_path, "--around")
     assert result.exit_code == 0, result.output
+    assert found["warnings"] == []
     assert found["passes"] == 4 and found["points"] == 4 * 123_301
     assert "in 4 passes" in result.output and "right" in result.output
     behind = [box for box in found["boxes"] if box["x_m"] < -5]
     assert len(behind) >= 3
+
+
+def test_what_is_behind_is_said_to_be_left_out(tmp_path: Path, sample: NDArray[np.float32]) -> None:
+    write_scan(tmp_path / "ahead.bin", sample[sample[:, 0] > np.abs(sample[:, 1])])
+    result, (around, ahead) = detect(tmp_path, sample_scan_path(), tmp_path / "ahead.bin", "--no-pictures")
+    assert "street.bin: 49% of the points lie behind" in result.output and "(--around)" in result.output
+    assert ["--around" in "".join(scan["warnings"]) for scan in (around, ahead)] == [True, False]
 
 
 def test_a_folder_has_one_reflectance_scale(tmp_path: Path, sample: NDArray[np.float32]) -> None:

@@ -16,8 +16,11 @@ from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.errors import ConfigError
+from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.pillars.pillarize import PillarLimits, pillarize
+from asca_pillars.sim.simulation import simulate_frame
+from asca_pillars.sim.simulation_configs import load_simulation_config
 
 Points = NDArray[np.float32]
 GRID = PillarGrid(x_range_m=(0.0, 23.04), y_range_m=(-7.68, 10.24))
@@ -209,6 +212,44 @@ def test_too_few_points(count: int) -> None:
 
 def test_a_camera_view_crop_is_no_surprise_after_full_scans() -> None:
     assert check(street()[::6]) == []
+
+
+AHEAD = Ranges((0.0, 69.12), (-30.72, 30.72), (-3.0, 1.0))
+
+
+def told_to_look_around(points: Points, looks_in: Ranges | None = AHEAD, axes: str = "x-forward") -> bool:
+    points = Mounting(axes=axes).level.inverse.points(points)
+    counts = pillarize(points, GRID, PillarLimits()).stats
+    texts = {warning.about: warning.text for warning in check_input(points, counts, EXPECTED, None, looks_in)}
+    assert "view" not in texts or "(--around)" in texts["view"]
+    return "view" in texts
+
+
+@pytest.mark.parametrize("sensor", ["hdl_32e", "os1_64", "os1_128", "vlp_16", "vlp_32c_pair", "residential"])
+def test_a_revolution_is_said_to_be_cut(sensor: str) -> None:
+    """A scan has half of its points behind the sensor, and a model that looks ahead leaves them out."""
+    for number in range(2):
+        points = simulate_frame(5, number, load_simulation_config(sensor, "full")).points
+        assert told_to_look_around(points)
+        assert not told_to_look_around(points, None), "it looks around"
+        assert not told_to_look_around(points, Ranges((-69.12, 69.12), *AHEAD[1:])), "so does this model, in one pass"
+        assert not told_to_look_around(points, Ranges((5.0, 69.12), (2.0, 30.0), (-3.0, 1.0))), "this one cannot"
+        angles = np.abs(np.arctan2(points[:, 1], points[:, 0]))
+        for field_deg in (70, 120, 180):
+            assert not told_to_look_around(points[angles < np.radians(field_deg / 2)])
+        assert told_to_look_around(points[angles < np.radians(135)])
+        assert told_to_look_around(points, axes="y-forward"), "whatever else is wrong"
+
+
+def test_the_own_vehicle_is_not_behind() -> None:
+    points = revolution()
+    roof = np.tile(np.array([[-1.5, 0.3, -0.6, 0.2]], np.float32), (9000, 1))
+    assert not told_to_look_around(np.concatenate([roof, points[points[:, 0] > 0]]))
+
+
+def test_a_sector_that_is_not_ahead_is_a_matter_of_axes() -> None:
+    points = revolution(2)
+    assert not told_to_look_around(points[points[:, 0] > np.abs(points[:, 1])], axes="-x,-y,z")
 
 
 @given(

@@ -97,6 +97,18 @@ def test_overlaps_of_random_boxes() -> None:
     assert np.count_nonzero(expected[::5]) > 1000
 
 
+def test_a_revolution_is_said_to_be_cut() -> None:
+    points = read_scan(sample_scan_path()).points[::40]
+    ranges = [[0, 69.12], [-30.72, 30.72], [-3, 1]]
+    ahead = points[points[:, 0] > 0]
+    every_way = [[-50, 50], *ranges[1:]]
+    cases = [(ranges, points), (ranges, ahead), (every_way, points), (ranges, points[:0])]
+    found = call("grid.js", "unseenDirections", *([{"ranges": own}, scan.reshape(-1).tolist()] for own, scan in cases))
+    cut, *fine = (answer["result"] for answer in found)
+    assert len(cut) == 1 and "asca detect --around" in cut[0]
+    assert fine == [[], [], []]
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 def test_pcd_files_read_as_python_reads_them(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "scan.pcd"

@@ -61,6 +61,7 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
     write_page(page, shipped_bundles()[name], sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
     points = read_scan(sample_scan_path()).points
     write_scan(tmp_path / "half.bin", points[::2])
+    write_scan(tmp_path / "ahead.bin", points[points[:, 0] > np.abs(points[:, 1])])
     write_scan(tmp_path / "outside.bin", points[:9] + np.array([500, 0, 0, 0], np.float32))
     detector = Detector(name, threads=1)
     with file_server(page) as address:
@@ -71,6 +72,9 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         warm = finished(tab, "sample.bin")
         tab.choose_file("#file", tmp_path / "half.bin")
         assert_same(finished(tab, "half.bin"), detector, points[::2])
+        assert "49% of the points lie behind the sensor" in warm["warnings"][0] and "--around" in status(tab)
+        tab.choose_file("#file", tmp_path / "ahead.bin")
+        assert finished(tab, "ahead.bin")["warnings"] == [] and "--around" not in status(tab)
         tab.choose_file("#file", tmp_path / "outside.bin")
         nothing = finished(tab, "outside.bin")
         assert (nothing["pillars"], nothing["boxes"]) == (0, [])
@@ -89,6 +93,10 @@ def finished(tab: Tab, scan: str) -> Any:
 
 def failure(tab: Tab) -> str:
     wait_for(tab, "failed")
+    return status(tab)
+
+
+def status(tab: Tab) -> str:
     return str(tab.evaluate("document.getElementById('status').textContent"))
 
 

@@ -47,10 +47,11 @@ def test_another_height() -> None:
     trained_m = ahead.bundle.expected_input.sensor_height_m
     assert trained_m is not None
     raised = points + np.array([0, 0, trained_m, 0], np.float32)  # z = 0 is the ground
-    (warning,) = ahead(raised).report.warnings
-    assert "ground" in warning
+    height, view = ahead(raised).report.warnings
+    assert "ground" in height and "--around" in view
     found = Detector(mounting=Mounting(sensor_height_m=0.0))(raised)
-    assert found.report.warnings == ()
+    assert found.report.warnings == (view,)
+    assert Detector(mounting=Mounting(sensor_height_m=0.0), view="around")(raised).report.warnings == ()
     expected = ahead(points)
     assert len(found) == len(expected) > 5
     np.testing.assert_allclose(found.boxes[:, 2] - expected.boxes[:, 2], trained_m, atol=0.05)

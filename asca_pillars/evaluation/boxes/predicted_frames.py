@@ -61,7 +61,7 @@ def stated_scope(path: Path, lines: Iterable[NamedRecords]) -> DetectorScope | N
         return None
     try:
         return scope_from_json(json.loads(beside.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{beside}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None
 
 

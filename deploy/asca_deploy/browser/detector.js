@@ -1,7 +1,7 @@
 /** A bundle in ONNX Runtime: points in, boxes out. Knows no page, so that node runs it too. */
 
 import { decodeCandidates, suppress } from "./boxes.js";
-import { makeGrid } from "./grid.js";
+import { makeGrid, unseenDirections } from "./grid.js";
 import { Canvas, pillarize } from "./pillars.js";
 import { NeckTableBuilder } from "./tables.js";
 
@@ -37,7 +37,7 @@ export class Detector {
   /**
    * The boxes of one scan, best first, in the scan's frame.
    * @param {Float32Array} points x, y, z in metres (LiDAR frame), reflectance 0..1 of each of N points
-   * @returns {Promise<{detections: object[], timesMs: object, counts: object}>}
+   * @returns {Promise<{detections: object[], timesMs: object, counts: object, remarks: string[]}>}
    */
   async detect(points) {
     const { spec, pillar } = this.manifest;
@@ -58,7 +58,7 @@ export class Detector {
     });
     const detections = found.map(({ box, score, label }) => ({ class: spec.classes[label].name, score, box }));
     const counts = { points: points.length / 4, points_outside: pillars.outside, pillars: pillars.cells.length };
-    return { detections, timesMs, counts };
+    return { detections, timesMs, counts, remarks: unseenDirections(this.grid, points) };
   }
 
   /** Features of the pillars (P x C), of the canvas's type. */

@@ -51,6 +51,32 @@ export function cellOf(grid, x, y, z) {
   return interval(y, grid.rowEdges) * grid.nx + grid.columnOfSlice[interval(x, grid.sliceEdges)];
 }
 
+// As in asca_pillars/data/input_check.py.
+const BEHIND_SHARE = 0.2;
+const BODY_M = 3;
+
+/**
+ * What a user is to know of where the model looks: nothing, or a sentence of a scan that goes on behind its sensor.
+ * @param {object} grid of `makeGrid`
+ * @param {Float32Array} points x, y, z in metres and reflectance of each of N points
+ * @returns {string[]}
+ */
+export function unseenDirections(grid, points) {
+  const [[xLow, xHigh], [yLow, yHigh]] = grid.ranges;
+  const reach = Math.min(xHigh, -yLow, yHigh);
+  let away = 0;
+  let behind = 0;
+  for (let i = 0; i < points.length; i += 4) {
+    const [x, y] = [points[i], points[i + 1]];
+    if (Math.max(Math.abs(x), Math.abs(y)) <= BODY_M) continue;
+    away += 1;
+    if (reach > 0 && x * reach < Math.min(xLow, 0) * Math.hypot(x, y)) behind += 1;
+  }
+  if (away === 0 || behind / away < BEHIND_SHARE) return [];
+  const share = Math.round((100 * behind) / away);
+  return [`${share}% of the points lie behind the sensor, where the model does not look; asca detect --around looks there.`];
+}
+
 /** Index of the interval [edges[i], edges[i + 1]) around a value, for evenly spaced edges. */
 function interval(value, edges) {
   const last = edges.length - 1;

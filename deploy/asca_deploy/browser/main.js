@@ -79,7 +79,7 @@ function show(file, { points, remarks, detections, timesMs, counts }) {
     line.addEventListener("click", () => scene.lookAt(box));
     return line;
   }));
-  save({ scan: file.name, times_ms: timesMs, ...counts, boxes: detections.map(plain) });
+  save({ scan: file.name, times_ms: timesMs, ...counts, warnings: remarks, boxes: detections.map(plain) });
 }
 
 /** A box as `asca detect` writes it. */

@@ -21,7 +21,8 @@ const tasks = {
 
   async detect({ name, buffer }) {
     const { points, remarks } = readScan(name, buffer);
-    return { points, remarks, ...(await detector.detect(points)) };
+    const found = await detector.detect(points);
+    return { ...found, points, remarks: [...remarks, ...found.remarks] };
   },
 };
 
