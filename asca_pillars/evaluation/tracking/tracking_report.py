@@ -224,6 +224,10 @@ def _about_run(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
+        about = dict(json.loads(path.read_text(encoding="utf-8")))
+        about["classes"] = [str(name) for name in about.get("classes") or ()]
+        if about.get("ranges_m") is not None:
+            about["ranges_m"] = [(float(low), float(high)) for low, high in about["ranges_m"][:3]]
+        return about
+    except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
         raise DatasetError(f"{path}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None
