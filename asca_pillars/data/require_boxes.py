@@ -92,7 +92,8 @@ def _why(names: list[str], labels: _Labels) -> str:
     spellings = {name: other for name in names if (other := other_spelling(name, labels.types)) is not None}
     if spellings:
         listed = ", ".join(f"'{other}'" for other in spellings.values())
-        return f"the labels spell {'it' if len(spellings) == 1 else 'them'} {listed}; rename there or in model.spec.classes"
+        what = "it" if len(spellings) == 1 else "them"
+        return f"the labels spell {what} {listed}; rename there or in model.spec.classes"
     if outside := [name for name in names if labels.types[name]]:
         count = sum(labels.types[name] for name in outside)
         return f"{count} lie outside the ranges of model.spec.grid; widen them, see `asca inspect`"

@@ -17,7 +17,7 @@ from asca_pillars.errors import DatasetError, WorkerError
 from asca_pillars.pillar_config import NetworkConfig, PillarModel
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loader_processes import loader_context
-from asca_pillars.training.shared_batches import SharedInputs, ShareCollated
+from asca_pillars.training.shared_batches import ShareCollated, SharedInputs
 from tests.models.pv_rcnn.tiny_pv_rcnn import tiny_config
 from tests.models.second_stage.tiny_refine import opened_config, write_first_stage
 from tests.scenes import SPEC, write_dataset
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this sy
 
 class Inner(NamedTuple):
     tensors: tuple[Tensor, ...]
-    count: int
+    frames: int
 
 
 class Outer(NamedTuple):
@@ -60,7 +60,7 @@ def test_another_process_gets_the_same_tensors() -> None:
     process = context.Process(target=send, args=(there,))
     process.start()
     found, expected = here.recv(), made_up()
-    assert isinstance(found, Outer) and found.inner.count == 3 and found.nothing is None
+    assert isinstance(found, Outer) and found.inner.frames == 3 and found.nothing is None
     assert np.array_equal(found.array, expected.array)
     for own, other in zip(found.inner.tensors, expected.inner.tensors, strict=True):
         assert own.dtype == other.dtype and own.shape == other.shape and torch.equal(own, other)
@@ -92,9 +92,7 @@ def inputs_of(family: str, root: Path) -> Any:
 
 
 @pytest.mark.parametrize("family", ["pillar", "sparse", "pv_rcnn", "pillar_refine"])
-def test_no_tensor_of_any_family_is_left_to_torch(
-    family: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_tensor_of_any_family_is_left_to_torch(family: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch stores what it pickles for another process in /dev/shm."""
 
     def refuse(tensor: Tensor) -> Any:

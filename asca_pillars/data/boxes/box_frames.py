@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, read_time, records_from
-from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans
+from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, visible_files
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import file_inside, is_hidden
 
@@ -57,15 +57,15 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             if same != path:
                 raise DatasetError(f"{same} and {path}: both would be frame {frame_id_of(path, scans)}; rename one")
     for scan, records, place, time_s in read_frames(labels):
-        path = _find_scan(scan, scans)
-        if path is None:
+        found = _find_scan(scan, scans)
+        if found is None:
             raise DatasetError(
                 f"{place}: no scan {scan[:200]} below {scans}; correct the name, or `scans` in {DATASET_FILE}"
             )
-        frame_id = frame_id_of(path, scans)
+        frame_id = frame_id_of(found, scans)
         if frame_id in places:
             raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
-        frames[frame_id], places[frame_id] = BoxFrame(path, labels, records, time_s), place
+        frames[frame_id], places[frame_id] = BoxFrame(found, labels, records, time_s), place
     if not frames:
         raise DatasetError(f"{labels}: no frame in it; write a line for each scan, as docs/DATA.md says")
     return frames
@@ -101,5 +101,12 @@ def _frames_of_folder(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             raise DatasetError(f"{path}: {frames[frame_id].label_file.name} has labels of the scan already; remove one")
         frames[frame_id] = BoxFrame(there[0], path, None)
     if not frames:
-        raise DatasetError(f"{labels}: no <frame>.json or <frame>.csv there; write one for each scan")
+        advice = "write one for each scan"
+        if texts := visible_files(labels, "*.txt"):
+            advice = (
+                f"{texts[0].name} is text, as KITTI's or OpenPCDet's labels: write a .csv for each scan, a line of "
+                "names (class,x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad) and below it the values, separated by "
+                "commas"
+            )
+        raise DatasetError(f"{labels}: no <frame>.json or <frame>.csv there; {advice}")
     return frames

@@ -80,9 +80,7 @@ def _read_tracklets(path: Path, left_out: LeftOut) -> dict[int, _Labels]:
     return dict(labels)
 
 
-def _add(
-    labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: LeftOut, path: Path
-) -> None:
+def _add(labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: LeftOut, path: Path) -> None:
     """Add the boxes of a tracklet to their frames; ValueError if it has no type, size or first frame."""
     height, width, length = _numbers(tracklet, "hwl")
     kind = text_of(tracklet.findtext("objectType", ""), "objectType")

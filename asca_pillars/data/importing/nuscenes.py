@@ -109,7 +109,10 @@ def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: Le
 
 
 def _records(
-    labels: list[_Row], changes: list[tuple[_Doubles, _Doubles]], tables: Mapping[str, _Table], folder: Path,
+    labels: list[_Row],
+    changes: list[tuple[_Doubles, _Doubles]],
+    tables: Mapping[str, _Table],
+    folder: Path,
     left_out: LeftOut,
 ) -> BoxRecords:
     boxes, types, tracks = [], [], []
@@ -119,7 +122,9 @@ def _records(
             for back, origin in changes:
                 center, turn = back.T @ (center - origin), back.T @ turn
             width, length, height = numbers(entry(label, "size"), 3, "size")
-            kind = text_of(entry(_linked(_linked(label, "instance", tables), "category", tables), "name"), "the category")
+            kind = text_of(
+                entry(_linked(_linked(label, "instance", tables), "category", tables), "name"), "the category"
+            )
         except ValueError as reason:
             left_out.add("boxes", f"{folder}/sample_annotation.json, {label['token']}", reason)
             continue

@@ -66,7 +66,7 @@ class ConventionFit(NamedTuple):
 
 
 def count_points(points: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Points inside each box (M, 7) by each convention: (C, M), in the order of `CONVENTIONS`; points (N, >=3)."""
+    """How many points (N, >=3), metres, each box (M, 7) holds by each of the `CONVENTIONS`: (C, M)."""
     counts = np.zeros((len(CONVENTIONS), len(boxes)), np.int64)
     for column, box in enumerate(boxes):
         reach = np.hypot(box[3], box[4]) / 2 + 0.01
@@ -76,7 +76,7 @@ def count_points(points: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDA
 
 
 def convention_fits(counts: NDArray[np.int64]) -> tuple[ConventionFit, ...]:
-    """The fit of each convention to boxes with these points, (C, M) of `count_points`."""
+    """The fit of each convention to boxes with these numbers of points, (C, M) unitless, of `count_points`."""
     seen = counts[:, counts.max(axis=0, initial=0) >= _SEEN_POINTS]
     more, fewer = seen > _MORE * seen[0], seen[0] > _MORE * seen
     rows = zip(CONVENTIONS, counts.sum(axis=1), more.sum(axis=1), fewer.sum(axis=1), strict=True)

@@ -166,7 +166,7 @@ class KittiSplit:
         return [item.type for item in self.objects(frame_id)]
 
     def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
-        """(M,) rotation_y of every object with a 3D box."""
+        """(M,) rotation_y in radians of every object with a 3D box."""
         return np.array([item.rotation_y for item in objects_3d(self.objects(frame_id))])
 
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:

@@ -103,12 +103,25 @@ def test_csv_rows_are_gathered_by_scan(tmp_path: Path) -> None:
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "x_m": True}]}), r"box 1: x_m is 'True'"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "x_m": 10**400}]}), r"box 1: x_m is '1000"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "score": -(10**400)}]}), r"box 1: score is '-1000"),
-        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "yaw_rad": 235}]}), r"yaw_rad is 235, .* radians .* pi / 180"),
+        (
+            "l.jsonl",
+            json.dumps({"scan": "a", "boxes": [{**BOX, "yaw_rad": 235}]}),
+            r"yaw_rad is 235, .* radians .* pi / 180",
+        ),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "yaw_rad": -6.5}]}), r"yaw_rad is -6\.5, .*radians"),
-        ("l.csv", "scan,class,x,y,z,length,width,height,yaw\na,Car,1,2,0,4,2,1,90\n", r"l\.csv:2: yaw_rad is 90, .*radians"),
+        (
+            "l.csv",
+            "scan,class,x,y,z,length,width,height,yaw\na,Car,1,2,0,4,2,1,90\n",
+            r"l\.csv:2: yaw_rad is 90, .*radians",
+        ),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "width_m": 0}]}), r"box 1: width_m is 0"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "class": " "}]}), r"box 1: no `class`"),
         ("l.jsonl", '{"scan": "a", "boxes": [{"class": "Car", "x": 1}]}', r"box 1: no `y_m`"),
+        (
+            "l.jsonl",
+            '{"scan": "a", "objects": [{"centroid": {}}]}',
+            r"labels of labelCloud .*`rotations\.z` \* pi / 180",
+        ),
         ("l.csv", "scan,class,x\na,Car,1\n", r"l\.csv:2: no `y_m`"),
         ("l.csv", "class,x\nCar,1\n", r"l\.csv:2: no `scan`"),
         ("l.csv", "scan,class\na,Car,1\n", r"l\.csv:2: 3 values for 2 columns"),
@@ -122,6 +135,12 @@ def test_csv_rows_are_gathered_by_scan(tmp_path: Path) -> None:
 def test_a_mistake_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         list(read_frames(write(tmp_path / name, text)))
+
+
+def test_labels_of_other_tools_are_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "000000.json", '[{"psr": {"position": {}}, "obj_type": "Car"}]')
+    with pytest.raises(DatasetError, match=r"000000\.json: labels of SUSTechPOINTS .*yaw_rad is `rotation\.z`"):
+        read_frame_file(path)
 
 
 def test_a_file_that_is_no_text_or_not_there_is_named(tmp_path: Path) -> None:

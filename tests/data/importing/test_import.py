@@ -259,11 +259,21 @@ def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
         usable(read_nuscenes(source))
     poses.write_text(whole)
     for name, old, new, message in (
-        ("sample_annotation", "[2.0, 4.5, 1.6]", "[0, 4.5, 1.6]", r"boxes: 1, .*LIDAR_TOP__1\.pcd\.bin: no box of a car"),
+        (
+            "sample_annotation",
+            "[2.0, 4.5, 1.6]",
+            "[0, 4.5, 1.6]",
+            r"boxes: 1, .*LIDAR_TOP__1\.pcd\.bin: no box of a car",
+        ),
         ("sample_annotation", "[2.0, 4.5, 1.6]", "[1e400, 4.5, 1.6]", r"boxes: 1, .*annotation\.json, 1: size is"),
         ("sample_annotation", '"instance_token": "i"', '"instance_token": ["i"]', r"boxes: 1, .*instance\.json has no"),
         ("ego_pose", json.dumps(quaternion(POSE)), "[0, 0, 0, 0]", r"frames: 1, .*rotation is \[0, 0, 0, 0\]"),
-        ("calibrated_sensor", "[0.9, 0.0, 1.8]", "[0, 0]", r"frames: 1, .*translation is \[0, 0\], not 3 finite numbers"),
+        (
+            "calibrated_sensor",
+            "[0.9, 0.0, 1.8]",
+            "[0, 0]",
+            r"frames: 1, .*translation is \[0, 0\], not 3 finite numbers",
+        ),
         ("sample_data", "samples/LIDAR_TOP", "../nuscenes/samples/LIDAR_TOP", r"frames: 1, .*no file below"),
         ("scene", '"scene-0001"', "7", r"frames: 1, .*the scene's name is 7"),
         ("sensor", '"l"', "[7]", r"rows: 1, .*sensor\.json, row 0: token is \[7\]"),
