@@ -88,7 +88,7 @@ def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
                 for _ in range(workers):
                     here, there = context.Pipe()
                     with there:
-                        process = context.Process(target=_work, args=(job, there), daemon=True)
+                        process: BaseProcess = context.Process(target=_work, args=(job, there), daemon=True)
                         process.start()
                     pool[here] = process
         except OSError as error:
@@ -119,8 +119,9 @@ def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]
                     if (start := next(starts, None)) is not None:
                         connection.send(todo[start : start + at_once])
                         at[connection] = start
-                for connection in wait(list(at)):
-                    done[at.pop(connection)] = connection.recv()  # type: ignore[union-attr]
+                ready: list[Any] = wait(list(at))
+                for connection in ready:
+                    done[at.pop(connection)] = connection.recv()
             except (EOFError, ConnectionError):
                 dead = sum(process.exitcode is not None for process in pool.values()) or 1
                 raise WorkerError(

@@ -1,11 +1,11 @@
 """Jobs in processes: the results of one process, in its order, whatever their number."""
 
 import errno
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from multiprocessing.context import SpawnProcess
@@ -67,17 +67,19 @@ def test_a_process_that_is_killed_ends_the_work() -> None:
         list(results)
 
 
-def killed_later(number: int) -> int:
-    if number == 0:
-        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGKILL)).start()
-    return number
+def unhurried(number: int) -> int:
+    time.sleep(0.05 if number else 0)
+    return os.getpid()
 
 
 def test_a_process_that_is_killed_while_it_waits_ends_the_work() -> None:
     """In a pool of the standard library it takes the lock of the common queue with it."""
-    results = in_processes(killed_later, range(8), 2, "Killed", at_once=1, progress=False)
-    assert next(results) == 0
-    time.sleep(1)
+    results = in_processes(unhurried, range(1000), 2, "Unhurried", at_once=1, progress=False)
+    process = next(results)
+    os.kill(process, signal.SIGKILL)
+    deadline = time.monotonic() + 30
+    while process in {child.pid for child in multiprocessing.active_children()} and time.monotonic() < deadline:
+        time.sleep(0.01)
     with pytest.raises(WorkerError, match="were killed"):
         list(results)
 
@@ -106,12 +108,12 @@ def test_a_process_that_cannot_be_started_is_one_line(monkeypatch: pytest.Monkey
             raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
 
     monkeypatch.setattr("multiprocessing.context.SpawnContext.Process", Refused)
-    with pytest.raises(WorkerError, match="cannot be started .*; use fewer workers"):
+    with pytest.raises(WorkerError, match=r"cannot be started .*; use fewer workers"):
         list(squares(50, 2))
 
 
 def asleep(number: int) -> int:
-    print(os.getpid(), flush=True)
+    os.write(1, f"{os.getpid()}\n".encode())  # at once: two processes write to one pipe
     time.sleep(1)
     return number
 

@@ -162,6 +162,7 @@ def evaluate(
         scores = steps.kitti_scores(opened, score, min_score) if protocol == "kitti" else {}
         task = steps.run_model(opened, frames_of, labels, scores, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)
+    steps.warn_of_degrees_in_text(console, frames)
     if protocol == "waymo":
         steps.report_waymo(task, frames, out, json, console)
     else:

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from asca_pillars.commands.eval_errors import prepare_errors, report_errors, who_predicted
 from asca_pillars.commands.eval_files import MADE_BY, PREDICTIONS_FOLDER, claim, write_report
-from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_unlike_scans
+from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_degrees, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
 from asca_pillars.commands.options import RuntimeOptions
 from asca_pillars.data.boxes.box_split import BoxSplit
@@ -67,6 +67,12 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
         scores = dict.fromkeys(class_names, TEXT_SCORE if task.score is None else task.score)
         subject, about = f"{predictions} against {task.data}", about | {"predictions": str(predictions)}
     _require_common_class(frames, class_names, task.data)
+    level = split.mounting.level.inverse  # yaws as files state them
+    warn_of_degrees(
+        console,
+        labels=[split.label_yaws(frame.frame_id) for frame in frames.frames],
+        predictions=[level.boxes(frame.found)[:, 6] for frame in frames.frames],
+    )
     about["environment"] = describe_environment()
     at_score = fixed_scores(frames.frames, class_names, scores)
     report = box_report(subject, task.protocol, frames, class_names, at_score, about)

@@ -1,9 +1,12 @@
 """The steps of `asca eval`: what goes together, running the model, reports and pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from asca_pillars.commands.eval_errors import ErrorAnalysis, report_errors
@@ -11,6 +14,7 @@ from asca_pillars.commands.eval_files import COMMAND, CURVES, GALLERY_FOLDER, MA
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
@@ -111,6 +115,22 @@ def warn_of_unlike_scans(model: Model, scans: int, console: Console) -> None:
             style="yellow",
             soft_wrap=True,
         )
+
+
+def warn_of_degrees(console: Console, **yaws: Sequence[NDArray[np.floating]]) -> None:
+    """Say of which files, labels or predictions, the yaws look like degrees."""
+    for what, own in yaws.items():
+        if (doubt := doubt_of_yaws(own)) is not None:
+            console.print(f"{what}: {doubt}", style="yellow", soft_wrap=True)
+
+
+def warn_of_degrees_in_text(console: Console, frames: ScoredFrames) -> None:
+    """The same of rotation_y; objects without a 3D box have none."""
+    labels, predictions = (
+        [frame.rotation_y[(frame.dimensions_hwl > 0).all(axis=1)] for frame in side]
+        for side in (frames.truth, frames.detections)
+    )
+    warn_of_degrees(console, labels=labels, predictions=predictions)
 
 
 def run_model(

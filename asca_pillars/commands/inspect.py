@@ -106,6 +106,7 @@ def inspect(
     console.print(
         show.types(inspection, spec.class_names), show.objects(inspection, min_points), show.sizes(inspection), sep="\n"
     )
+    console.print(show.conventions(inspection))
     console.print(show.matching(inspection), show.scans(inspection, input_cells(spec), view), sep="\n")
     if draw is not None:
         draw_frames(data, frames_of.name, settings, draw, pictures, console)

@@ -34,6 +34,15 @@ def objects(inspection: Inspection, min_points: int) -> Table:
     return table
 
 
+def conventions(inspection: Inspection) -> Table:
+    """Points in the boxes by each convention for yaw and z."""
+    title = "Conventions: points in the boxes of the classes as labelled and otherwise; boxes with 10 % more or fewer"
+    table = _table(title, "boxes", "points", "more", "fewer")
+    for fit in inspection.conventions:
+        table.add_row(fit.name, str(fit.points), str(fit.more), str(fit.fewer))
+    return table
+
+
 def sizes(inspection: Inspection) -> Table:
     """Sizes per class against the anchors."""
     title = "Sizes, m: mean ± standard deviation (difference to the anchor); misfits cannot reach positive_iou"

@@ -84,6 +84,9 @@ class LabeledSplit(Protocol):
     def label_types(self, frame_id: str) -> list[str]:
         """The type of every label, also of those without a 3D box."""
 
+    def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
+        """(M,) yaw, or KITTI's rotation_y, of every label with a 3D box, radians if it is right, as it is stated."""
+
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
         """The frame's boxes: those of `types`, or all that have a 3D box.
 

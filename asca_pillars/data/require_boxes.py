@@ -4,21 +4,28 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.progress import track
 
 from asca_pillars.config import Config
 from asca_pillars.data.frames import other_spelling, read_frame, within_ranges
 from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import DatasetError
 
 FRAMES_WITH_POINTS = 50
 """Frames with boxes whose points are looked at before all of them are taken to be without points."""
 
 
+FEWEST_FRAMES = 20
+"""Frames whose yaws are looked at, if there are so many."""
+
+
 @dataclass
 class _Labels:
     """Boxes of a list so far: by type, by class within the detector's ranges, and whether one has enough points."""
 
+    yaws: list[NDArray[np.float64]] = field(default_factory=list)
     types: Counter[str] = field(default_factory=Counter)
     in_ranges: Counter[str] = field(default_factory=Counter)
     frames_read: int = 0
@@ -26,9 +33,9 @@ class _Labels:
 
 
 def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> list[str]:
-    """Make sure that a list has boxes of the classes that are to be learnt; a line for each class that has none.
+    """Make sure that a list has boxes of the classes that are to be learnt; a line for whatever else looks wrong.
 
-    Frames are read only until every class was found.
+    That is a class without a box, and yaws that look like degrees. Frames are read only until every class was found.
 
     Args:
         split: the training or the validation list.
@@ -44,8 +51,9 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> lis
     order = np.random.default_rng(0).permutation(len(split.frame_ids)).tolist()
     for number in track(order, "Looking for boxes of each class", transient=True):
         _add(labels, split, split.frame_ids[number], config)
-        if labels.one_with_points and all(labels.in_ranges[name] for name in names):
-            return []
+        complete = labels.one_with_points and all(labels.in_ranges[name] for name in names)
+        if complete and len(labels.yaws) >= FEWEST_FRAMES:
+            break
     missing = [name for name in names if not labels.in_ranges[name]]
     place = f"{split.root}: list `{split.name}`"
     if len(missing) == len(names):
@@ -59,13 +67,16 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> lis
             f"{place}: none of the boxes in {labels.frames_read} frames has data.min_points = {config.data.min_points} "
             "points inside; labels (and calib) must belong to the scans: see `asca inspect`"
         )
+    doubt = doubt_of_yaws(labels.yaws)
     cannot = "it cannot be learnt" if training else "its recall cannot be measured"
-    return [f"{place} has no box of {name}, {cannot}: {_why([name], labels)}" for name in missing]
+    lines = [f"{place} has no box of {name}, {cannot}: {_why([name], labels)}" for name in missing]
+    return lines if doubt is None else [*lines, f"{place}: {doubt}"]
 
 
 def _add(labels: _Labels, split: LabeledSplit, frame_id: str, config: Config) -> None:
     spec, data = config.model.spec, config.data
     boxes, types = split.labeled_boxes(frame_id)
+    labels.yaws.append(split.label_yaws(frame_id))
     labels.types.update(types)
     held = spec.ranges.hold_centers(boxes)
     own = [name for name, inside in zip(types, held, strict=True) if inside and name in spec.class_names]
@@ -81,7 +92,8 @@ def _why(names: list[str], labels: _Labels) -> str:
     spellings = {name: other for name in names if (other := other_spelling(name, labels.types)) is not None}
     if spellings:
         listed = ", ".join(f"'{other}'" for other in spellings.values())
-        return f"the labels spell {'it' if len(spellings) == 1 else 'them'} {listed}; rename there or in model.spec.classes"
+        what = "it" if len(spellings) == 1 else "them"
+        return f"the labels spell {what} {listed}; rename there or in model.spec.classes"
     if outside := [name for name in names if labels.types[name]]:
         count = sum(labels.types[name] for name in outside)
         return f"{count} lie outside the ranges of model.spec.grid; widen them, see `asca inspect`"

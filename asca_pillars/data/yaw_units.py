@@ -34,6 +34,6 @@ def doubt_of_yaws(yaws: Sequence[ArrayLike]) -> str | None:
         return None
     examples: NDArray[np.float64] = np.unique(np.round(stated[np.arange(len(values)), off.argmin(axis=1)]))
     return (
-        f"all {len(values)} yaws that are not 0 are whole numbers, such as {examples[-1]:g}: radians are wanted; if they "
-        "are degrees, multiply them by pi / 180 (0.0174533)"
+        f"all {len(values)} yaws that are not 0 are whole numbers, such as {examples[-1]:g}: radians are wanted; if "
+        "they are degrees, multiply them by pi / 180 (0.0174533)"
     )

@@ -23,8 +23,8 @@ LOOK_AGAIN_S = 5
 MOST_LOOKS = 180
 """Looks without a batch after which it gives up: a quarter of an hour, in which the run was not suspended."""
 _REMEDY = (
-    "lower data.workers or set data.workers=0, or give a container more memory (--memory, --shm-size); the same command "
-    "goes on from the last checkpoint"
+    "lower data.workers or set data.workers=0, or give a container more memory (--memory, --shm-size); the same "
+    "command goes on from the last checkpoint"
 )
 
 

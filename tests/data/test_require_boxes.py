@@ -85,7 +85,7 @@ def test_validation_without_boxes_can_go_on_unless_its_names_differ(tmp_path: Pa
     (line,) = require_boxes(KittiSplit(root, "val"), CONFIG, training=False)
     assert "recall cannot be measured" in line
     label.write_text(text.upper())
-    with pytest.raises(DatasetError, match="list `val` has no box of .* spell them 'CAR'"):
+    with pytest.raises(DatasetError, match=r"list `val` has no box of .* spell them 'CAR'"):
         require_boxes(KittiSplit(root, "val"), CONFIG, training=False)
 
 

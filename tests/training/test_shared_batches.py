@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this sy
 
 class Inner(NamedTuple):
     tensors: tuple[Tensor, ...]
-    count: int
+    frames: int
 
 
 class Outer(NamedTuple):
@@ -60,7 +60,7 @@ def test_another_process_gets_the_same_tensors() -> None:
     process = context.Process(target=send, args=(there,))
     process.start()
     found, expected = here.recv(), made_up()
-    assert isinstance(found, Outer) and found.inner.count == 3 and found.nothing is None
+    assert isinstance(found, Outer) and found.inner.frames == 3 and found.nothing is None
     assert np.array_equal(found.array, expected.array)
     for own, other in zip(found.inner.tensors, expected.inner.tensors, strict=True):
         assert own.dtype == other.dtype and own.shape == other.shape and torch.equal(own, other)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, read_time, records_from
-from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans
+from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, visible_files
 from asca_pillars.errors import DatasetError
 from asca_pillars.files import file_inside, is_hidden
 
@@ -101,5 +101,12 @@ def _frames_of_folder(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             raise DatasetError(f"{path}: {frames[frame_id].label_file.name} has labels of the scan already; remove one")
         frames[frame_id] = BoxFrame(there[0], path, None)
     if not frames:
-        raise DatasetError(f"{labels}: no <frame>.json or <frame>.csv there; write one for each scan")
+        advice = "write one for each scan"
+        if texts := visible_files(labels, "*.txt"):
+            advice = (
+                f"{texts[0].name} is text, as KITTI's or OpenPCDet's labels: write a .csv for each scan, a line of "
+                "names (class,x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad) and below it the values, separated by "
+                "commas"
+            )
+        raise DatasetError(f"{labels}: no <frame>.json or <frame>.csv there; {advice}")
     return frames

@@ -144,7 +144,7 @@ def json_line(
 
 
 def can_be_written(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which boxes (N, 7) can be read again from what `json_line` writes of them."""
+    """Which boxes (N, 7), metres and radians, can be read again from what `json_line` writes of them."""
     written = np.round(np.asarray(boxes, np.float64), _DECIMALS)
     within = (np.abs(written) < _TOO_LARGE).all(axis=1)  # not where a number is not finite
     return np.asarray(within & (written[:, 3:6] > 0).all(axis=1) & (np.abs(written[:, 6]) <= LARGEST_YAW_RAD))
@@ -172,9 +172,24 @@ def _time_s(content: Any) -> float | None:
 
 def _json_records(content: Any, place: str) -> BoxRecords:
     boxes = content.get("boxes") if isinstance(content, dict) else None
+    if (remedy := _of_other_tool(content)) is not None:
+        raise DatasetError(f"{place}: {remedy}")
     if not isinstance(boxes, list):
         raise DatasetError(f'{place}: no list "boxes"; a frame without objects has "boxes": []')
     return _records((f"{place}, box {number}", box) for number, box in enumerate(boxes, start=1))
+
+
+def _of_other_tool(content: Any) -> str | None:
+    """What to convert in a file of a labelling tool that is known; None if it is of none."""
+    record = f'write {{"boxes": [...]}} with `class`, {_listed()} for each'
+    if isinstance(content, dict) and "boxes" not in content and isinstance(content.get("objects"), list):
+        return f"labels of labelCloud (`objects`); {record}: the center is `centroid`, yaw_rad `rotations.z` * pi / 180"
+    if isinstance(content, list) and content and all(isinstance(item, dict) and "psr" in item for item in content):
+        return (
+            f"labels of SUSTechPOINTS (`psr`); {record}: the center is `position`, length, width and height are "
+            "`scale` x, y and z, yaw_rad is `rotation.z`"
+        )
+    return None
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:

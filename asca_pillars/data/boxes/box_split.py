@@ -170,6 +170,10 @@ class BoxSplit:
         """The class of each box."""
         return list(self.records(frame_id).types)
 
+    def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
+        """(M,) yaw of each box in radians, in the scan's own frame, within half a turn."""
+        return self.records(frame_id).boxes[:, 6].astype(np.float64)
+
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
         """The frame's boxes in the level frame, all or those of `types`."""
         records = self.records(frame_id)

@@ -54,9 +54,10 @@ def whole_number(value: Any, name: str) -> int:
     Raises:
         ValueError: it is none.
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -(2**63) <= value < 2**63:
+    number = int(value) if isinstance(value, int | np.integer) and not isinstance(value, bool) else None
+    if number is None or not -(2**63) <= number < 2**63:
         raise ValueError(f"{name} is {_QUOTE.repr(value)}, no whole number")
-    return int(value)
+    return number
 
 
 def numbers(values: Any, count: int | None, name: str) -> NDArray[np.float64]:
@@ -68,12 +69,9 @@ def numbers(values: Any, count: int | None, name: str) -> NDArray[np.float64]:
     if isinstance(values, np.ndarray) and values.dtype.kind in "iuf":
         array = values.astype(np.float64)
     elif isinstance(values, list | tuple | np.ndarray):
-        plain = [
-            float(value)
-            for value in values
-            if isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(value) <= _LARGEST
-        ]
-        array = np.array(plain if len(plain) == len(values) else [np.nan])
+        plain: list[Any] = [value for value in values if isinstance(value, int | float | np.integer | np.floating)]
+        usual = [float(value) for value in plain if not isinstance(value, bool) and abs(value) <= _LARGEST]
+        array = np.array(usual if len(usual) == len(values) else [np.nan])
     else:
         array = np.zeros(0)
     if array.ndim != 1 or len(array) != (count or max(len(array), 1)) or not (np.abs(array) <= _LARGEST).all():

@@ -39,8 +39,8 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
 
 
 def _plain(value: Any) -> Any:
-    items = getattr(value, "values", None)  # of a list; None of a list that is null
+    items: Any = getattr(value, "values", None)  # of a list; None of a list that is null
     try:
-        return items.to_numpy(zero_copy_only=False) if hasattr(items, "to_numpy") else value.as_py()
+        return value.as_py() if not hasattr(items, "to_numpy") else items.to_numpy(zero_copy_only=False)
     except (ValueError, TypeError, LookupError, OverflowError, NotImplementedError):  # Arrow's own are among them
         return None

@@ -8,7 +8,7 @@ v2/perception.
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +69,8 @@ def read_waymo(root: Path, out: Path) -> Imported:
         labels = _labels(root / "lidar_box" / path.name, left_out)
         nothing = records_from(np.zeros((0, 7)), ())
         folder = scans / portable_name(path.stem)
-        for time in _write_scans(root, path, folder, left_out):
-            frames.append(ImportedFrame(_scan_path(folder, time), labels.get(time, nothing), path.stem))
+        times = _write_scans(root, path, folder, left_out)
+        frames += [ImportedFrame(_scan_path(folder, time), labels.get(time, nothing), path.stem) for time in times]
     top = _calibrations(root / "lidar_calibration" / segments[0].name, LeftOut()).get(TOP)
     x, y, z = np.zeros(3) if top is None else np.round(top.vehicle_from_lidar[:3, 3], 3).tolist()
     settings = BoxDataset(sensor_height=0.0, reflectance_scale=1.0, scans=str(scans), sensor_position=(x, y, z))
@@ -83,12 +83,7 @@ def _scan_path(folder: Path, time: int) -> Path:
 
 def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> list[int]:
     """Write the scans of a segment that are not there yet; the times of all that are there then."""
-    missing: Counter[int] = Counter()
-    for number, row in enumerate(parquet_rows(lidar, (_TIME,))):
-        try:
-            missing[whole_number(row[_TIME], _TIME)] += 1
-        except ValueError as reason:
-            left_out.add("range images", f"{lidar}, row {number}", reason)
+    missing = _images_of_times(lidar, left_out)
     times = sorted(missing)
     missing = Counter({time: rows for time, rows in missing.items() if not _scan_path(folder, time).exists()})
     if not missing:
@@ -100,30 +95,55 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> li
     points: dict[int, list[NDArray[np.float32]]] = defaultdict(list)
     columns = (_TIME, _LASER, *(f"{image}.{part}" for image in _IMAGES for part in ("values", "shape")))
     for number, row in enumerate(parquet_rows(lidar, columns)):
-        time, laser = row[_TIME], row[_LASER]
+        time = row[_TIME]
         if not isinstance(time, int) or time not in missing:
             continue
+        poses = None
+        if row[_LASER] == TOP:  # the only one whose pixels have poses
+            while time not in early and (other := next(pixel_poses, None)) is not None:
+                early |= {other[0]: other[1]} if other[0] in missing else {}
+            poses = early.pop(time, None)
         try:
-            if not isinstance(laser, int) or laser not in calibrations:
-                raise ValueError(f"sensor {str(laser)[:40]} has no usable calibration")
-            if laser == TOP:  # the only one whose pixels have poses
-                while time not in early and (other := next(pixel_poses, None)) is not None:
-                    early |= {other[0]: other[1]} if other[0] in missing else {}
-            poses = early.pop(time, None) if laser == TOP else None
-            for image in (_image(row, name) for name in _IMAGES):
-                if image is not None:
-                    points[time].append(range_image_points(image, calibrations[laser], poses, vehicle_poses.get(time)))
+            points[time] += _points(row, calibrations, poses, vehicle_poses.get(time))
         except ValueError as reason:  # a scan without one of its sensors would pass for a whole one
             left_out.add("frames", f"{lidar}, row {number}", reason)
-            del missing[time]
-            points.pop(time, None)
+            del missing[time], points[time]
             times.remove(time)
             continue
         missing[time] -= 1
         if not missing[time]:  # all sensors of the frame
             with atomic_path(_scan_path(folder, time)) as temporary, temporary.open("wb") as file:
-                np.save(file, np.concatenate([*points.pop(time, []), np.zeros((0, 4), np.float32)]))
+                np.save(file, np.concatenate([*points.pop(time), np.zeros((0, 4), np.float32)]))
     return times
+
+
+def _images_of_times(lidar: Path, left_out: LeftOut) -> Counter[int]:
+    """How many rows, one for each sensor, each frame of a segment has."""
+    rows: Counter[int] = Counter()
+    for number, row in enumerate(parquet_rows(lidar, (_TIME,))):
+        try:
+            rows[whole_number(row[_TIME], _TIME)] += 1
+        except ValueError as reason:
+            left_out.add("range images", f"{lidar}, row {number}", reason)
+    return rows
+
+
+def _points(
+    row: dict[str, Any],
+    calibrations: Mapping[int, LidarCalibration],
+    poses: NDArray[np.float32] | None,
+    world_from_vehicle: Doubles | None,
+) -> list[NDArray[np.float32]]:
+    """Points of each return of one sensor; ValueError where they cannot be computed."""
+    laser = row[_LASER]
+    if not isinstance(laser, int) or laser not in calibrations:
+        raise ValueError(f"sensor {str(laser)[:40]} has no usable calibration")
+    images = (_image(row, name) for name in _IMAGES)
+    return [
+        range_image_points(image, calibrations[laser], poses, world_from_vehicle)
+        for image in images
+        if image is not None
+    ]
 
 
 def _labels(path: Path, left_out: LeftOut) -> dict[int, BoxRecords]:

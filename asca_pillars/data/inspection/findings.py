@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 
 from asca_pillars.data.frames import other_spelling
 from asca_pillars.data.input_check import TOLERANCE_M
+from asca_pillars.data.inspection.box_conventions import better_convention
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
 
@@ -60,6 +61,7 @@ def findings(inspection: Inspection, spec: InspectedSpec, min_points: int) -> li
             ]
     scans = inspection.scans
     found += [Finding("warning", "axes", text) for text in _of_axes(inspection)]
+    found += [Finding("warning", "boxes", text) for text in _of_conventions(inspection)]
     found += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
     found += [Finding("warning", "height", text) for text in _of_height(inspection)]
     found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, spec)]
@@ -173,6 +175,17 @@ def _of_axes(inspection: Inspection) -> Iterator[str]:
     else:
         remedy = "if so, turn the points of all scans to x forward, y left, z up, and calib with them"
     yield f"{len(inspection.doubts)} of {inspection.frames} scans are odd, the first: {first.text}: {remedy}"
+
+
+def _of_conventions(inspection: Inspection) -> Iterator[str]:
+    if inspection.yaws_doubt is not None:
+        yield inspection.yaws_doubt
+    if (better := better_convention(inspection.conventions)) is not None:
+        convention, fit = better
+        yield (
+            f"the points fit the boxes better {convention.name}: {fit.more} boxes hold more points so and {fit.fewer} "
+            f"fewer, {fit.points} points together instead of {inspection.conventions[0].points}; {convention.remedy}"
+        )
 
 
 def _of_height(inspection: Inspection) -> Iterator[str]:

@@ -14,10 +14,12 @@ from rich.progress import track
 
 from asca_pillars.config import DataConfig
 from asca_pillars.data.input_check import FrameDoubt
+from asca_pillars.data.inspection.box_conventions import ConventionFit, convention_fits
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import DatasetError, ScanError
 from asca_pillars.geometry.anchors import ClassSpec
 from asca_pillars.geometry.overlap import aligned_bev_iou
@@ -117,7 +119,9 @@ class Inspection:
 
     `types` counts the labels by type, those of no class included; `damaged` holds a line for each frame that was
     wanted and cannot be read, `doubts` what is odd about the axes of a scan, for each scan where something is. A
-    dataset of KITTI's layout cannot state how its sensor stands (`states_mounting`).
+    dataset of KITTI's layout cannot state how its sensor stands (`states_mounting`). `conventions` says how well the
+    points fit the boxes of the classes as they are labelled, turned, mirrored, raised and lowered; `yaws_doubt` is a
+    sentence where the yaws do not look like radians.
     """
 
     data: str
@@ -131,6 +135,8 @@ class Inspection:
     damaged: tuple[str, ...]
     doubts: tuple[FrameDoubt, ...]
     states_mounting: bool
+    conventions: tuple[ConventionFit, ...]
+    yaws_doubt: str | None
 
     @property
     def sampled(self) -> bool:
@@ -187,6 +193,8 @@ def inspect_dataset(
         damaged=tuple(map(str, damaged)),
         doubts=tuple(frame.doubt for frame in measured if frame.doubt is not None),
         states_mounting=not isinstance(split, KittiSplit),
+        conventions=convention_fits(np.concatenate([frame.convention_points for frame in measured], axis=1)),
+        yaws_doubt=doubt_of_yaws([frame.label_yaws for frame in measured]),
     )
 
 

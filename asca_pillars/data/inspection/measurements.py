@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from asca_pillars.config import DataConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.input_check import FrameDoubt, doubt_frame, ground_z_m
+from asca_pillars.data.inspection.box_conventions import count_points
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.scans.scan_reader import decide_scale
@@ -63,7 +64,8 @@ class FrameMeasure(NamedTuple):
     """A frame: its labels by type, the M objects of the C classes, and its scan.
 
     `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `outcomes` (M,), `positives` (C,) positive
-    anchors of each class, `doubt` what is odd about the scan's axes.
+    anchors of each class, `doubt` what is odd about the scan's axes, `convention_points` (C, M) inside each box by each
+    of the `box_conventions`, `label_yaws` as the labels state them.
     """
 
     types: Counter[str]
@@ -74,6 +76,8 @@ class FrameMeasure(NamedTuple):
     positives: NDArray[np.int64]
     scan: ScanMeasure
     doubt: FrameDoubt | None
+    convention_points: NDArray[np.int64]
+    label_yaws: NDArray[np.float64]
 
 
 def measure_frame(
@@ -103,6 +107,8 @@ def measure_frame(
         positives=positives,
         scan=scan,
         doubt=doubt_frame(sample, None if np.isnan(scan.ground_z_m) else scan.ground_z_m) if len(sample) else None,
+        convention_points=count_points(frame.points, frame.boxes[own]),
+        label_yaws=split.label_yaws(frame_id),
     )
 
 

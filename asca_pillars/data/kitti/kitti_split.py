@@ -185,6 +185,10 @@ class KittiSplit:
         """The type of every label, DontCare included."""
         return [item.type for item in self.objects(frame_id)]
 
+    def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
+        """(M,) rotation_y in radians of every object with a 3D box."""
+        return np.array([item.rotation_y for item in objects_3d(self.objects(frame_id))])
+
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
         """The frame's boxes in the LiDAR frame: those of `types`, or all that have a 3D box.
 

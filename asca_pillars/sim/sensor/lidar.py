@@ -85,7 +85,7 @@ class Lidar(Strict):
                 f"azimuth_steps is {list(self.azimuth_steps)[:4]}, ... of azimuth_counts {self.azimuth_counts}: must "
                 "be counts of 1 and more, at most an eighth as many as azimuth_counts"
             )
-        if self.azimuth_counts / self.mean_step >= MAX_COLUMNS:
+        if self.azimuth_counts >= MAX_COLUMNS * self.mean_step:
             raise ConfigError(f"azimuth_steps make {MAX_COLUMNS} firings per revolution or more; make them longer")
         if self.ring_gain and len(self.ring_gain) != self.rings:
             raise ConfigError(f"ring_gain has {len(self.ring_gain)} values for {self.rings} lasers")

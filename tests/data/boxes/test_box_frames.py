@@ -79,3 +79,17 @@ def test_per_frame_labels_need_their_scan(root: Path) -> None:
     (root / "dataset.yaml").write_text("labels: labels\n")
     with pytest.raises(DatasetError, match=r"9\.json: belongs to one scan .* there is none"):
         BoxSplit(root).frame_ids  # noqa: B018
+
+
+def test_a_folder_of_text_names_what_to_write(root: Path) -> None:
+    (root / "labels").mkdir()
+    (root / "labels" / "000000.txt").write_text("10.0 1.0 -1.0 4.1 1.7 1.5 1.2 Car\n")
+    (root / "dataset.yaml").write_text("labels: labels\n")
+    with pytest.raises(DatasetError, match=r"000000\.txt is text, .*: write a \.csv for each scan, .*yaw_rad"):
+        BoxSplit(root).frame_ids  # noqa: B018
+
+
+def test_a_path_of_very_many_folders_is_no_scan(root: Path) -> None:
+    (root / "labels.jsonl").write_text(f'{{"scan": "{"a/" * 200_000}x.bin", "boxes": []}}')
+    with pytest.raises(DatasetError, match=r"labels\.jsonl:1: no scan"):
+        BoxSplit(root).frame_ids  # noqa: B018

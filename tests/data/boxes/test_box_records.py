@@ -58,6 +58,24 @@ def test_time_stamps_are_written_and_read(tmp_path: Path) -> None:
     assert [frame.time_s for frame in read_frames(write(tmp_path / "l.jsonl", lines))] == [12.25, None]
 
 
+def test_a_time_stamp_that_no_clock_shows_is_none(tmp_path: Path) -> None:
+    for time_s in ("1" + "0" * 400, "1e999", "NaN", '"7"', "true"):
+        line = f'{{"scan": "a.bin", "time_s": {time_s}, "boxes": []}}'
+        assert [frame.time_s for frame in read_frames(write(tmp_path / "l.jsonl", line))] == [None]
+
+
+def test_line_breaks_within_a_text_end_no_line(tmp_path: Path) -> None:
+    """Other programs write JSON and CSV without escapes."""
+    lines = [json.dumps({"scan": f"a\u2028{number}.bin", "boxes": []}, ensure_ascii=False) for number in range(2)]
+    assert [frame.scan for frame in read_frames(write(tmp_path / "l.jsonl", "\r\n".join(lines)))] == [
+        "a\u20280.bin",
+        "a\u20281.bin",
+    ]
+    text = "scan,class,x,y,z,length,width,height,yaw\r\na\x85b,Car,1,2,0,4,2,1,6.28\r\n"
+    (frame,) = read_frames(write(tmp_path / "l.csv", text))
+    assert frame.scan == "a\x85b" and frame.records.boxes[0, 6] == pytest.approx(6.28 - 2 * np.pi, abs=1e-6)
+
+
 @given(st.lists(st.floats(-500, 500), min_size=7, max_size=7))
 def test_what_is_written_is_read_again(tmp_path_factory: pytest.TempPathFactory, numbers: list[float]) -> None:
     box = np.array([[*numbers[:3], *(abs(number) + 0.1 for number in numbers[3:6]), numbers[6] % 3]], np.float32)
@@ -83,9 +101,27 @@ def test_csv_rows_are_gathered_by_scan(tmp_path: Path) -> None:
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [BOX, {**BOX, "x_m": "far"}]}), r"1, box 2: x_m is 'far'"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "x_m": 1e9}]}), r"box 1: x_m is '1000000000.0'"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "x_m": True}]}), r"box 1: x_m is 'True'"),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "x_m": 10**400}]}), r"box 1: x_m is '1000"),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "score": -(10**400)}]}), r"box 1: score is '-1000"),
+        (
+            "l.jsonl",
+            json.dumps({"scan": "a", "boxes": [{**BOX, "yaw_rad": 235}]}),
+            r"yaw_rad is 235, .* radians .* pi / 180",
+        ),
+        ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "yaw_rad": -6.5}]}), r"yaw_rad is -6\.5, .*radians"),
+        (
+            "l.csv",
+            "scan,class,x,y,z,length,width,height,yaw\na,Car,1,2,0,4,2,1,90\n",
+            r"l\.csv:2: yaw_rad is 90, .*radians",
+        ),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "width_m": 0}]}), r"box 1: width_m is 0"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [{**BOX, "class": " "}]}), r"box 1: no `class`"),
         ("l.jsonl", '{"scan": "a", "boxes": [{"class": "Car", "x": 1}]}', r"box 1: no `y_m`"),
+        (
+            "l.jsonl",
+            '{"scan": "a", "objects": [{"centroid": {}}]}',
+            r"labels of labelCloud .*`rotations\.z` \* pi / 180",
+        ),
         ("l.csv", "scan,class,x\na,Car,1\n", r"l\.csv:2: no `y_m`"),
         ("l.csv", "class,x\nCar,1\n", r"l\.csv:2: no `scan`"),
         ("l.csv", "scan,class\na,Car,1\n", r"l\.csv:2: 3 values for 2 columns"),
@@ -99,6 +135,12 @@ def test_csv_rows_are_gathered_by_scan(tmp_path: Path) -> None:
 def test_a_mistake_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         list(read_frames(write(tmp_path / name, text)))
+
+
+def test_labels_of_other_tools_are_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "000000.json", '[{"psr": {"position": {}}, "obj_type": "Car"}]')
+    with pytest.raises(DatasetError, match=r"000000\.json: labels of SUSTechPOINTS .*yaw_rad is `rotation\.z`"):
+        read_frame_file(path)
 
 
 def test_a_file_that_is_no_text_or_not_there_is_named(tmp_path: Path) -> None:

@@ -113,6 +113,7 @@ def test_the_sensor_of_kitti_has_its_pattern_and_its_car() -> None:
         ({"origin_z_m": [[0, 0], [0, 0], [0, 0]]}, "3 blocks"),
         ({"azimuth_steps": []}, "azimuth_steps"),
         ({"azimuth_counts": 9000}, "4096 firings"),
+        ({"azimuth_counts": 10**400}, "4096 firings"),
         ({"ring_gain": [1.0]}, "1 values for 64"),
         ({"ego_first_ring": []}, "ego_first_ring has 0 values, ego_beyond_ring 120"),
         ({"range_m": [9.0, 3.0]}, "lower bound"),

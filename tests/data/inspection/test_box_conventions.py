@@ -1,0 +1,129 @@
+"""Labels in other tools' conventions are told from right ones by the points in their boxes."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asca_pillars.config import Config, DataConfig
+from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
+from asca_pillars.data.inspection.box_conventions import (
+    CONVENTIONS,
+    better_convention,
+    convention_fits,
+    count_points,
+)
+from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
+from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.pillar_config import PillarModel
+from tests.data.boxes.box_scenes import write_box_dataset
+from tests.in_process import invoke
+from tests.scenes import SPEC, make_scene
+
+MIRROR, QUARTER_TURN = np.array([1, 1, 1, 1, 1, 1, -1]), np.array([0, 0, 0, 0, 0, 0, np.pi / 2])
+WRONG: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "turned by 90 degrees": lambda boxes: boxes + QUARTER_TURN,
+    "mirrored": lambda boxes: boxes * MIRROR,
+    "mirrored and turned by 90 degrees": lambda boxes: boxes * MIRROR - QUARTER_TURN,
+    "raised by half a height": lambda boxes: boxes - boxes[:, [5]] * [0, 0, 0.5, 0, 0, 0, 0],
+    "lowered by half a height": lambda boxes: boxes + boxes[:, [5]] * [0, 0, 0.5, 0, 0, 0, 0],
+}
+
+
+def swapped(boxes: np.ndarray) -> np.ndarray:
+    return boxes[:, [0, 1, 2, 4, 3, 5, 6]]
+
+
+def name_of(frames: list[tuple[np.ndarray, np.ndarray]], wrong: Callable[[np.ndarray], np.ndarray]) -> str | None:
+    """The convention that fits better, of points and boxes of several frames with the boxes made wrong."""
+    counts = [count_points(points, wrong(boxes.astype(np.float64)).astype(np.float32)) for points, boxes in frames]
+    better = better_convention(convention_fits(np.concatenate(counts, axis=1)))
+    return None if better is None else better[0].name
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[tuple[np.ndarray, np.ndarray]]:
+    return [make_scene(seed)[:2] for seed in range(12)]
+
+
+@pytest.fixture(scope="module")
+def real() -> list[tuple[np.ndarray, np.ndarray]]:
+    root = os.environ.get("ASCA_KITTI_MINI")
+    if root is None:
+        pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")
+    split = KittiSplit(root)
+    return [(split.points(one, camera_view=True), split.labeled_boxes(one).boxes) for one in split.frame_ids]
+
+
+@pytest.mark.parametrize("frames", ["scenes", "real"])
+def test_right_labels_pass_and_wrong_ones_are_told(frames: str, request: pytest.FixtureRequest) -> None:
+    given = request.getfixturevalue(frames)
+    assert name_of(given, lambda boxes: boxes) is None
+    assert {name: name_of(given, wrong) for name, wrong in WRONG.items()} == {name: name for name in WRONG}
+    assert name_of(given, swapped) == "turned by 90 degrees"
+
+
+def test_the_counts_are_those_of_the_changed_boxes(scenes: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    points, boxes = scenes[0]
+    counts = count_points(points, boxes)
+    np.testing.assert_array_equal(counts[0], points_in_boxes(points, boxes).sum(axis=0))
+    for name, wrong in WRONG.items():
+        row = [convention.name for convention in CONVENTIONS].index(name)
+        undone = wrong(boxes.astype(np.float64)).astype(np.float32)  # each but a shift undoes itself
+        if "height" not in name:
+            np.testing.assert_array_equal(counts[row], points_in_boxes(points, undone).sum(axis=0))
+    raised = boxes + boxes[:, [5]] * np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32)
+    np.testing.assert_array_equal(counts[4], points_in_boxes(points, raised).sum(axis=0))
+    assert count_points(points, boxes[:0]).shape == (6, 0)
+    assert better_convention(convention_fits(np.zeros((6, 0), np.int64))) is None
+
+
+def test_boxes_that_say_nothing_are_not_doubted() -> None:
+    """Square boxes and objects without points fit every yaw alike."""
+    rng = np.random.default_rng(0)
+    frames = []
+    for _ in range(20):
+        boxes = np.column_stack(
+            [rng.uniform(5, 40, (8, 2)), np.zeros(8), np.full((8, 2), 0.7), np.full(8, 1.8), rng.uniform(-3, 3, 8)]
+        ).astype(np.float32)
+        near = boxes[:, None, :3] + rng.uniform(-0.3, 0.3, (8, 20, 3)) * [1, 1, 3]
+        frames.append((near.reshape(-1, 3).astype(np.float32), boxes))
+    assert name_of(frames, lambda boxes: boxes) is None
+    assert name_of([(points[:0], boxes) for points, boxes in frames], lambda boxes: boxes) is None
+
+
+def rewritten(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
+    write_box_dataset(root, 12, names=("Car", "Car", "Pedestrian", "Cyclist"))
+    lines = [
+        json_line(frame.scan, records_from(change(frame.records.boxes), frame.records.types))
+        for frame in read_frames(root / "labels.jsonl")
+    ]
+    (root / "labels.jsonl").write_text("".join(lines))
+    return root
+
+
+def test_inspect_names_the_convention_and_shows_both_counts(tmp_path: Path) -> None:
+    root = rewritten(tmp_path / "data", WRONG["turned by 90 degrees"])
+    output = invoke("inspect", root, "-c", "asca_small_sim", "--split", "training")
+    assert "warning: the points fit the boxes better turned by 90 degrees:" in output
+    assert "Conventions:" in output and "as labelled" in output
+
+
+def whole(boxes: np.ndarray) -> np.ndarray:
+    """Small angles in degrees, of streets along x."""
+    return np.column_stack([boxes[:, :6], np.round(boxes[:, 6] * 2)])
+
+
+@pytest.mark.parametrize("change", [whole, lambda boxes: boxes])
+def test_whole_yaws_are_doubted(change: Callable[[np.ndarray], np.ndarray], tmp_path: Path) -> None:
+    root = rewritten(tmp_path / "data", change)
+    config = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
+    inspection = inspect_dataset(open_split(root), SPEC, config.data)
+    texts = [item.text for item in findings(inspection, SPEC, 1) if "whole numbers" in item.text]
+    assert len(texts) == (1 if change is whole else 0)
+    assert all("radians are wanted" in text and "pi / 180" in text for text in texts)
