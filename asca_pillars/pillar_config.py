@@ -10,7 +10,7 @@ from asca_pillars.pillars.pillar_spec import PillarSpec
 from asca_pillars.strict import Strict
 from asca_pillars.tables.neck_tables import MaskRule
 
-CpaReading = Literal["none", "paper", "channel", "point"]
+CpaReading = Literal["none", "paper", "channel", "point", "linear"]
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class NetworkConfig(Strict):
     """Widths and depths of the network.
 
     Attributes:
-        cpa: reading of the correlative point attention, see docs/READING.md.
+        cpa: reading of the correlative point attention, or the control `linear`, see docs/READING.md.
         pillar_channels: C, features of one pillar.
         block_channels: output channels of Block1..3 (Table 1).
         block_convs: stride-1 convolutions that follow each block's strided one (Table 1: 3).

@@ -40,7 +40,7 @@ class PaddedDetector:
     def __post_init__(self) -> None:
         if self.network.encode.point_attention is not None:
             raise ConfigError(
-                "cpa point attends among the points of a pillar; give a config with channel, paper or none"
+                "cpa point attends among the points of a pillar; give a config with linear, channel, paper or none"
             )
 
     def __call__(self, points: NDArray[np.float32]) -> Detections:

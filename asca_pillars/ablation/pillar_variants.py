@@ -89,6 +89,7 @@ VARIANTS = {
         Variant("baseline"),
         Variant("asp_k3", zones=3),
         Variant("cpa_channel", cpa="channel"),
+        Variant("cpa_linear", cpa="linear"),
         Variant("asp_k3_cpa_channel", zones=3, cpa="channel"),
         Variant("asp_k2", zones=2),
         Variant("asp_k4", zones=4),
@@ -104,6 +105,7 @@ VARIANTS = {
         Variant("asp_k3_pooled_cpa_channel_fine", zones=3, cpa="channel", map="pooled", neck="sparse"),
         Variant("cpa_channel_lower_ious", cpa="channel", person_ious=(0.35, 0.2)),
         Variant("cpa_channel_fine_lower_ious", cpa="channel", neck="sparse", person_ious=(0.35, 0.2)),
+        Variant("cpa_linear_fine_lower_ious", cpa="linear", neck="sparse", person_ious=(0.35, 0.2)),
         Variant(
             "asp_k3_pooled_cpa_channel_fine_lower_ious",
             zones=3,
@@ -135,6 +137,9 @@ PILLARS = Family(
         "Zones of the adaptive-scale pillars (K)": ("baseline", "asp_k2", "asp_k3", "asp_k4"),
         "Readings of the correlative point attention": (
             *("asp_k3", "asp_k3_cpa_paper", "asp_k3_cpa_channel", "asp_k3_cpa_point"),
+        ),
+        "Channel attention, and a linear layer that is the same for every frame": (
+            *("baseline", "cpa_linear", "cpa_channel", "cpa_linear_fine_lower_ious", "cpa_channel_fine_lower_ious"),
         ),
         "Map and neck": (
             *("cpa_channel", "asp_k3_cpa_channel", "asp_k3_pooled_cpa_channel"),

@@ -106,6 +106,8 @@ _ROWS = (
     TwoStageVariant("keypoints_256_deform", keypoints=256, deform="paper"),
     TwoStageVariant("keypoints_1024", keypoints=1024),
     TwoStageVariant("keypoints_1024_deform", keypoints=1024, deform="paper"),
+    TwoStageVariant("keypoints_2048", keypoints=2048),
+    TwoStageVariant("keypoints_2048_deform", keypoints=2048, deform="paper"),
 )
 
 TWO_STAGE = Family(
@@ -123,7 +125,7 @@ TWO_STAGE = Family(
         ),
         "Keypoints (figure 4 of Deformable PV-RCNN)": (
             *("keypoints_256", "keypoints_256_deform", "pv_rcnn", "deform_paper"),
-            *("keypoints_1024", "keypoints_1024_deform"),
+            *("keypoints_1024", "keypoints_1024_deform", "keypoints_2048", "keypoints_2048_deform"),
         ),
     },
     components=("deformation", "gate", "RoI pooling", "attention", "raw points", "box loss", "keypoints"),

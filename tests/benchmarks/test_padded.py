@@ -31,7 +31,7 @@ def network(cpa: CpaReading) -> tuple:
     return detector.eval(), spec
 
 
-@pytest.mark.parametrize("cpa", ["channel", "paper", "none"])
+@pytest.mark.parametrize("cpa", ["channel", "paper", "none", "linear"])
 @pytest.mark.parametrize(("all_pillars", "channels_last"), [(True, False), (False, True)])
 def test_padded_pillars_are_the_same_network(cpa: CpaReading, all_pillars: bool, channels_last: bool) -> None:
     detector, spec = network(cpa)

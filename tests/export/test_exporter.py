@@ -36,7 +36,7 @@ from tests.export.tiny import SCANS, tiny_checkpoint, tiny_detector
 from tests.scenes import SPEC
 
 Exports = Callable[[CpaReading], Path]
-READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point")
+READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point", "linear")
 
 
 @pytest.mark.parametrize("cpa", READINGS)

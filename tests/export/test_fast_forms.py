@@ -19,7 +19,7 @@ def padded(image: torch.Tensor) -> torch.Tensor:
     return functional.pad(image, (1, 0, 1, 0)).permute(0, 2, 3, 1)
 
 
-@pytest.mark.parametrize("cpa", ["none", "channel", "paper"])
+@pytest.mark.parametrize("cpa", ["none", "channel", "paper", "linear"])
 @torch.no_grad()
 def test_the_maximum_before_bias_and_relu(cpa: CpaReading, tmp_path: Path) -> None:
     encode = tiny_detector(cpa).encode

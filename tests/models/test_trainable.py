@@ -22,7 +22,7 @@ from tests.second_device import SecondDevice, move_weights, on_gpu
 from tests.training.test_loop import CONFIG, NETWORK
 
 PILLARS: dict[str, dict[str, Any]] = {
-    **{f"CPA {cpa}": {"cpa": cpa} for cpa in ("none", "paper", "channel", "point")},
+    **{f"CPA {cpa}": {"cpa": cpa} for cpa in ("none", "paper", "channel", "point", "linear")},
     "sparse neck": {"neck": "sparse"},
 }
 

@@ -45,7 +45,14 @@ CONFIG = Config(
 
 @pytest.mark.parametrize(
     ("cpa", "neck"),
-    [("none", "dense"), ("paper", "dense"), ("channel", "dense"), ("point", "dense"), ("channel", "sparse")],
+    [
+        ("none", "dense"),
+        ("paper", "dense"),
+        ("channel", "dense"),
+        ("point", "dense"),
+        ("linear", "dense"),
+        ("channel", "sparse"),
+    ],
 )
 def test_two_frames_are_learnt_by_heart(tmp_path: Path, cpa: CpaReading, neck: Literal["dense", "sparse"]) -> None:
     torch.manual_seed(0)

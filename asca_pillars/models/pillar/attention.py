@@ -1,7 +1,7 @@
 """Correlative point attention (CPA, section 3.2 of the paper, eq. 6-11) in the readings that its text allows.
 
 Letters: P pillars of one frame, M points, C channels, d attention width, N points of one pillar at most.
-Each reading ends with the residual connection of eq. (11).
+Each reading ends with the residual connection of eq. (11), and so does the control without attention.
 """
 
 import torch
@@ -46,7 +46,45 @@ class PaperAttention(nn.Module):
         return features + restored.T
 
 
-class ChannelAttention(nn.Module):
+class _ChannelMixing(nn.Module):
+    """Features mixed by a C x C matrix and added to themselves; `restore` has the bias."""
+
+    restore: nn.Linear
+
+    def mixing(self, features: Tensor) -> Tensor:
+        """(C, C) of the pillars (P, C) of one frame, unitless."""
+        raise NotImplementedError
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Unitless features (P, C) -> (P, C) for the pillars of one frame."""
+        device = features.device.type
+        if torch.is_autocast_enabled(device):  # differences of large sums: bfloat16 would leave little of them
+            with torch.autocast(device, enabled=False):
+                return self(features.float())
+        mixing = self.mixing(features)
+        residual = torch.eye(len(mixing), device=mixing.device)  # as part of the product it takes no pass of its own
+        return F.linear(features, mixing + residual, self.restore.bias)
+
+
+class ChannelLinear(_ChannelMixing):
+    """No attention, but the layer that `ChannelAttention` would be if it were the same for every frame.
+
+    It tells what of the attention's effect is that of one more linear layer. Training starts at the identity, near
+    which channel attention starts, too.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.restore = nn.Linear(channels, channels)
+        nn.init.zeros_(self.restore.weight)
+        nn.init.zeros_(self.restore.bias)
+
+    def mixing(self, features: Tensor) -> Tensor:
+        """(C, C), unitless, whatever the features (P, C)."""
+        return self.restore.weight
+
+
+class ChannelAttention(_ChannelMixing):
     """The same C x C attention with projections per pillar, so that order and number of pillars do not matter.
 
     Queries and keys are normalised along the pillars (cross-covariance attention, XCiT, arXiv 2106.09681), which
@@ -65,12 +103,8 @@ class ChannelAttention(nn.Module):
         self.restore = nn.Linear(channels, channels)
         self.temperature = nn.Parameter(torch.ones(1))
 
-    def forward(self, features: Tensor) -> Tensor:
-        """Unitless features (P, C) -> (P, C) for the pillars of one frame."""
-        device = features.device.type
-        if torch.is_autocast_enabled(device):  # differences of large sums: bfloat16 would leave little of them
-            with torch.autocast(device, enabled=False):
-                return self(features.float())
+    def mixing(self, features: Tensor) -> Tensor:
+        """(C, C) of the pillars (P, C) of one frame, unitless."""
         gram = features.T @ features  # (C, C)
         query, key = self.query.weight, self.key.weight
         products = query @ gram @ key.T  # of queries and keys, summed over the pillars
@@ -78,9 +112,7 @@ class ChannelAttention(nn.Module):
         key_norm = _norm((key @ gram * key).sum(dim=1))
         logits = products / (query_norm[:, None] * key_norm[None, :]) * self.temperature
         attention = torch.softmax(logits, dim=-1)  # (C, C)
-        mixing = self.restore.weight @ attention @ self.value.weight  # (C, C)
-        residual = torch.eye(len(mixing), device=mixing.device)  # as part of the product it takes no pass of its own
-        return F.linear(features, mixing + residual, self.restore.bias)
+        return self.restore.weight @ attention @ self.value.weight
 
 
 def _norm(squared: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from asca_pillars.models.map_layers import NORM_EPS, NORM_MOMENTUM
-from asca_pillars.models.pillar.attention import ChannelAttention, PaperAttention, PointAttention
+from asca_pillars.models.pillar.attention import ChannelAttention, ChannelLinear, PaperAttention, PointAttention
 from asca_pillars.models.row_product import linear_rows
 from asca_pillars.pillar_config import CpaReading
 from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
@@ -39,7 +39,7 @@ class PillarEncoder(nn.Module):
 
     Args:
         channels: C, features of one pillar.
-        cpa: reading of the attention; `point` acts before the max, `paper` and `channel` after it.
+        cpa: reading of the attention; `point` acts before the max, the others after it.
         limits: caps on pillars and points, which the `paper` and `point` readings lay their tables out for.
         empty_slots: whether a pillar with fewer points than fit also has `empty_slot` among them, before its
             normalization.
@@ -60,6 +60,8 @@ class PillarEncoder(nn.Module):
             self.pillar_attention = PaperAttention(channels, limits.max_pillars)
         elif cpa == "channel":
             self.pillar_attention = ChannelAttention(channels)
+        elif cpa == "linear":
+            self.pillar_attention = ChannelLinear(channels)
 
     def forward(
         self,

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from asca_pillars.models.pillar.attention import ChannelAttention, PaperAttention, PointAttention
+from asca_pillars.models.pillar.attention import ChannelAttention, ChannelLinear, PaperAttention, PointAttention
 
 CHANNELS = 8
 
@@ -47,6 +47,21 @@ def test_channel_reading_keeps_its_precision_in_mixed_precision_training() -> No
     with torch.autocast("cpu", torch.bfloat16):
         mixed = attention(features)
     torch.testing.assert_close(mixed, attention(features))
+
+
+def test_the_linear_control_is_channel_attention_whose_mixing_no_frame_changes() -> None:
+    control, attention = ChannelLinear(CHANNELS), ChannelAttention(CHANNELS)
+    frame, other = torch.randn(30, CHANNELS), torch.randn(20, CHANNELS)
+    torch.testing.assert_close(control(frame), frame)  # training starts at the identity
+    with torch.no_grad():
+        control.restore.weight.copy_(attention.mixing(frame))
+        control.restore.bias.copy_(attention.restore.bias)
+    torch.testing.assert_close(control(frame), attention(frame))
+    assert not torch.allclose(control(other), attention(other), atol=1e-4)
+    torch.testing.assert_close(control(torch.cat([frame, other]))[30:], control(other))
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = control(frame)
+    torch.testing.assert_close(mixed, control(frame))
 
 
 def test_channel_reading_of_silent_channels_is_finite() -> None:

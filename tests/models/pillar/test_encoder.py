@@ -8,7 +8,7 @@ from asca_pillars.pillar_config import CpaReading
 from asca_pillars.pillars.pillarize import PillarLimits
 
 LIMITS = PillarLimits(max_pillars=40, max_points=6)
-READINGS = ("none", "paper", "channel", "point")
+READINGS = ("none", "paper", "channel", "point", "linear")
 
 
 def _frame(pillars: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -74,6 +74,7 @@ def test_parameter_counts() -> None:
     pfn = 9 * 64 + 2 * 64  # linear without bias, scale and shift of the normalization
     assert count("none") == pfn
     assert count("channel") == pfn + 4 * 64 * 64 + 64 + 1  # query, key, value, restore with bias, temperature
+    assert count("linear") == pfn + 64 * 64 + 64
     assert count("point") == pfn + 4 * 64 * 64 + 64
     # Q, K, V: 12000 -> 64 with bias; restore: 64 -> 12000 with bias
     assert count("paper") == pfn + 3 * (12000 * 64 + 64) + 64 * 12000 + 12000

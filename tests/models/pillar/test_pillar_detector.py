@@ -75,7 +75,7 @@ def test_scatter_equals_a_loop_and_frames_stay_apart() -> None:
 
 def test_an_empty_frame_in_a_batch_gives_maps() -> None:
     empty = SPEC.pillarize(np.empty((0, 4), np.float32))
-    for cpa in ("none", "paper", "channel", "point"):
+    for cpa in ("none", "paper", "channel", "point", "linear"):
         maps = _detector(cpa)(batch_pillars([empty, SPEC.pillarize(_points())]))
         assert torch.isfinite(maps.scores).all() and len(maps.scores) == 2
 
