@@ -1,7 +1,6 @@
-"""One name, one file; and imports go one way."""
+"""Imports go one way."""
 
 import ast
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = (ROOT / "asca_pillars", ROOT / "deploy" / "asca_deploy", ROOT / "export" / "asca_export")
-SHARED_NAMES = {"__init__.py", "conftest.py"}
 LAYERS = (  # what is in one of them imports from those before it
     {"errors", "telemetry"},
     {"locks"},
@@ -91,9 +89,3 @@ def test_a_wrong_import_is_found(tmp_path: Path, place: str, line: str) -> None:
     path.parent.mkdir(parents=True)
     path.write_text(f"import numpy\nfrom asca_pillars.errors import AscaError\n{line}\n")
     assert len(upward(path, tmp_path / "asca_pillars")) == 1
-
-
-def test_no_two_files_have_one_name() -> None:
-    folders = (*PACKAGES, ROOT / "tests", ROOT / "benchmarks")
-    names = Counter(path.name for folder in folders for path in folder.rglob("*.py"))
-    assert {name for name, count in names.items() if count > 1} <= SHARED_NAMES

@@ -111,7 +111,9 @@ def _train(
     trainer = _trainer(config, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes)
     say = rank_zero_only(Console(markup=False, highlight=False).print)
     for name, training in ((config.data.train_set, True), (config.data.val_set, False)):
-        for warning in require_boxes(open_split(data_root, name), config, training=training):
+        split = open_split(data_root, name)
+        split.require_files()
+        for warning in require_boxes(split, config, training=training):
             say(warning, style="yellow", soft_wrap=True)
     data = DetectionData(config, data_root)
     claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights), steps_of(resumed))

@@ -62,7 +62,9 @@ def test_sums_are_medians_and_shares_are_means() -> None:
     rows["Car"][:1, COLUMNS.index(WINDOW_RETURNS)] = 0.5
     fits = fits_of(rows, "here")
     assert set(fits) == {"Car flank_end", "Car low_inside"}, "one car's windows tell nothing"
-    assert fits["Car flank_end"][0] == Fit("here", 3, pytest.approx(-0.2), pytest.approx(-0.28), pytest.approx(-0.12))
+    ends = fits["Car flank_end"][0]
+    assert (ends.source, ends.objects) == ("here", 3)
+    assert (ends.middle, ends.low, ends.high) == pytest.approx((-0.2, -0.28, -0.12))
     assert fits["Car low_inside"][0].middle == pytest.approx(0.25)
     assert "| Car flank_end | -0.20 (3) |" in fits_table(fits)
 
@@ -70,7 +72,9 @@ def test_sums_are_medians_and_shares_are_means() -> None:
 def test_a_set_may_be_as_far_off_as_the_drives_are_from_each_other() -> None:
     real = kitti_reference().statistics
     assert len(real.label_fit["Car rear_width"]) >= 3 and len(real.label_fit["Pedestrian range_50"]) == 2
-    like = {name: (Fit("this set", 100, fits[0].middle, 0.0, 0.0),) for name, fits in real.label_fit.items()}
+    like: dict[str, tuple[Fit, ...]] = {
+        name: (Fit("this set", 100, fits[0].middle, 0.0, 0.0),) for name, fits in real.label_fit.items()
+    }
     off = like | {"Car rear_width": (Fit("this set", 100, -0.2, -0.21, -0.19),)}
     records: list[ScanRecord] = []
     scan = replace(real.scan, reflectance={})
