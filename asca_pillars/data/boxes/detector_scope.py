@@ -56,6 +56,8 @@ def scope_from_json(content: Any) -> DetectorScope | None:
     try:
         (x_low, x_high), (y_low, y_high) = ranges_m
         ranges = (float(x_low), float(x_high)), (float(y_low), float(y_high))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if not all(abs(end) <= _FARTHEST_M for interval in ranges for end in interval):
         return None
     return DetectorScope(tuple(classes), ranges)

@@ -60,7 +60,10 @@ def stated_scope(path: Path, lines: Iterable[NamedRecords]) -> DetectorScope | N
     if not beside.is_file():
         return None
     try:
-        return scope_from_json(json.loads(beside.read_text(encoding="utf-8")))
+        scope = scope_from_json(json.loads(beside.read_text(encoding="utf-8")))
+        if scope is None:
+            raise ValueError("it states no classes and ranges")
+        return scope
     except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{beside}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None
 
