@@ -16,7 +16,7 @@ _Floats: TypeAlias = NDArray[np.floating[Any]]
 
 OUTSIDE_SHARE = 0.95
 FAR_M, FAR_SHARE = 1000.0, 0.05
-"""Of the points of a LiDAR's scan less than this share lies further away."""
+"""A distance, metres, and the share of a LiDAR's points that may lie further away."""
 SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
 _FRAME_STEP = 2  # of the sample; angles and ranges take longer
 
