@@ -146,7 +146,7 @@ def _prepare(path: str | Path) -> Path:
 
 
 def _make_folder(folder: Path) -> None:
-    """As `folder.mkdir(parents=True, exist_ok=True)`, which fails at a thousand folders: it calls itself for each."""
+    """Create a folder and those above it; `mkdir(parents=True)` calls itself for each and fails at a thousand."""
     missing = [folder]
     while not missing[-1].exists():
         missing.append(missing[-1].parent)

@@ -17,7 +17,7 @@ _Floats: TypeAlias = NDArray[np.floating[Any]]
 
 OUTSIDE_SHARE = 0.95
 FAR_M, FAR_SHARE = 1000.0, 0.05
-"""Of the points of a LiDAR's scan less than this share lies further away."""
+"""A distance, metres, and the share of a LiDAR's points that may lie further away."""
 BEHIND_SHARE = 0.2
 """Of the points beyond BODY_M: a revolution has about half of them behind its sensor, a view of 200 degrees a tenth."""
 BODY_M = 3.0

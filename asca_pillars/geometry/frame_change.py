@@ -68,5 +68,7 @@ class FrameChange:
 def is_rigid(matrix: NDArray[np.float64]) -> bool:
     """Whether a (4, 4) matrix is a rotation, not a mirror image, and a shift: its last row is 0 0 0 1."""
     turn = matrix[:3, :3]
-    orthogonal = bool(np.isfinite(matrix).all() and np.allclose(turn @ turn.T, np.eye(3), atol=1e-3))
-    return orthogonal and bool(np.linalg.det(turn) > 0) and np.allclose(matrix[3], [0, 0, 0, 1])
+    if not np.isfinite(matrix).all() or np.abs(turn).max() > 2:  # squares of what is larger may overflow
+        return False
+    orthogonal = np.allclose(turn @ turn.T, np.eye(3), atol=1e-3)
+    return bool(orthogonal and np.linalg.det(turn) > 0 and np.allclose(matrix[3], [0, 0, 0, 1]))

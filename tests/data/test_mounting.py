@@ -107,8 +107,9 @@ def test_a_pose_file(tmp_path: Path) -> None:
     path.write_text("one")
     with pytest.raises(ConfigError, match="16 numbers"):
         read_pose(path)
-    np.savetxt(path, np.diag([2, 2, 2, 1]))
-    with pytest.raises(ConfigError, match=r"pose\.txt: must be a rotation and a shift, without a scale"):
-        read_pose(path)
+    for scale in (2, 1e200, np.inf, np.nan):
+        np.savetxt(path, np.diag([scale, scale, scale, 1]))
+        with pytest.raises(ConfigError, match=r"pose\.txt: must be a rotation and a shift, without a scale"):
+            read_pose(path)
     with pytest.raises(ConfigError, match=r"none\.txt"):
         read_pose(tmp_path / "none.txt")

@@ -9,6 +9,8 @@ from asca_pillars.geometry.detector_spec import DetectorSpec
 
 Interval = tuple[float, float]
 
+_FARTHEST_M = 1e6  # beyond it a number is a mistake
+
 
 class DetectorScope(NamedTuple):
     """The classes of a detector, and its ranges seen from above.

@@ -1,6 +1,6 @@
-"""Compressed parts of recordings and whole compressed files, unpacked to no more than they state and than a limit.
+"""Decompression of recordings and of their chunks and messages, to no more than they state and than a limit.
 
-A few kilobytes can unpack to more than memory holds. What is large unpacked has to be large packed, too.
+A few kilobytes can decompress to more than memory holds. The limit grows with the compressed size.
 """
 
 import shutil
@@ -21,8 +21,8 @@ _BLOCK_BYTES = 2**20
 _SHOWN_BYTES = 2**28  # compressed files from this size on show their progress
 
 
-def unpack_file(source: Path) -> Path:
-    """Unpack a file of zstd into a temporary folder of its own, which the caller removes.
+def decompress_file(source: Path) -> Path:
+    """Decompress a file of zstd into a temporary folder of its own, which the caller removes.
 
     Returns:
         path of the copy, which has the name of the file without its last suffix.
@@ -32,7 +32,7 @@ def unpack_file(source: Path) -> Path:
     """
     folder = Path(tempfile.mkdtemp(prefix="asca-unpacked-"))
     try:
-        _unpack_file(source, folder / source.stem)
+        _decompress_file(source, folder / source.stem)
     except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, ScanError) or not isinstance(error, Exception):
@@ -45,8 +45,8 @@ def unpack_file(source: Path) -> Path:
     return folder / source.stem
 
 
-def unpack_zstd(data: bytes, size: int | None = None) -> bytes:
-    """A frame of zstd.
+def decompress_zstd(data: bytes, size: int | None = None) -> bytes:
+    """Decompress a frame of zstd.
 
     Args:
         data: the frame.
@@ -66,8 +66,8 @@ def unpack_zstd(data: bytes, size: int | None = None) -> bytes:
         return _within_limit(stream.read(_limit(len(data)) + 1), len(data))
 
 
-def unpack_lz4(data: bytes, size: int | None = None) -> bytes:
-    """A frame of LZ4; arguments and errors as `unpack_zstd`."""
+def decompress_lz4(data: bytes, size: int | None = None) -> bytes:
+    """Decompress a frame of LZ4; arguments and errors as `decompress_zstd`."""
     from lz4.frame import LZ4FrameDecompressor
 
     expected = _checked(size, size, len(data))
@@ -75,8 +75,8 @@ def unpack_lz4(data: bytes, size: int | None = None) -> bytes:
     return _ended(unpacker, unpacker.decompress(data, (expected or _limit(len(data))) + 1), expected, len(data))
 
 
-def unpack_bz2(data: bytes) -> bytes:
-    """A stream of bzip2; errors as `unpack_zstd`."""
+def decompress_bz2(data: bytes) -> bytes:
+    """Decompress a stream of bzip2; errors as `decompress_zstd`."""
     from bz2 import BZ2Decompressor
 
     unpacker = BZ2Decompressor()
@@ -117,8 +117,8 @@ def _within_limit(unpacked: bytes, packed_bytes: int) -> bytes:
     return unpacked
 
 
-def _unpack_file(source: Path, target: Path) -> None:
-    """Unpack as much as can be: whoever reads the copy says what is missing from its end."""
+def _decompress_file(source: Path, target: Path) -> None:
+    """Decompress as much as is whole: whoever reads the copy says what is missing from its end."""
     from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
     packed_bytes = source.stat().st_size

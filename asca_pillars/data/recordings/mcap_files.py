@@ -12,7 +12,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from asca_pillars.data.recordings.decompression import unpack_lz4, unpack_zstd
+from asca_pillars.data.recordings.decompression import decompress_lz4, decompress_zstd
 from asca_pillars.data.recordings.recording import (
     LAST_NS,
     UNKNOWN_TYPE,
@@ -31,7 +31,7 @@ _FIRST_PRIVATE = 0x80  # opcode
 _RECORD, _MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _FOOTER_BYTES = 9 + 20 + 8  # with the magic that ends the file
 _MAX_OTHER_RECORDS = 2**18
-"""Of a chunk: twice as many as there are numbers of channels and schemas."""
+"""Records of a chunk that are no messages; twice as many as there are numbers of channels and schemas."""
 _MAX_OPEN_BYTES = 2**28
 """Chunks whose messages are merged by their times hold so many bytes; beyond, messages may be out of order."""
 
@@ -237,9 +237,9 @@ class McapRecording(Recording):
         """The records of a chunk; None, and it is noted, if it cannot be unpacked or is damaged."""
         try:
             if chunk.compression == "zstd":
-                data = unpack_zstd(chunk.data, chunk.uncompressed_size)
+                data = decompress_zstd(chunk.data, chunk.uncompressed_size)
             elif chunk.compression == "lz4":
-                data = unpack_lz4(chunk.data, chunk.uncompressed_size)
+                data = decompress_lz4(chunk.data, chunk.uncompressed_size)
             elif chunk.compression == "":
                 data = chunk.data
             else:

@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any
 
-from asca_pillars.data.recordings.decompression import ZSTD_MAGIC, unpack_zstd
+from asca_pillars.data.recordings.decompression import ZSTD_MAGIC, decompress_zstd
 from asca_pillars.data.recordings.recording import Encoding, Message
 
 
@@ -18,7 +18,7 @@ def decoded(message: Message, kind: str) -> Any:
         return store.deserialize_ros1(message.data, kind)
     # No CDR begins so. rosbag2 says in its metadata.yaml alone that it compressed the messages.
     is_compressed = message.data.startswith(ZSTD_MAGIC)
-    return store.deserialize_cdr(unpack_zstd(message.data) if is_compressed else message.data, kind)
+    return store.deserialize_cdr(decompress_zstd(message.data) if is_compressed else message.data, kind)
 
 
 def time_of(header: Any, message: Message) -> int | None:

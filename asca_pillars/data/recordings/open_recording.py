@@ -5,7 +5,7 @@ import weakref
 from collections.abc import Callable
 from pathlib import Path
 
-from asca_pillars.data.recordings.decompression import ZSTD_SUFFIXES, unpack_file
+from asca_pillars.data.recordings.decompression import ZSTD_SUFFIXES, decompress_file
 from asca_pillars.data.recordings.mcap_files import McapRecording
 from asca_pillars.data.recordings.recording import Recording
 from asca_pillars.data.recordings.ros_bags import RosBag
@@ -88,7 +88,7 @@ def _open_file(path: Path) -> Recording:
         reader = _READERS[_recorded_suffix(path)]
         if path.suffix.lower() not in ZSTD_SUFFIXES:
             return reader(path, None)
-        copy = unpack_file(path)
+        copy = decompress_file(path)
         try:
             recording = reader(path, copy)
         except BaseException:

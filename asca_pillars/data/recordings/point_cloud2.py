@@ -18,7 +18,7 @@ class PointCloud(NamedTuple):
 
     points: StoredPoints
     time_ns: int
-    """Of the header; where that says 0 or less, when the message was recorded; 0, with a remark, if that is unknown."""
+    """The header's time, or if that is 0 or less the recording's; 0, with a remark, if neither is usable."""
     frame_id: str
 
 

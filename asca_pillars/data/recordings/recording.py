@@ -13,7 +13,7 @@ Encoding = Literal["cdr", "ros1"]
 
 
 UNKNOWN_TYPE = "unknown"
-"""Of a topic without a schema."""
+"""The type of a topic without a schema."""
 SEVERAL_TYPES = "several types"
 LAST_NS = 2**63 - 1
 """The latest time that is usable: in 2262."""
@@ -88,7 +88,7 @@ class Recording(ABC):
         return filled[0]
 
     def _remedy(self, topics: Sequence[Topic]) -> str:
-        """What to do where none of these topics is read."""
+        """The advice where none of these topics is read."""
         for topic in topics:
             if conversion := conversion_of(topic.type):
                 return f"the scans are recorded as {topic.type}, which is not read: {conversion}"

@@ -7,7 +7,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from asca_pillars.data.recordings.decompression import unpack_bz2, unpack_lz4
+from asca_pillars.data.recordings.decompression import decompress_bz2, decompress_lz4
 from asca_pillars.data.recordings.recording import SEVERAL_TYPES, Message, Recording, Topic, reason
 from asca_pillars.errors import ScanError
 
@@ -72,12 +72,12 @@ class RosBag(Recording):
 
 
 def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
-    """What unpacks a chunk to no more than a limit, in the place of what the library would use."""
+    """A function that decompresses a chunk up to a limit, for the one that the library would use."""
     from rosbags.rosbag1.reader import Compression, decompressors
 
     bounded: dict[str, Callable[[bytes], bytes]] = {
-        Compression.BZ2.value: unpack_bz2,
-        Compression.LZ4.value: unpack_lz4,
+        Compression.BZ2.value: decompress_bz2,
+        Compression.LZ4.value: decompress_lz4,
     }
     return next((bounded[name] for name in bounded if decompressors[name] is chunk.decompressor), chunk.decompressor)
 

@@ -15,14 +15,14 @@ _KEY = "rosbag2_bagfile_information"
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """What a metadata.yaml says, as far as it can be read: names of files, and messages of each topic."""
+    """The names of files and the number of messages of each topic, as far as a metadata.yaml states them."""
 
     files: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_metadata(folder: Path) -> BagMetadata | None:
-    """What the folder's metadata.yaml says; None if there is none, or one of something else than rosbag2."""
+    """Read the folder's metadata.yaml; None if there is none, or one of something else than rosbag2."""
     path = folder / METADATA_FILE
     if not path.is_file():
         return None

@@ -19,5 +19,5 @@ _CONVERSIONS = (
 
 
 def conversion_of(type_name: str) -> str | None:
-    """How scans of a type become PointCloud2; None if it is not known to hold scans."""
+    """Advice on making PointCloud2 of scans of a type; None if it is not known to hold scans."""
     return next((remedy for pattern, remedy in _CONVERSIONS if re.fullmatch(pattern, type_name)), None)

@@ -75,7 +75,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def _folder_identity(folder: Path) -> tuple[int, int]:
-    """What is the same on all paths to a folder; resolving a path of a thousand folders takes milliseconds."""
+    """The device and number of a folder, the same on all paths to it; resolving a deep path takes milliseconds."""
     status = folder.stat()
     return status.st_dev, status.st_ino
 

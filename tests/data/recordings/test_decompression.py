@@ -1,4 +1,4 @@
-"""What compressed parts of recordings unpack to, and traps among them; files of rosbag2 without their folder."""
+"""Compressed messages, chunks and files, decompression bombs, and files of rosbag2 without their folder."""
 
 import bz2
 import gc
@@ -21,12 +21,12 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from asca_pillars.data.recordings import decompression
-from asca_pillars.data.recordings.decompression import unpack_bz2, unpack_lz4, unpack_zstd
+from asca_pillars.data.recordings.decompression import decompress_bz2, decompress_lz4, decompress_zstd
 from asca_pillars.data.recordings.open_recording import is_recording, open_recording
 from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.errors import ScanError
 from tests.data.recordings.cloud_recordings import CLOUD, cloud_points, clouds, stamps, store, write_mcap
-from tests.data.recordings.traps import zstd_zeros
+from tests.data.recordings.decompression_bombs import zstd_zeros
 
 DATA = np.random.default_rng(0).integers(0, 9, 300_000, np.uint8).tobytes()
 
@@ -35,9 +35,9 @@ def test_what_was_packed_comes_back() -> None:
     packer = zstandard.ZstdCompressor().compressobj()
     unsized = packer.compress(DATA) + packer.flush()
     for packed in (zstandard.compress(DATA), unsized):
-        assert unpack_zstd(packed) == unpack_zstd(packed, len(DATA)) == DATA
-    assert unpack_lz4(lz4.frame.compress(DATA)) == unpack_lz4(lz4.frame.compress(DATA), len(DATA)) == DATA
-    assert unpack_bz2(bz2.compress(DATA)) == DATA
+        assert decompress_zstd(packed) == decompress_zstd(packed, len(DATA)) == DATA
+    assert decompress_lz4(lz4.frame.compress(DATA)) == decompress_lz4(lz4.frame.compress(DATA), len(DATA)) == DATA
+    assert decompress_bz2(bz2.compress(DATA)) == DATA
 
 
 @pytest.mark.parametrize("size", [len(DATA) - 1, len(DATA) + 1, 0, 2**40])
@@ -45,29 +45,29 @@ def test_another_size_than_the_stated_one_is_an_error(size: int) -> None:
     packer = zstandard.ZstdCompressor().compressobj()
     for packed in (zstandard.compress(DATA), packer.compress(DATA) + packer.flush()):
         with pytest.raises((ValueError, zstandard.ZstdError)):
-            unpack_zstd(packed, size)
+            decompress_zstd(packed, size)
     with pytest.raises(ValueError):
-        unpack_lz4(lz4.frame.compress(DATA), size)
+        decompress_lz4(lz4.frame.compress(DATA), size)
 
 
-def test_traps_are_unpacked_to_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decompression_bombs_are_stopped_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decompression, "MAX_BYTES", 2**20)
     zeros = bytes(2**24)
-    for trap in (zstd_zeros(2**33, stated=True), zstd_zeros(2**33, stated=False)):
+    for bomb in (zstd_zeros(2**33, stated=True), zstd_zeros(2**33, stated=False)):
         with pytest.raises(ValueError, match=r"\d+ bytes (state that they )?unpack to"):
-            unpack_zstd(trap)
+            decompress_zstd(bomb)
     with pytest.raises(ValueError, match="unpack to more than"):
-        unpack_lz4(lz4.frame.compress(zeros))
+        decompress_lz4(lz4.frame.compress(zeros))
     with pytest.raises(ValueError, match="unpack to more than"):
-        unpack_bz2(bz2.compress(zeros))
+        decompress_bz2(bz2.compress(zeros))
 
 
 def test_torn_streams_are_errors() -> None:
-    for unpack, packed in ((unpack_lz4, lz4.frame.compress(DATA)), (unpack_bz2, bz2.compress(DATA))):
+    for unpack, packed in ((decompress_lz4, lz4.frame.compress(DATA)), (decompress_bz2, bz2.compress(DATA))):
         with pytest.raises(ValueError, match="end is missing"):
             unpack(packed[:-8])
     with pytest.raises(zstandard.ZstdError):
-        unpack_zstd(zstandard.compress(DATA)[:-8])
+        decompress_zstd(zstandard.compress(DATA)[:-8])
 
 
 # --- rosbag2
@@ -105,7 +105,7 @@ def test_files_without_their_folder(tmp_path: Path, storage: str, mode: str) -> 
 def test_what_the_user_unpacked_is_read_instead(tmp_path: Path) -> None:
     folder = rosbag2(tmp_path / "bag", "SQLITE3", "FILE")
     packed = folder / "bag.db3.zstd"
-    (folder / "bag.db3").write_bytes(unpack_zstd(packed.read_bytes()))
+    (folder / "bag.db3").write_bytes(decompress_zstd(packed.read_bytes()))
     packed.write_bytes(b"no longer needed")
     assert len(scans(folder)) == 3
     packed.unlink()

@@ -1,4 +1,4 @@
-"""MCAP files as other writers leave them, damaged ones, and traps."""
+"""MCAP files as other writers leave them, damaged ones, and decompression bombs."""
 
 import struct
 import zlib
@@ -19,7 +19,7 @@ from asca_pillars.data.recordings.recorded_scans import RecordedScans
 from asca_pillars.data.recordings.recording import Recording, Topic
 from asca_pillars.errors import ScanError
 from tests.data.recordings.cloud_recordings import CLOUD, cloud_points, clouds, stamps, store, write_mcap
-from tests.data.recordings.traps import zstd_zeros
+from tests.data.recordings.decompression_bombs import zstd_zeros
 
 WRITERS: dict[str, dict[str, Any]] = {
     "all": {},
@@ -121,7 +121,7 @@ def test_times_that_no_clock_shows_are_none(tmp_path: Path, time_ns: int) -> Non
     assert scans[0].scan is not None and scans[0].scan.notes.remarks == ()
 
 
-# --- traps
+# --- decompression bombs
 
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -187,7 +187,7 @@ def test_what_fills_a_chunk_hides_no_message(tmp_path: Path, filling: bytes) -> 
     assert [one.data for one in recording.messages("/lidar")] == [b"data"]
 
 
-def test_a_summary_that_begins_with_the_data_is_no_trap(tmp_path: Path) -> None:
+def test_chunks_within_the_summary_are_not_decompressed(tmp_path: Path) -> None:
     """The library would unpack the chunks there as if they belonged to the summary."""
     content = with_chunk(zstd_zeros(2**33, stated=True), compression="zstd", size=2**33)
     (tmp_path / "a.mcap").write_bytes(content.removesuffix(footer(0)) + footer(8))
