@@ -11,12 +11,11 @@ from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import ConfigError, DatasetError
-from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
+from asca_pillars.evaluation.gallery import INDEX as GALLERY_INDEX
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
-from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
 from asca_pillars.evaluation.predictions import ScoredFrames, write_predictions
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.evaluation.waymo import waymo_detection
@@ -30,7 +29,6 @@ from asca_pillars.system import describe_environment
 Protocol = Literal["kitti", "waymo"]
 
 TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
-GALLERY = 8
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,8 @@ def run_model(
     about = {"model": model.about, "data": str(split.root), "split": split.name}
     with atomic_directory(out / "predictions", COMMAND, MADE_BY) as folder:
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
-        write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
+        files = sorted(path.name for path in folder.iterdir())
+        write_json(folder / MADE_BY, about | {"scores": scores, "files": files})
     warn_of_unlike_scans(model, len(split.frame_ids), console)
     subject = f"{model.name} on {split.root}, {split.name}"
     return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
@@ -146,21 +145,9 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     report = KittiReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     page = ReportPage(report.title, kitti_tables(report), kitti_notes(report))
     write_report("report", page, kitti_json(report), out, json_path, task.predictions, console)
-    remove_directory(out / "gallery", COMMAND, gallery.INDEX)
+    remove_directory(out / "gallery", COMMAND, GALLERY_INDEX)
     if missing_modules("eval"):
         (out / "curves.png").unlink(missing_ok=True)
         console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
     else:
         write_curves(out / "curves.png", ap.overall, report.title)
-
-
-def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:
-    """Draw the `count` frames with the most errors below `out`, if there are scans to draw."""
-    count = GALLERY if count is None else count
-    if task.split is None or count == 0:
-        return
-    judged = matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
-    worst = gallery.worst_frames(judged, count)
-    folders = task.split, task.labels, task.predictions
-    with atomic_directory(out / "gallery", COMMAND, gallery.INDEX) as folder:
-        gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)
