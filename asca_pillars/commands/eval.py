@@ -53,6 +53,14 @@ def evaluate(
         int | None,
         typer.Option("--gallery", min=0, help="Worst frames to draw. Default: 8 if there are scans (--data)."),
     ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare",
+            help="Predictions of another detector, such as predictions/ of another evaluation: the gallery shows the "
+            "frames in which the two differ most, side by side.",
+        ),
+    ] = None,
     score: Annotated[
         float | None,
         typer.Option(
@@ -116,6 +124,7 @@ def evaluate(
     from asca_pillars.commands.eval_arguments import EvalArguments, check_arguments, default_protocol
     from asca_pillars.commands.eval_errors import prepare_errors, who_predicted
     from asca_pillars.commands.eval_files import claim
+    from asca_pillars.commands.eval_gallery import draw_gallery
     from asca_pillars.commands.models import open_model
     from asca_pillars.data.kitti import KittiSplit
     from asca_pillars.evaluation.predictions import read_predictions, read_truth
@@ -123,10 +132,15 @@ def evaluate(
     console = Console(markup=False)
     protocol = protocol or default_protocol(data)
     options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
+<<<<<<< HEAD
     given = EvalArguments(
         protocol, model, data, split, predictions, labels, gallery, score, min_score, around, errors, errors_by, beside
     )
     check_arguments(given, options)
+=======
+    sources = model, data, split, predictions, labels
+    check_arguments(EvalArguments(protocol, *sources, out, gallery, compare, score, min_score, around), options)
+>>>>>>> evaluation
     split = "val" if split is None else split
     if protocol == "tracking":
         from asca_pillars.commands.eval_tracks import evaluate_tracks
@@ -168,7 +182,11 @@ def evaluate(
     else:
         steps.check_classes(task, frames)
         steps.report_kitti(task, frames, out, json, console)
+<<<<<<< HEAD
         steps.draw_gallery(task, frames, out, gallery, console)
         if analysis is not None:
             steps.analyze_errors(analysis, task, frames, out, console)
+=======
+        draw_gallery(task, frames, out, gallery, compare, console)
+>>>>>>> evaluation
     console.print(f"Written to {out}/", highlight=False)

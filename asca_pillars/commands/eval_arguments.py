@@ -21,7 +21,9 @@ class EvalArguments:
     split: str | None
     predictions: Path | None
     labels: Path | None
+    out: Path
     gallery: int | None
+    compare: Path | None
     score: float | None
     min_score: float
     around: bool
@@ -115,6 +117,8 @@ def _check_no_text(given: EvalArguments) -> None:
         raise ConfigError(
             f"--gallery {given.gallery} belongs to --protocol kitti; `asca detect` draws scans with boxes"
         )
+    if given.compare is not None:
+        raise ConfigError(f"--compare {given.compare} belongs to the gallery of --protocol kitti; leave it out")
 
 
 def _check_kitti(given: EvalArguments) -> None:
@@ -132,6 +136,19 @@ def _check_kitti(given: EvalArguments) -> None:
         raise ConfigError(
             f"--protocol {given.protocol}: {given.data} has no camera, which it needs; choose iou or distance"
         )
+    if given.compare is not None:
+        _check_compare(given.compare, given)
     if given.protocol == "waymo" and (given.gallery or given.score is not None):
         option = f"--gallery {given.gallery}" if given.gallery else f"--score {given.score:g}"
         raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
+
+
+def _check_compare(compare: Path, given: EvalArguments) -> None:
+    if given.protocol != "kitti":
+        raise ConfigError(f"--compare {compare} belongs to the gallery of --protocol kitti; leave it out")
+    if given.data is None or given.gallery == 0:
+        why = "give --data ROOT that has them" if given.data is None else "leave --gallery 0 out"
+        raise ConfigError(f"--compare {compare} draws scans: {why}")
+    replaced = (given.out / "predictions").resolve()
+    if replaced in (compare.resolve(), *compare.resolve().parents):
+        raise ConfigError(f"--compare {compare}: this evaluation writes there; give it another --out")

@@ -16,13 +16,15 @@ from asca_pillars.commands.models import Model
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import ConfigError, DatasetError
-from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.curves import write_curves
+<<<<<<< HEAD
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
+=======
+from asca_pillars.evaluation.gallery import INDEX as GALLERY_INDEX
+>>>>>>> evaluation
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
-from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
 from asca_pillars.evaluation.predictions import ScoredFrames, write_predictions
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.evaluation.waymo import waymo_detection
@@ -37,7 +39,6 @@ from asca_pillars.system import describe_environment
 Protocol = Literal["kitti", "waymo"]
 
 TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
-GALLERY = 8
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,8 @@ def run_model(
     about = {"model": model.about, "data": str(split.root), "split": split.name}
     with atomic_directory(out / "predictions", *PREDICTIONS_FOLDER) as folder:
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, console=console)
-        write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
+        files = sorted(path.name for path in folder.iterdir())
+        write_json(folder / MADE_BY, about | {"scores": scores, "files": files})
     warn_of_unlike_scans(model, len(split.frame_ids), console)
     subject = f"{model.name} on {split.root}, {split.name}"
     return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
@@ -169,12 +171,17 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     report = KittiReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     page = ReportPage(report.title, kitti_tables(report), kitti_notes(report))
     write_report("report", page, kitti_json(report), out, json_path, task.predictions, console)
+<<<<<<< HEAD
     remove_directory(out / "gallery", *GALLERY_FOLDER)
     require_own_file(out / CURVES, COMMAND, is_own_picture)
+=======
+    remove_directory(out / "gallery", COMMAND, GALLERY_INDEX)
+>>>>>>> evaluation
     if missing_modules("eval"):
         (out / CURVES).unlink(missing_ok=True)
         console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
     else:
+<<<<<<< HEAD
         write_curves(out / CURVES, ap.overall, report.title)
 
 
@@ -199,3 +206,6 @@ def analyze_errors(analysis: ErrorAnalysis, task: Task, frames: ScoredFrames, ou
     read = KittiErrorFrames(task.split, task.labels, task.predictions, tuple(scores), frame_ids)
     about = task.about | {"environment": describe_environment()}
     report_errors(analysis, read, scores, task.subject, about, out, console)
+=======
+        write_curves(out / "curves.png", ap.overall, report.title)
+>>>>>>> evaluation

@@ -1,4 +1,7 @@
-"""The worst frames as pictures: what was missed and what was seen where nothing is, from above and on the image."""
+"""Frames as pictures: what was missed and what was seen where nothing is, from above and on the image.
+
+Of one detector the worst frames; of two those in which they differ most, side by side.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +18,7 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
 from asca_pillars.files import write_text
 from asca_pillars.geometry.ranges import Ranges
+<<<<<<< HEAD
 from asca_pillars.own_files import page_end
 from asca_pillars.pictures.drawing import Color, Image
 from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, read_image, write_png
@@ -22,11 +26,28 @@ from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image
 INDEX = "index.md"
 INDEX_END = page_end("asca eval")
 _INTRODUCTION = """# {title}: worst frames
+=======
+from asca_pillars.pictures.drawing import BACKGROUND, Color, Image, Texts
+from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, read_image, write_png
 
-The frames with most misses and false detections at the fixed score, by KITTI's moderate difficulty. A false detection
-may well stand on an object: to find it, its 3D overlap must exceed 0.7 for cars and 0.5 for the others. Objects beyond
-the difficulty's limits are not counted, and what only touches them or DontCare areas is ignored.
+INDEX = "index.md"
+_INTRODUCTION = """# {title}: {which}
+>>>>>>> evaluation
+
+{chosen}
+A false detection may well stand on an object: to find it, its 3D overlap must exceed 0.7 for cars and 0.5 for the
+others. Objects beyond the difficulty's limits are not counted, and what only touches them or DontCare areas is ignored.
 """
+_WORST = {
+    "which": "worst frames",
+    "chosen": "The frames with most misses and false detections at the fixed score, by KITTI's moderate difficulty.",
+}
+_DIFFERENT = {
+    "which": "where they differ most",
+    "chosen": "The frames with most objects that only one of the two finds, and the largest difference of false\n"
+    "detections, each at its fixed score, by KITTI's moderate difficulty.",
+}
+_HEADING_PX = 34
 
 
 @dataclass(frozen=True)
@@ -48,20 +69,48 @@ _NOT_COUNTED = _Kind("not counted", (150, 150, 150), "", 2)
 _IGNORED = _Kind("ignored", (200, 160, 60), "", 3)
 
 
+Matches = Sequence[ScoreMatches]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A detector: its name, the folder of its predictions as KITTI text, and how they match the labels."""
+
+    name: str
+    predictions: Path
+    frames: Matches
+
+
 def worst_frames(frames: Sequence[ScoreMatches], count: int) -> list[ScoreMatches]:
     """The `count` frames with most misses and false detections, worst first; frames without any are left out."""
     wrong = [frame for frame in frames if frame.errors]
     return sorted(wrong, key=lambda frame: (-frame.errors, frame.frame_id))[:count]
 
 
+def most_different_frames(first: Matches, second: Matches, count: int) -> list[tuple[ScoreMatches, ScoreMatches]]:
+    """The matches of two detectors in the `count` frames in which they differ most, the most different first.
+
+    Frames that one of them lacks, and those without any difference, are left out.
+    """
+    there = {frame.frame_id: frame for frame in second}
+    pairs = [(frame, there[frame.frame_id]) for frame in first if frame.frame_id in there]
+    different = [pair for pair in pairs if _difference(*pair)]
+    return sorted(different, key=lambda pair: (-_difference(*pair), pair[0].frame_id))[:count]
+
+
+def _difference(first: ScoreMatches, second: ScoreMatches) -> int:
+    """How many objects only one of the two finds, and how many more false detections one of them has."""
+    found = np.logical_xor(first.found, second.found).sum()
+    return int(found) + abs(int(first.false_positive.sum()) - int(second.false_positive.sum()))
+
+
 def write_gallery(
     folder: str | Path,
-    frames: Sequence[ScoreMatches],
+    detectors: Sequence[Judged],
+    count: int,
     split: KittiSplit,
     labels: str | Path,
-    predictions: str | Path,
     ranges: Ranges,
-    title: str,
     *,
     console: Console | None = None,
 ) -> None:
@@ -69,16 +118,17 @@ def write_gallery(
 
     Args:
         folder: for the pictures.
-        frames: their matches, in the order in which the pictures are numbered.
+        detectors: one, whose worst frames are drawn, or two, of which the frames that differ most are.
+        count: of the frames, at most.
         split: the scans, calibrations and images.
-        labels, predictions: the folders of KITTI text that were judged.
+        labels: the folder of KITTI text that they were judged by.
         ranges: what the pictures show.
-        title: what was evaluated, for index.md.
         console: shows the progress.
 
     Raises:
         DatasetError, ScanError: a frame's scan, calibration or text cannot be read.
     """
+<<<<<<< HEAD
     rows = [_INTRODUCTION.format(title=title), "| frame | missed | false |", "| --- | ---: | ---: |"]
     bar = track(frames, "Drawing", console=console, disable=console is None)
     for rank, frame in enumerate(bar, start=1):
@@ -86,15 +136,57 @@ def write_gallery(
         write_png(Path(folder) / name, _draw(frame, split, Path(labels), Path(predictions), ranges))
         rows.append(f"| [{frame.frame_id}]({name}) | {frame.missed.sum()} | {frame.false_positive.sum()} |")
     write_text(Path(folder) / INDEX, "\n".join([*rows, ""]) + INDEX_END)
+=======
+    if len(detectors) == 1:
+        chosen: list[tuple[ScoreMatches, ...]] = [(frame,) for frame in worst_frames(detectors[0].frames, count)]
+        words, heads = _WORST, ["missed", "false"]
+    else:
+        first, second = detectors
+        chosen = [*most_different_frames(first.frames, second.frames, count)]
+        words, heads = _DIFFERENT, [f"{kind}, {one.name}" for one in detectors for kind in ("missed", "false")]
+    title = " and ".join(one.name for one in detectors)
+    rows = [
+        _INTRODUCTION.format(title=title, **words),
+        f"| frame | {' | '.join(heads)} |",
+        f"| --- |{' ---: |' * len(heads)}",
+    ]
+    bar = track(chosen, "Drawing", console=console, disable=console is None)
+    for rank, matches in enumerate(bar, start=1):
+        frame_id = matches[0].frame_id
+        name = f"{rank:03d}_{frame_id}.png"
+        write_png(Path(folder) / name, _draw(matches, detectors, split, Path(labels), ranges))
+        counts = [f"{kind.sum()}" for one in matches for kind in (one.missed, one.false_positive)]
+        rows.append(f"| [{frame_id}]({name}) | {' | '.join(counts)} |")
+    with atomic_path(Path(folder) / INDEX) as temporary:
+        temporary.write_text("\n".join([*rows, ""]), encoding="utf-8")
+>>>>>>> evaluation
 
 
-def _draw(frame: ScoreMatches, split: KittiSplit, labels: Path, predictions: Path, ranges: Ranges) -> Image:
-    frame_id = frame.frame_id
+def _draw(
+    matches: Sequence[ScoreMatches], detectors: Sequence[Judged], split: KittiSplit, labels: Path, ranges: Ranges
+) -> Image:
+    frame_id = matches[0].frame_id
     calibration = split.calibration(frame_id)
     points = read_scan(split.scan_path(frame_id)).points
     points = points[in_image(points, calibration, split.image_size_wh(frame_id))]
-    truth, found = (read_labels(folder / f"{frame_id}.txt") for folder in (labels, predictions))
-    layers = [
+    image = read_image(split.image_path(frame_id))
+    truth = read_labels(labels / f"{frame_id}.txt")
+    found = [read_labels(detector.predictions / f"{frame_id}.txt") for detector in detectors]
+    layers = [_layers(one, truth, own, calibration) for one, own in zip(matches, found, strict=True)]
+    every_box = np.concatenate([layer.boxes for own in layers for layer in own])
+    panels = []
+    for detector, own in zip(detectors, layers, strict=True):
+        panel = draw_layers(points, own, ranges, room_for=every_box)
+        if image is not None:
+            panel = _below(panel, _draw_on(image, own, calibration))
+        panels.append(panel if len(detectors) == 1 else _headed(panel, detector.name))
+    return np.hstack(panels)
+
+
+def _layers(
+    frame: ScoreMatches, truth: Sequence[KittiObject], found: Sequence[KittiObject], calibration: Calibration
+) -> list[BoxLayer]:
+    return [
         _layer(_MISSED, truth, frame.missed, calibration),
         _layer(_FALSE, found, frame.false_positive, calibration),
         _layer(_FOUND, truth, frame.found, calibration),
@@ -102,9 +194,18 @@ def _draw(frame: ScoreMatches, split: KittiSplit, labels: Path, predictions: Pat
         _layer(_NOT_COUNTED, truth, frame.not_counted, calibration),
         _layer(_IGNORED, found, frame.ignored, calibration),
     ]
-    picture = draw_layers(points, layers, ranges)
-    image = read_image(split.image_path(frame_id))
-    return picture if image is None else _below(picture, _draw_on(image, layers, calibration))
+
+
+def _headed(picture: Image, text: str) -> Image:
+    """The picture below a line of text, its end if there is no room for all, and with a border on its right."""
+    bar = np.full((_HEADING_PX, picture.shape[1], 3), BACKGROUND, np.uint8)
+    texts = Texts(bar, 0.6)
+    while texts.size(text)[0] > picture.shape[1] - 32:
+        text = f"...{text[4:]}"
+    texts.put(text, [(16, _HEADING_PX - 11)], (255, 255, 255))
+    headed = np.vstack([bar, picture])
+    headed[:, -2:] = 90
+    return headed.astype(np.uint8)
 
 
 def _layer(

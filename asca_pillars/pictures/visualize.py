@@ -107,15 +107,24 @@ def draw_bev(
 
 
 def draw_layers(
-    points: NDArray[np.floating], layers: Sequence[BoxLayer], ranges: Ranges, *, width_px: int = 1000
+    points: NDArray[np.floating],
+    layers: Sequence[BoxLayer],
+    ranges: Ranges,
+    *,
+    width_px: int = 1000,
+    room_for: NDArray[np.floating] | None = None,
 ) -> Image:
     """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend.
 
-    Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR.
+    Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR. With the same boxes (K, 7) as
+    `room_for` several pictures of a scan show the same part of it, whatever is drawn in each.
     """
     points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
-    view = View.around(np.concatenate([points[:, :2], *(o.reshape(-1, 2) for o in outlines)]), ranges, width_px)
+    corners = [outline.reshape(-1, 2) for outline in outlines]
+    if room_for is not None:
+        corners.append(footprints(np.asarray(room_for, dtype=np.float64).reshape(-1, 7)).reshape(-1, 2))
+    view = View.around(np.concatenate([points[:, :2], *corners]), ranges, width_px)
 
     canvas = np.full((view.height_px, view.width_px, 3), BACKGROUND, np.uint8)
     texts = Texts(canvas, 0.42 * OVERSAMPLING)

@@ -54,6 +54,7 @@ def evaluate(
     out: Path,
     json_path: Path | None = None,
     gallery: int | None = 0,
+    compare: Path | None = None,
     score: float | None = None,
     min_score: float = 0.05,
     provider: str = "cpu",
@@ -72,6 +73,7 @@ def evaluate(
         out=out,
         json=json_path,
         gallery=gallery,
+        compare=compare,
         score=score,
         min_score=min_score,
         protocol=protocol,
@@ -137,6 +139,28 @@ def test_predictions_with_a_dataset_are_scored_on_its_split_and_drawn(
     assert {path.name for path in (tmp_path / "out" / "gallery").iterdir()} == {"001_000002.png", "index.md"}
 
 
+def test_another_detector_is_drawn_beside_the_first(
+    tmp_path: Path, root: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, other, out = texts["predictions"], tmp_path / "other", tmp_path / "out"
+    shutil.copytree(found, other)
+    compared = {"predictions": found, "data": root, "out": out, "gallery": None, "compare": other}
+    evaluate(**compared)
+    assert {path.name for path in (out / "gallery").iterdir()} == {"index.md"}, "they are the same"
+    # As an evaluation of a model leaves it, whose scores of cars do not reach its own threshold.
+    about = {"model": {"name": "newer"}, "scores": {"Car": 0.95, "Pedestrian": 0.3, "Cyclist": 0.3}, "files": []}
+    (other / "made_by.json").write_text(json.dumps(about))
+    (other / "000001.txt").unlink()
+    capsys.readouterr()
+    evaluate(**compared)
+    assert {path.name for path in (out / "gallery").iterdir()} == {"001_000002.png", "index.md"}
+    index = (out / "gallery" / "index.md").read_text()
+    assert index.startswith(f"# {found} and newer: where they differ most\n")
+    assert "| [000002](001_000002.png) | 0 | 0 | 2 | 0 |\n" in index
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"--compare {other}: evaluated on 1 of 2 frames: no prediction file for 000001" in said
+
+
 def test_the_shipped_bundle_and_its_predictions_score_the_same(
     tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,6 +178,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
     assert lines and all(float(line.split()[15]) >= 0.05 for line in lines)
     assert len(list((out / "gallery").glob("*.png"))) == 1
     assert "2 of 2 scans are unlike those that asca_sim_int8 was trained on" in capsys.readouterr().out
+    assert json.loads((out / "predictions" / "made_by.json").read_text())["scores"] == own
     again = evaluate(predictions=out / "predictions", data=root, out=tmp_path / "again")
     for key in ("results", "bands", "best_scores"):  # text has no thresholds of its own
         assert again[key] == report[key]
@@ -204,6 +229,17 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
         "b and --predictions det: give a model or its predictions, not both"
     )
     assert refusal(tmp_path, **texts, gallery=3) == "--gallery 3 draws scans: give --data ROOT that has them"
+    other = tmp_path / "out" / "predictions"
+    assert refusal(tmp_path, **texts, compare=det) == "--compare det draws scans: give --data ROOT that has them"
+    assert refusal(tmp_path, **texts, data=root, compare=det, gallery=0) == (
+        "--compare det draws scans: leave --gallery 0 out"
+    )
+    assert refusal(tmp_path, data=root, compare=other, gallery=None) == (
+        "--compare out/predictions: this evaluation writes there; give it another --out"
+    )
+    assert refusal(tmp_path, **texts, data=root, compare=det, protocol="waymo") == (
+        "--compare det belongs to the gallery of --protocol kitti; leave it out"
+    )
     assert refusal(tmp_path, **texts, score=float("nan")) == "--score nan must be a number"
     assert refusal(tmp_path, **texts, split="val") == (
         "--split val is a list of the frames of a dataset: give --data ROOT, too"

@@ -8,7 +8,7 @@ import pytest
 
 from asca_pillars.data.kitti import KittiSplit, read_labels, write_labels
 from asca_pillars.data.kitti.kitti_labels import KittiObject
-from asca_pillars.evaluation.gallery import worst_frames, write_gallery
+from asca_pillars.evaluation.gallery import Judged, most_different_frames, worst_frames, write_gallery
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches, matches_at_score
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from tests.scenes import GRID, write_dataset
@@ -37,17 +37,16 @@ def root(tmp_path: Path) -> Path:
     return root
 
 
-def judge(root: Path) -> list[ScoreMatches]:
+def judge(root: Path, predictions: str = "det") -> list[ScoreMatches]:
     labels = root / "training" / "label_2"
-    frames = read_predictions(root.parent / "det", read_truth(labels), labels)
+    frames = read_predictions(root.parent / predictions, read_truth(labels), labels)
     return matches_at_score(frames.truth, frames.detections, CLASSES, scores=0.3)
 
 
-def draw(root: Path, worst: list[ScoreMatches]) -> Path:
+def draw(root: Path, count: int, *others: Judged) -> Path:
     folder = root.parent / "gallery"
-    write_gallery(
-        folder, worst, KittiSplit(root), root / "training" / "label_2", root.parent / "det", GRID.ranges, "made up"
-    )
+    own = Judged("made up", root.parent / "det", judge(root))
+    write_gallery(folder, [own, *others], count, KittiSplit(root), root / "training" / "label_2", GRID.ranges)
     return folder
 
 
@@ -65,7 +64,7 @@ def test_the_worst_frames_come_first_and_flawless_ones_not_at_all(root: Path) ->
 
 
 def test_misses_and_false_detections_have_their_colors(root: Path) -> None:
-    folder = draw(root, worst_frames(judge(root), 3))
+    folder = draw(root, 3)
     names = ["001_000001.png", "002_000003.png", "003_000002.png"]
     assert sorted(path.name for path in folder.iterdir()) == [*names, "index.md"]
     index = (folder / "index.md").read_text()
@@ -82,12 +81,11 @@ def test_misses_and_false_detections_have_their_colors(root: Path) -> None:
 
 
 def test_the_image_stands_below_where_there_is_one(root: Path) -> None:
-    worst = worst_frames(judge(root), 1)
-    alone = np.asarray(cv2.imread(str(draw(root, worst) / "001_000001.png")))
+    alone = np.asarray(cv2.imread(str(draw(root, 1) / "001_000001.png")))
     path = KittiSplit(root).image_path("000001")
     path.parent.mkdir()
     cv2.imwrite(str(path), np.full((375, 1242, 3), 90, np.uint8))
-    both = np.asarray(cv2.imread(str(draw(root, worst) / "001_000001.png")))
+    both = np.asarray(cv2.imread(str(draw(root, 1) / "001_000001.png")))
     height = round(375 * alone.shape[1] / 1242)
     assert both.shape[0] == alone.shape[0] + height
     below = both[-height:]
@@ -102,5 +100,41 @@ def test_objects_without_a_box_in_3d_are_not_drawn(root: Path) -> None:
     detection.write_text("Car -1 -1 -10 100.00 100.00 200.00 200.00 -1 -1 -1 -1000 -1000 -1000 -10 0.9\n")
     worst = worst_frames(judge(root), 1)
     assert (worst[0].missed.sum(), worst[0].false_positive.sum()) == (4, 1) and len(read_labels(label)) == 5
-    image = np.asarray(cv2.imread(str(draw(root, worst) / "001_000001.png")))
+    image = np.asarray(cv2.imread(str(draw(root, 1) / "001_000001.png")))
     assert pixels(image, MAGENTA) == 0 < pixels(image, RED)
+
+
+def another(root: Path) -> Judged:
+    """Another detector: the same; all found; one missed and one false; without predictions."""
+    split, folder = KittiSplit(root), root.parent / "other"
+    for frame_id in ("000000", "000001", "000002"):
+        objects = scored(split.objects(frame_id))
+        found = [*objects[:3], moved(objects[0])] if frame_id == "000002" else objects
+        write_labels(folder / f"{frame_id}.txt", found)
+    return Judged("another", folder, judge(root, "other"))
+
+
+def test_two_detectors_are_compared_where_they_differ(root: Path) -> None:
+    first, second = judge(root), another(root).frames
+    assert [pair[0].frame_id for pair in most_different_frames(first, second, 9)] == ["000001", "000002"]
+    assert [pair[0].frame_id for pair in most_different_frames(first, second, 1)] == ["000001"]
+    assert most_different_frames(first, first, 9) == []
+
+
+def test_two_detectors_stand_side_by_side_on_the_same_part_of_the_scan(root: Path) -> None:
+    objects = scored(KittiSplit(root).objects("000001"))
+    far = KittiObject(**(vars(objects[0]) | {"x_m": 0.0, "z_m": GRID.x_range_m[1]}))  # false, beyond all points
+    write_labels(root.parent / "det" / "000001.txt", [far])
+    folder = draw(root, 1, another(root))
+    index = (folder / "index.md").read_text()
+    assert index.startswith("# made up and another: where they differ most\n")
+    assert "| frame | missed, made up | false, made up | missed, another | false, another |\n" in index
+    assert "| [000001](001_000001.png) | 4 | 1 | 0 | 0 |\n" in index
+    assert sorted(path.name for path in folder.iterdir()) == ["001_000001.png", "index.md"]
+    picture = np.asarray(cv2.imread(str(folder / "001_000001.png")))
+    assert picture.shape[1] == 2000
+    left, right = picture[:, :1000], picture[:, 1000:]
+    assert pixels(left, RED) > 100 and pixels(left, MAGENTA) > 20 and pixels(left, GREEN) == 0
+    assert pixels(right, GREEN) > 100 and pixels(right, RED) == pixels(right, MAGENTA) == 0
+    # Most of the picture is the same points at the same places.
+    assert (left[60:, 160:-4] == right[60:, 160:-4]).all(axis=-1).mean() > 0.9
