@@ -132,15 +132,11 @@ def evaluate(
     console = Console(markup=False)
     protocol = protocol or default_protocol(data)
     options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
-<<<<<<< HEAD
+    sources = model, data, split, predictions, labels
     given = EvalArguments(
-        protocol, model, data, split, predictions, labels, gallery, score, min_score, around, errors, errors_by, beside
+        protocol, *sources, out, gallery, compare, score, min_score, around, errors, errors_by, beside
     )
     check_arguments(given, options)
-=======
-    sources = model, data, split, predictions, labels
-    check_arguments(EvalArguments(protocol, *sources, out, gallery, compare, score, min_score, around), options)
->>>>>>> evaluation
     split = "val" if split is None else split
     if protocol == "tracking":
         from asca_pillars.commands.eval_tracks import evaluate_tracks
@@ -155,7 +151,7 @@ def evaluate(
         box_task = BoxTask(protocol, data, split, out, json, score, min_score, around, errors, errors_by, beside)
         evaluate_boxes(box_task, options, predictions, console)
         return
-    inputs = (model, data, labels, *(beside or ()))
+    inputs = (model, data, labels, compare, *(beside or ()))
     claim("report" if protocol == "kitti" else protocol, out, json, predictions, inputs)
     frames_of = None if data is None else KittiSplit(data, split)
     if labels is None:
@@ -182,11 +178,7 @@ def evaluate(
     else:
         steps.check_classes(task, frames)
         steps.report_kitti(task, frames, out, json, console)
-<<<<<<< HEAD
-        steps.draw_gallery(task, frames, out, gallery, console)
+        draw_gallery(task, frames, out, gallery, compare, console)
         if analysis is not None:
             steps.analyze_errors(analysis, task, frames, out, console)
-=======
-        draw_gallery(task, frames, out, gallery, compare, console)
->>>>>>> evaluation
     console.print(f"Written to {out}/", highlight=False)

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from asca_pillars.commands.eval_files import COMMAND, MADE_BY
+from asca_pillars.commands.eval_files import GALLERY_FOLDER, MADE_BY
 from asca_pillars.commands.eval_steps import Task
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
@@ -39,7 +39,7 @@ def draw_gallery(
         return
     own = gallery.Judged(task.subject, task.predictions, _judged(frames, task.scores))
     detectors = [own] if compare is None else _named_apart(own, task, _other(compare, task, frames, console))
-    with atomic_directory(out / "gallery", COMMAND, gallery.INDEX) as folder:
+    with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
         gallery.write_gallery(folder, detectors, count, task.split, task.labels, task.ranges, console=console)
 
 

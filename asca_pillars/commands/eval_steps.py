@@ -17,11 +17,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation.curves import write_curves
-<<<<<<< HEAD
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
-=======
-from asca_pillars.evaluation.gallery import INDEX as GALLERY_INDEX
->>>>>>> evaluation
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
@@ -171,30 +167,13 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     report = KittiReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
     page = ReportPage(report.title, kitti_tables(report), kitti_notes(report))
     write_report("report", page, kitti_json(report), out, json_path, task.predictions, console)
-<<<<<<< HEAD
     remove_directory(out / "gallery", *GALLERY_FOLDER)
     require_own_file(out / CURVES, COMMAND, is_own_picture)
-=======
-    remove_directory(out / "gallery", COMMAND, GALLERY_INDEX)
->>>>>>> evaluation
     if missing_modules("eval"):
         (out / CURVES).unlink(missing_ok=True)
         console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
     else:
-<<<<<<< HEAD
         write_curves(out / CURVES, ap.overall, report.title)
-
-
-def draw_gallery(task: Task, frames: ScoredFrames, out: Path, count: int | None, console: Console) -> None:
-    """Draw the `count` frames with the most errors below `out`, if there are scans to draw."""
-    count = GALLERY if count is None else count
-    if task.split is None or count == 0:
-        return
-    judged = matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=task.scores)
-    worst = gallery.worst_frames(judged, count)
-    folders = task.split, task.labels, task.predictions
-    with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
-        gallery.write_gallery(folder, worst, *folders, task.ranges, task.subject, console=console)
 
 
 def analyze_errors(analysis: ErrorAnalysis, task: Task, frames: ScoredFrames, out: Path, console: Console) -> None:
@@ -206,6 +185,3 @@ def analyze_errors(analysis: ErrorAnalysis, task: Task, frames: ScoredFrames, ou
     read = KittiErrorFrames(task.split, task.labels, task.predictions, tuple(scores), frame_ids)
     about = task.about | {"environment": describe_environment()}
     report_errors(analysis, read, scores, task.subject, about, out, console)
-=======
-        write_curves(out / "curves.png", ap.overall, report.title)
->>>>>>> evaluation

@@ -18,21 +18,13 @@ from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
 from asca_pillars.files import write_text
 from asca_pillars.geometry.ranges import Ranges
-<<<<<<< HEAD
 from asca_pillars.own_files import page_end
-from asca_pillars.pictures.drawing import Color, Image
-from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, read_image, write_png
-
-INDEX = "index.md"
-INDEX_END = page_end("asca eval")
-_INTRODUCTION = """# {title}: worst frames
-=======
 from asca_pillars.pictures.drawing import BACKGROUND, Color, Image, Texts
 from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, read_image, write_png
 
 INDEX = "index.md"
+INDEX_END = page_end("asca eval")
 _INTRODUCTION = """# {title}: {which}
->>>>>>> evaluation
 
 {chosen}
 A false detection may well stand on an object: to find it, its 3D overlap must exceed 0.7 for cars and 0.5 for the
@@ -128,15 +120,6 @@ def write_gallery(
     Raises:
         DatasetError, ScanError: a frame's scan, calibration or text cannot be read.
     """
-<<<<<<< HEAD
-    rows = [_INTRODUCTION.format(title=title), "| frame | missed | false |", "| --- | ---: | ---: |"]
-    bar = track(frames, "Drawing", console=console, disable=console is None)
-    for rank, frame in enumerate(bar, start=1):
-        name = f"{rank:03d}_{frame.frame_id}.png"
-        write_png(Path(folder) / name, _draw(frame, split, Path(labels), Path(predictions), ranges))
-        rows.append(f"| [{frame.frame_id}]({name}) | {frame.missed.sum()} | {frame.false_positive.sum()} |")
-    write_text(Path(folder) / INDEX, "\n".join([*rows, ""]) + INDEX_END)
-=======
     if len(detectors) == 1:
         chosen: list[tuple[ScoreMatches, ...]] = [(frame,) for frame in worst_frames(detectors[0].frames, count)]
         words, heads = _WORST, ["missed", "false"]
@@ -157,9 +140,7 @@ def write_gallery(
         write_png(Path(folder) / name, _draw(matches, detectors, split, Path(labels), ranges))
         counts = [f"{kind.sum()}" for one in matches for kind in (one.missed, one.false_positive)]
         rows.append(f"| [{frame_id}]({name}) | {' | '.join(counts)} |")
-    with atomic_path(Path(folder) / INDEX) as temporary:
-        temporary.write_text("\n".join([*rows, ""]), encoding="utf-8")
->>>>>>> evaluation
+    write_text(Path(folder) / INDEX, "\n".join([*rows, ""]) + INDEX_END)
 
 
 def _draw(
