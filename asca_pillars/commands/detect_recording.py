@@ -23,7 +23,7 @@ from asca_pillars.commands.detect_files import RUN_FILE, RUN_MARK
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.foxglove_file import FoxgloveFile, require_own_file
 from asca_pillars.commands.models import open_detector
-from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.options import RuntimeOptions, Scores
 from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult
 from asca_pillars.commands.recording_results import (
     Found,
@@ -58,7 +58,7 @@ class RecordingTask:
 
     path: Path
     out: Path
-    score: float | None
+    score: Scores | None
     around: bool
     topic: str | None
     track: bool
@@ -186,7 +186,7 @@ class _Run:
             yield
 
 
-def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
+def _thresholds(bundle: Path | None, score: Scores | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track; ConfigError if it is none."""
     spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)
@@ -216,7 +216,7 @@ def _about(
     mounting: Mounting,
     detector: Detector,
     topic: str,
-    least: float | None,
+    least: Scores | None,
 ) -> dict[str, Any]:
     """All that detections depend on: a journal of anything else is not gone on with."""
     files = recording_files(task.path)

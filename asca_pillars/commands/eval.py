@@ -12,6 +12,7 @@ from asca_pillars.commands.options import (
     ProviderOption,
     RuntimeOptions,
     ThreadsOption,
+    read_scores,
 )
 
 
@@ -54,11 +55,11 @@ def evaluate(
         typer.Option("--gallery", min=0, help="Worst frames to draw. Default: 8 if there are scans (--data)."),
     ] = None,
     score: Annotated[
-        float | None,
+        list[str] | None,
         typer.Option(
             "--score",
-            help="Score from which on detections count for recall, precision and gallery. "
-            "Default: the model's, per class; 0.3 for --predictions.",
+            help="VALUE or CLASS=VALUE: score from which on detections count for recall, precision and gallery. "
+            "Repeatable for classes. Default: the model's, per class; 0.3 for --predictions.",
         ),
     ] = None,
     min_score: Annotated[
@@ -102,7 +103,8 @@ def evaluate(
     console = Console(markup=False)
     protocol = protocol or default_protocol(data)
     options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
-    given = EvalArguments(protocol, model, data, split, predictions, labels, gallery, score, min_score, around)
+    scores = read_scores(score)
+    given = EvalArguments(protocol, model, data, split, predictions, labels, gallery, scores, min_score, around)
     check_arguments(given, options)
     split = "val" if split is None else split
     if protocol == "tracking":
@@ -115,7 +117,7 @@ def evaluate(
         from asca_pillars.commands.eval_boxes import BoxTask, evaluate_boxes
 
         assert data is not None, "checked with the arguments"
-        box_task = BoxTask(protocol, data, split, out, json, score, min_score, around)
+        box_task = BoxTask(protocol, data, split, out, json, scores, min_score, around)
         evaluate_boxes(box_task, options, predictions, console)
         return
     claim(out, json)
@@ -125,12 +127,12 @@ def evaluate(
         labels = frames_of.folder / "label_2"
     truth = read_truth(labels, None if frames_of is None else frames_of.frame_ids)
     if predictions is not None:
-        task = steps.text_task(predictions, labels, frames_of, score)
+        task = steps.text_task(predictions, labels, frames_of, scores)
     else:
         assert frames_of is not None, "checked with the arguments"
         opened = open_model(options, min_score)
-        scores = steps.kitti_scores(opened, score, min_score) if protocol == "kitti" else {}
-        task = steps.run_model(opened, frames_of, labels, scores, out, console)
+        fixed = steps.kitti_scores(opened, scores, min_score) if protocol == "kitti" else {}
+        task = steps.run_model(opened, frames_of, labels, fixed, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)
     if protocol == "waymo":
         steps.report_waymo(task, frames, out, json, console)

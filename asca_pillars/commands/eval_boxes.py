@@ -9,7 +9,7 @@ from rich.console import Console
 from asca_pillars.commands.eval_files import COMMAND, MADE_BY, claim, write_report
 from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
-from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.options import RuntimeOptions, Scores, scores_by_class
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.open_split import open_split
@@ -33,7 +33,7 @@ class BoxTask:
     split: str
     out: Path
     json: Path | None
-    score: float | None
+    score: Scores | None
     min_score: float
     around: bool
 
@@ -54,7 +54,7 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
     else:
         frames = read_box_predictions(predictions, split, console=console)
         class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.found_types}))
-        scores = dict.fromkeys(class_names, TEXT_SCORE if task.score is None else task.score)
+        scores = scores_by_class(task.score, dict.fromkeys(class_names, TEXT_SCORE))
         subject, about = f"{predictions} against {task.data}", about | {"predictions": str(predictions)}
     _require_common_class(frames, class_names, task.data)
     about["environment"] = describe_environment()

@@ -16,7 +16,7 @@ from asca_deploy.shipped import find_checkpoint
 from asca_pillars.commands.extras import require
 from asca_pillars.data.scans.find_scans import find_scans
 from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.errors import TrainingError
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
@@ -72,19 +72,6 @@ def print_quantization(report: Quantization, console: Console) -> None:
         f"{report.boxes_matched} are there again, {report.boxes_added} are new. "
         "What that costs in AP says `asca eval` on both bundles"
     )
-
-
-def class_score(text: str) -> tuple[str, float]:
-    """`CLASS=VALUE` as a pair.
-
-    Raises:
-        ConfigError: it is something else.
-    """
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise ConfigError(f"--score {text}: write a class and its score, such as Car=0.35") from None
 
 
 def read_or_simulate(
