@@ -36,12 +36,13 @@ from asca_pillars.commands.recording_results import (
 )
 from asca_pillars.commands.rerun_file import RerunFile, require_own_rrd
 from asca_pillars.commands.scan_input import said_of_scale
+from asca_pillars.data.ground_height import NamedPoints
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.recordings.odometry import Poses, read_poses
 from asca_pillars.data.recordings.open_recording import open_recording, recording_files
 from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.data.scan_settings import SAMPLE_SCANS, ScanSettings
+from asca_pillars.data.scan_settings import SEARCHED_SCANS, ScanSettings
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.files import atomic_path, require_own
 from asca_pillars.schema import to_dict
@@ -90,7 +91,9 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     damages = {recording.damage}
     scans = RecordedScans(recording, topic, reading.reflectance_scale)
     said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
-    mounting, estimate = reading.mounting(scan.points for scan in scans.first(SAMPLE_SCANS))
+    first = enumerate(scans.first(SEARCHED_SCANS), start=1)
+    samples = (NamedPoints(f"scan {number} with points of {topic.name}", scan.points) for number, scan in first)
+    mounting, estimate = reading.mounting(samples)
     if estimate is not None:
         said.append(f"sensor height: {estimate}")
     for line in said:
