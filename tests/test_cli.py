@@ -208,7 +208,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     assert not bundle.exists()
 
     assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
-    assert "such as Car=0.35" in refusal(run_here(*export, "--score", "0.2"))
+    assert "such as Car=0.35" in refusal(run_here(*export, "--score", "Car:0.2"))
     exported = run_here(*export, "--score", "Pedestrian=0.21", "--with-weights")
     assert exported.returncode == 0, exported.stderr
     assert (bundle / "weights.ckpt").read_bytes() == (run / "checkpoints" / "weights.ckpt").read_bytes()

@@ -17,8 +17,10 @@ from asca_pillars.commands.options import (
     ReflectanceScaleOption,
     RuntimeOptions,
     ScansArgument,
+    ScoreOption,
     SensorHeightOption,
     ThreadsOption,
+    read_scores,
 )
 from asca_pillars.errors import ConfigError
 
@@ -28,10 +30,7 @@ def detect(
     *,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.")] = Path("detections"),
     bundle: BundleOption = None,
-    score: Annotated[
-        float | None,
-        typer.Option("--score", help="Report detections from this score on. Default: the bundle's, per class."),
-    ] = None,
+    score: ScoreOption = None,
     pictures: Annotated[
         bool | None,
         typer.Option(
@@ -88,6 +87,8 @@ def detect(
 
     asca detect drive1/ drive2/ --out results --no-pictures
 
+    asca detect my_scans/ --score Car=0.6 --score Pedestrian=0.4
+
     asca detect sweeps/ --around --axes y-forward --sensor-height auto
 
     asca detect drive.mcap --track --foxglove boxes.mcap
@@ -114,6 +115,7 @@ def detect(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    scores = read_scores(score)
     recordings = [path for path in scans or () if is_recording(path)]
     if recordings:
         if cluster is not None or len(scans or ()) > 1:
@@ -127,7 +129,7 @@ def detect(
         task = RecordingTask(
             path=recordings[0],
             out=out,
-            score=score,
+            score=scores,
             around=around,
             topic=topic,
             track=track,
@@ -149,9 +151,9 @@ def detect(
         if pictures:
             raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
         paths = [path for path, _ in named]
-        detect_archive(paths, scan_input, reading, options, out, score=score, around=around, address=cluster)
+        detect_archive(paths, scan_input, reading, options, out, score=scores, around=around, address=cluster)
         return
-    detector = open_detector(options, score, scan_input.mounting, around=around)
+    detector = open_detector(options, scores, scan_input.mounting, around=around)
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     scope = detector_scope(detector.spec, around=around)

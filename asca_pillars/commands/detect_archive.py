@@ -5,7 +5,7 @@ import json
 import logging
 import socket
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -32,7 +32,7 @@ from asca_pillars.commands.detect_files import (
 from asca_pillars.commands.detect_tables import remark
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.models import open_detector
-from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.options import RuntimeOptions, Scores
 from asca_pillars.commands.scan_input import ScanInput
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.data.mounting import Mounting
@@ -69,7 +69,7 @@ class DetectShard:
         shards: folder of the shards.
         start: folder that relative paths of scans start from.
         options: of the detector; `bundle` is absolute, or the name of one that ships.
-        score, mounting, around: as for `open_detector`.
+        score, mounting, around: as for `open_detector`; scores of some classes as pairs, so that a job has a hash.
         columns: as for `read_scan`.
         bundle_sha256: of the bundle that the command saw.
     """
@@ -77,7 +77,7 @@ class DetectShard:
     shards: Path
     start: Path
     options: RuntimeOptions
-    score: float | None
+    score: float | tuple[tuple[str, float], ...] | None
     mounting: Mounting
     around: bool
     columns: int | None
@@ -133,7 +133,7 @@ def detect_archive(
     options: RuntimeOptions,
     out: Path,
     *,
-    score: float | None,
+    score: Scores | None,
     around: bool,
     address: str,
 ) -> None:
@@ -232,7 +232,7 @@ def _within(parts: Sequence[Shard], shard: Shard) -> Iterator[Shard]:
 
 
 def _job(
-    mounting: Mounting, columns: int | None, options: RuntimeOptions, out: Path, *, score: float | None, around: bool
+    mounting: Mounting, columns: int | None, options: RuntimeOptions, out: Path, *, score: Scores | None, around: bool
 ) -> DetectShard:
     bundle = find_bundle(options.bundle)
     spec = load_bundle(bundle).spec  # a damaged one is named here, not by every worker
@@ -248,7 +248,7 @@ def _job(
             bundle=given.absolute() if given is not None and given.exists() else given,
             threads=options.threads or 1,
         ),
-        score=score,
+        score=tuple(score.items()) if isinstance(score, Mapping) else score,
         mounting=mounting,
         around=around,
         columns=columns,
@@ -265,18 +265,22 @@ def _results_depend_on(job: DetectShard, scans: Sequence[Path]) -> dict[str, obj
         "bundle_sha256": job.bundle_sha256,
         "provider": job.options.provider,
         "precision": job.options.precision,
-        "score": job.score,
+        "score": _scores(job),
         "around": job.around,
         "columns": job.columns,
         "mounting": to_dict(job.mounting),
     }
 
 
+def _scores(job: DetectShard) -> Scores | None:
+    return dict(job.score) if isinstance(job.score, tuple) else job.score
+
+
 @lru_cache(maxsize=1)
 def _detector(job: DetectShard) -> Detector:
     """Opened once in a worker's process."""
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # warnings are in the lines
-    detector = open_detector(job.options, job.score, job.mounting, around=job.around)
+    detector = open_detector(job.options, _scores(job), job.mounting, around=job.around)
     if bundle_digest(detector.folder) != job.bundle_sha256:
         raise BundleError(f"{detector.folder}: is another bundle than the command's; give every machine the same one")
     return detector

@@ -24,7 +24,7 @@ from asca_pillars.commands.detect_files import ABOUT_FILE, COMMAND, KITTI_FILE, 
 from asca_pillars.commands.extras import require
 from asca_pillars.commands.foxglove_file import FoxgloveFile, is_own_mcap
 from asca_pillars.commands.models import open_detector
-from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.options import RuntimeOptions, Scores
 from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanResult, is_journal
 from asca_pillars.commands.recording_results import (
     Found,
@@ -39,12 +39,13 @@ from asca_pillars.commands.rerun_file import RerunFile, is_own_rrd
 from asca_pillars.commands.scan_input import said_of_scale
 from asca_pillars.commands.writable_file import require_suffix, require_writable
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
+from asca_pillars.data.ground_height import NamedPoints
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.recordings.odometry import Poses, read_poses
 from asca_pillars.data.recordings.open_recording import open_recording, recording_files
 from asca_pillars.data.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.data.scan_settings import SAMPLE_SCANS, ScanSettings
+from asca_pillars.data.scan_settings import SEARCHED_SCANS, ScanSettings
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.files import atomic_path
 from asca_pillars.schema import to_dict
@@ -59,7 +60,7 @@ class RecordingTask:
 
     path: Path
     out: Path
-    score: float | None
+    score: Scores | None
     around: bool
     topic: str | None
     track: bool
@@ -94,7 +95,9 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     damages = set() if poses is None else {recording.damage}
     scans = RecordedScans(recording, topic, reading.reflectance_scale)
     said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
-    mounting, estimate = reading.mounting(scan.points for scan in scans.first(SAMPLE_SCANS))
+    first = enumerate(scans.first(SEARCHED_SCANS), start=1)
+    samples = (NamedPoints(f"scan {number} with points of {topic.name}", scan.points) for number, scan in first)
+    mounting, estimate = reading.mounting(samples)
     if estimate is not None:
         said.append(f"sensor height: {estimate}")
     for line in said:
@@ -189,7 +192,7 @@ class _Run:
             yield
 
 
-def _thresholds(bundle: Path | None, score: float | None) -> dict[str, float]:
+def _thresholds(bundle: Path | None, score: Scores | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track; ConfigError if it is none."""
     spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)
@@ -219,7 +222,7 @@ def _about(
     mounting: Mounting,
     detector: Detector,
     topic: str,
-    least: float | None,
+    least: Scores | None,
 ) -> dict[str, Any]:
     """All that detections depend on: a journal of anything else is not gone on with."""
     files = recording_files(task.path)

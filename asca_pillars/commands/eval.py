@@ -12,6 +12,7 @@ from asca_pillars.commands.options import (
     ProviderOption,
     RuntimeOptions,
     ThreadsOption,
+    read_scores,
 )
 
 
@@ -62,11 +63,11 @@ def evaluate(
         ),
     ] = None,
     score: Annotated[
-        float | None,
+        list[str] | None,
         typer.Option(
             "--score",
-            help="Score from which on detections count for recall, precision and gallery. "
-            "Default: the model's, per class; 0.3 for --predictions.",
+            help="VALUE or CLASS=VALUE: score from which on detections count for recall, precision and gallery. "
+            "Repeatable for classes. Default: the model's, per class; 0.3 for --predictions.",
         ),
     ] = None,
     min_score: Annotated[
@@ -132,9 +133,10 @@ def evaluate(
     console = Console(markup=False)
     protocol = protocol or default_protocol(data)
     options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
+    scores = read_scores(score)
     sources = model, data, split, predictions, labels
     given = EvalArguments(
-        protocol, *sources, out, gallery, compare, score, min_score, around, errors, errors_by, beside
+        protocol, *sources, out, gallery, compare, scores, min_score, around, errors, errors_by, beside
     )
     check_arguments(given, options)
     split = "val" if split is None else split
@@ -148,7 +150,7 @@ def evaluate(
         from asca_pillars.commands.eval_boxes import BoxTask, evaluate_boxes
 
         assert data is not None, "checked with the arguments"
-        box_task = BoxTask(protocol, data, split, out, json, score, min_score, around, errors, errors_by, beside)
+        box_task = BoxTask(protocol, data, split, out, json, scores, min_score, around, errors, errors_by, beside)
         evaluate_boxes(box_task, options, predictions, console)
         return
     inputs = (model, data, labels, compare, *(beside or ()))
@@ -163,14 +165,14 @@ def evaluate(
         if errors:
             assert frames_of is not None, "checked with the arguments"
             analysis = prepare_errors(who_predicted(predictions), frames_of, errors_by, beside)
-        task = steps.text_task(predictions, labels, frames_of, score)
+        task = steps.text_task(predictions, labels, frames_of, scores)
     else:
         assert frames_of is not None, "checked with the arguments"
         opened = open_model(options, min_score)
         if errors:
             analysis = prepare_errors(opened.name, frames_of, errors_by, beside)
-        scores = steps.kitti_scores(opened, score, min_score) if protocol == "kitti" else {}
-        task = steps.run_model(opened, frames_of, labels, scores, out, console)
+        fixed = steps.kitti_scores(opened, scores, min_score) if protocol == "kitti" else {}
+        task = steps.run_model(opened, frames_of, labels, fixed, out, console)
     frames = read_predictions(task.predictions, truth, labels, console=console)
     steps.warn_of_degrees_in_text(console, frames)
     if protocol == "waymo":

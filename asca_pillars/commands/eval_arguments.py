@@ -1,11 +1,12 @@
 """Which options of `asca eval` go together."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from asca_pillars.commands.options import MIN_SCORE, RuntimeOptions
+from asca_pillars.commands.options import MIN_SCORE, RuntimeOptions, Scores
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.errors import ConfigError
@@ -24,7 +25,7 @@ class EvalArguments:
     out: Path
     gallery: int | None
     compare: Path | None
-    score: float | None
+    score: Scores | None
     min_score: float
     around: bool
     errors: bool = False
@@ -55,8 +56,9 @@ def check_arguments(given: EvalArguments, options: RuntimeOptions) -> None:
         _check_boxes(given)
     else:
         _check_kitti(given)
-    if given.score is not None and not math.isfinite(given.score):
-        raise ConfigError(f"--score {given.score} must be a number")  # any: predictions from elsewhere may hold logits
+    scores = given.score.values() if isinstance(given.score, Mapping) else [given.score or 0.0]
+    if wrong := [score for score in scores if not math.isfinite(score)]:
+        raise ConfigError(f"--score {wrong[0]} must be a number")  # any: predictions from elsewhere may hold logits
 
 
 def _check_no_runtime(predictions: Path, options: RuntimeOptions, min_score: float) -> None:
@@ -95,7 +97,7 @@ def _check_tracking(given: EvalArguments) -> None:
     _check_no_text(given)
     if given.score is not None:
         raise ConfigError(
-            f"--score {given.score:g}: --protocol tracking goes over all tracks; give it to asca detect --track"
+            f"--score {_typed(given.score)}: --protocol tracking goes over all tracks; give it to asca detect --track"
         )
     if given.data is None or given.predictions is None:
         raise ConfigError("--protocol tracking: give --data ROOT and --predictions, the output of asca detect --track")
@@ -139,7 +141,7 @@ def _check_kitti(given: EvalArguments) -> None:
     if given.compare is not None:
         _check_compare(given.compare, given)
     if given.protocol == "waymo" and (given.gallery or given.score is not None):
-        option = f"--gallery {given.gallery}" if given.gallery else f"--score {given.score:g}"
+        option = f"--score {_typed(given.score)}" if given.score is not None else f"--gallery {given.gallery}"
         raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
 
 
@@ -152,3 +154,8 @@ def _check_compare(compare: Path, given: EvalArguments) -> None:
     replaced = (given.out / "predictions").resolve()
     if replaced in (compare.resolve(), *compare.resolve().parents):
         raise ConfigError(f"--compare {compare}: this evaluation writes there; give it another --out")
+
+
+def _typed(score: Scores) -> str:
+    """As a user would type it, the first one of several."""
+    return next(f"{name}={value:g}" for name, value in score.items()) if isinstance(score, Mapping) else f"{score:g}"

@@ -10,7 +10,7 @@ from asca_pillars.commands.eval_errors import prepare_errors, report_errors, who
 from asca_pillars.commands.eval_files import MADE_BY, PREDICTIONS_FOLDER, claim, write_report
 from asca_pillars.commands.eval_steps import TEXT_SCORE, model_scores, warn_of_degrees, warn_of_unlike_scans
 from asca_pillars.commands.models import Model, open_model
-from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.options import RuntimeOptions, Scores, scores_by_class
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -36,7 +36,7 @@ class BoxTask:
     split: str
     out: Path
     json: Path | None
-    score: float | None
+    score: Scores | None
     min_score: float
     around: bool
     errors: bool
@@ -64,7 +64,7 @@ def evaluate_boxes(task: BoxTask, options: RuntimeOptions, predictions: Path | N
         )
         frames = read_box_predictions(predictions, split, console=console)
         class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.found_types}))
-        scores = dict.fromkeys(class_names, TEXT_SCORE if task.score is None else task.score)
+        scores = scores_by_class(task.score, dict.fromkeys(class_names, TEXT_SCORE))
         subject, about = f"{predictions} against {task.data}", about | {"predictions": str(predictions)}
     _require_common_class(frames, class_names, task.data)
     level = split.mounting.level.inverse  # yaws as files state them

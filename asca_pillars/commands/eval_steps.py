@@ -13,6 +13,7 @@ from asca_pillars.commands.eval_errors import ErrorAnalysis, report_errors
 from asca_pillars.commands.eval_files import COMMAND, CURVES, GALLERY_FOLDER, MADE_BY, PREDICTIONS_FOLDER, write_report
 from asca_pillars.commands.extras import missing_modules
 from asca_pillars.commands.models import Model
+from asca_pillars.commands.options import Scores, scores_by_class
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.errors import ConfigError, DatasetError
@@ -50,9 +51,9 @@ class Task:
     about: dict[str, Any]
 
 
-def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: float | None) -> Task:
+def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: Scores | None) -> Task:
     """Finished predictions as KITTI text, counted from `score` on."""
-    scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE if score is None else score)
+    scores = scores_by_class(score, dict.fromkeys(CLASS_NAMES, TEXT_SCORE))
     about = {"predictions": str(predictions), "labels": str(labels)}
     return Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid().ranges, scores, about)
 
@@ -70,7 +71,7 @@ def check_classes(task: Task, frames: ScoredFrames) -> None:
         )
 
 
-def kitti_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
+def kitti_scores(model: Model, score: Scores | None, min_score: float) -> dict[str, float]:
     """For each class the score from which on detections count for precision and recall."""
     known = {name.lower(): name for name in CLASS_NAMES}
     scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
@@ -85,16 +86,16 @@ def kitti_scores(model: Model, score: float | None, min_score: float) -> dict[st
     return scores
 
 
-def model_scores(model: Model, score: float | None, min_score: float) -> dict[str, float]:
+def model_scores(model: Model, score: Scores | None, min_score: float) -> dict[str, float]:
     """The same for each of the model's own classes.
 
     Raises:
         ConfigError: a score that the model is not run down to.
     """
-    scores = {item.name: item.score_threshold if score is None else score for item in model.spec.classes}
-    if score is not None and score > 1:
-        raise ConfigError(f"--score {score:g}: no detection of a model has such a score; at most 1")
+    scores = scores_by_class(score, {item.name: item.score_threshold for item in model.spec.classes})
     for name, fixed in scores.items():
+        if fixed > 1:
+            raise ConfigError(f"--score {fixed:g}: no detection of a model has such a score; at most 1")
         if fixed < min_score:
             raise ConfigError(
                 f"score {fixed:g} of {name} is below --min-score {min_score:g}, the lowest that {model.name} is "

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from asca_pillars.commands.extras import require
+from asca_pillars.commands.options import ScoreOption, read_scores
 
 
 def export(
@@ -33,12 +34,7 @@ def export(
             help="What the weights saw, for the manifest. Default: what a bundle says of itself, or `not stated`.",
         ),
     ] = None,
-    score: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--score", help="CLASS=VALUE: report this class from this score on. Repeatable. Default: the config's."
-        ),
-    ] = None,
+    score: ScoreOption = None,
     range_m: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(
@@ -133,7 +129,6 @@ def export(
         PARITY_SCANS,
         PARITY_SEED,
         View,
-        class_score,
         open_source,
         print_quantization,
         read_or_simulate,
@@ -147,8 +142,9 @@ def export(
     require_not_input(out, (scans, calibrate))
     source = open_source(checkpoint)
     loaded = source.checkpoint
-    scores = source.score_thresholds | dict(class_score(text) for text in score or ())
-    spec = loaded.config.model.spec.with_score_threshold(scores)
+    spec = loaded.config.model.spec.with_score_threshold(source.score_thresholds)
+    if (scores := read_scores(score)) is not None:
+        spec = spec.with_score_threshold(scores)
     if range_m is not None:
         spec = with_ranges(spec, range_m)
     model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind

@@ -77,19 +77,6 @@ def print_quantization(report: Quantization, console: Console) -> None:
     )
 
 
-def class_score(text: str) -> tuple[str, float]:
-    """`CLASS=VALUE` as a pair.
-
-    Raises:
-        ConfigError: it is something else.
-    """
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise ConfigError(f"--score {text}: write a class and its score, such as Car=0.35") from None
-
-
 def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:
     """The same detector that looks for objects elsewhere: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
 

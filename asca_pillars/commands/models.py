@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asca_deploy import Detections, Detector
 from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.commands.extras import require
-from asca_pillars.commands.options import RuntimeOptions
+from asca_pillars.commands.options import RuntimeOptions, Scores
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ConfigError
 from asca_pillars.geometry.detector_spec import DetectorSpec
@@ -41,7 +41,7 @@ class Model:
 
 
 def open_detector(
-    options: RuntimeOptions, score: float | None = None, mounting: Mounting | None = None, *, around: bool = False
+    options: RuntimeOptions, score: Scores | None = None, mounting: Mounting | None = None, *, around: bool = False
 ) -> Detector:
     """The detector of a bundle that is run as `options` say, from `score` on; None for the bundle's own thresholds.
 

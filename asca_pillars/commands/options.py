@@ -1,10 +1,13 @@
 """Options that several commands share, declared once. Nothing heavy is imported here: `asca --help` is instant."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
+
+from asca_pillars.errors import ConfigError
 
 ScansArgument = Annotated[
     list[Path] | None,
@@ -23,6 +26,16 @@ BundleOption = Annotated[
         "providers that need one), each also with _int8, and pvrcnn_small_sim (PV-RCNN). Default: asca_sim_int8.",
     ),
 ]
+ScoreOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--score",
+        help="VALUE or CLASS=VALUE: report detections, or those of a class, from this score on. Repeatable for "
+        "classes. Default: the model's, per class.",
+    ),
+]
+Scores: TypeAlias = float | Mapping[str, float]
+"""What `--score` says: one score for every class, or scores of some classes by name."""
 MIN_SCORE = 0.05  # of `asca eval --min-score`
 
 ProviderOption = Annotated[
@@ -108,6 +121,41 @@ ClusterOption = Annotated[
         "Needs pip install 'asca-pillars\\[cluster]'; docs/CLUSTER.md.",
     ),
 ]
+
+
+def read_scores(texts: Sequence[str] | None) -> Scores | None:
+    """`--score` as typed; None if it was not given.
+
+    Raises:
+        ConfigError: one is no score, or a score for every class stands beside others.
+    """
+    scores: dict[str, float] = {}
+    for text in texts or ():
+        name, equals, value = text.rpartition("=")
+        try:
+            scores[name] = float(value)
+        except ValueError:
+            name, equals = "", "="
+        if equals and not name:
+            raise ConfigError(f"--score {text}: give a score, or a class and its score, such as Car=0.35")
+    if "" not in scores:
+        return scores or None
+    if len(texts or ()) > 1:
+        raise ConfigError(f"--score {scores['']:g} is for every class; give it alone, or CLASS=VALUE for each")
+    return scores[""]
+
+
+def scores_by_class(stated: Scores | None, defaults: Mapping[str, float]) -> dict[str, float]:
+    """The score of each class of `defaults`: as stated, else that one.
+
+    Raises:
+        ConfigError: a stated class is none of them.
+    """
+    if not isinstance(stated, Mapping):
+        return dict(defaults) if stated is None else dict.fromkeys(defaults, stated)
+    if unknown := [name for name in stated if name not in defaults]:
+        raise ConfigError(f"--score {unknown[0]}: no such class; there are {', '.join(defaults)}")
+    return dict(defaults) | dict(stated)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """How high the sensor sits above the ground, estimated from scans: `--sensor-height auto`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -49,6 +49,13 @@ class GroundPlane(NamedTuple):
         return None
 
 
+class NamedPoints(NamedTuple):
+    """Points (N, >=3) of a scan, metres, and what to call it."""
+
+    name: str
+    points: NDArray[Any]
+
+
 class HeightEstimate(NamedTuple):
     """The sensor's height over several scans."""
 
@@ -59,12 +66,15 @@ class HeightEstimate(NamedTuple):
     share: float
     """Smallest `GroundPlane.share`."""
     scans: int
+    left_out: tuple[str, ...] = ()
+    """Scans that show no clear ground, each with the reason."""
 
     def __str__(self) -> str:
         agree = "" if self.scans == 1 else f", which agree within {self.spread_m:.2f} m"
         return (
             f"{self.height_m:.2f} m above the ground, estimated from {self.scans} scan{'s' * (self.scans > 1)}{agree}: "
             f"{self.share:.0%} of the low points near the sensor lie on the plane"
+            + (f"; left out: {_first_of(self.left_out)}" if self.left_out else "")
         )
 
 
@@ -76,24 +86,47 @@ def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = N
         mounting: axes or pose; its height does not matter. None: x forward, y left, z up.
 
     Raises:
-        ScanError: a scan shows no clear ground, or the scans contradict each other; says how.
+        ScanError: no scan shows a clear ground, or the scans contradict each other; says how.
+    """
+    return estimate_named_height((NamedPoints(f"scan {n}", one) for n, one in enumerate(scans, start=1)), mounting)
+
+
+def estimate_named_height(
+    scans: Iterable[NamedPoints], mounting: Mounting | None = None, enough: int | None = None
+) -> HeightEstimate:
+    """As `estimate_height`, of scans with names, of which those after `enough` that show the ground are not read.
+
+    Raises:
+        ScanError: no scan shows a clear ground, or the scans contradict each other; names one.
     """
     level = (mounting or Mounting()).level
-    planes = []
-    for number, points in enumerate(scans, start=1):
+    heights: dict[str, float] = {}
+    shares, left_out = [], []
+    for name, points in scans:
         plane = fit_ground_plane(level.points(points))
         doubt = "too few points near the sensor, or all on one line" if plane is None else plane.doubt
         if plane is None or doubt:
-            raise ScanError(f"the sensor's height cannot be estimated from scan {number}: {doubt}; {_BY_HAND}")
-        planes.append(plane)
-    if not planes:
-        raise ScanError(f"the sensor's height cannot be estimated without a scan; {_BY_HAND}")
-    heights = np.array([plane.height_m for plane in planes])
-    spread = float(np.ptp(heights))
+            left_out.append(f"{name}: {doubt}")
+            continue
+        heights[name] = plane.height_m
+        shares.append(plane.share)
+        if len(heights) == enough:
+            break
+    if not heights:
+        why = f"from {_first_of(left_out)}" if left_out else "without a scan"
+        raise ScanError(f"the sensor's height cannot be estimated {why}; {_BY_HAND}")
+    low, high = min(heights, key=heights.__getitem__), max(heights, key=heights.__getitem__)
+    spread = heights[high] - heights[low]
     if spread > MAX_SPREAD_M:
-        text = f"{len(heights)} scans disagree by {spread:.2f} m on the sensor's height; {_BY_HAND}"
-        raise ScanError(text)
-    return HeightEstimate(float(np.median(heights)), spread, min(plane.share for plane in planes), len(planes))
+        raise ScanError(
+            f"{len(heights)} scans disagree by {spread:.2f} m on the sensor's height: {heights[low]:.2f} m in {low}, "
+            f"{heights[high]:.2f} m in {high}; {_BY_HAND}"
+        )
+    return HeightEstimate(float(np.median([*heights.values()])), spread, min(shares), len(heights), tuple(left_out))
+
+
+def _first_of(left_out: Sequence[str]) -> str:
+    return left_out[0] + (f" (and {len(left_out) - 1} more)" if left_out[1:] else "")
 
 
 def measured_mounting(

@@ -1,7 +1,7 @@
 """How scan files are read and where their sensor sat: the options of commands and the keys of a dataset.yaml, alike."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Literal
@@ -9,14 +9,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.ground_height import HeightEstimate, measured_mounting
+from asca_pillars.data.ground_height import HeightEstimate, NamedPoints, estimate_named_height
 from asca_pillars.data.mounting import Mounting, read_pose, refuse_axes_beside_pose
 from asca_pillars.data.scans.scan_reader import ReflectanceScale
 from asca_pillars.errors import ConfigError, ScanError
 from asca_pillars.strict import Strict
 
 FEWEST_COLUMNS = 3
-SAMPLE_SCANS = 8  # that a height of "auto" looks at
+SAMPLE_SCANS = 8  # that show the ground: a height of "auto" is their median
+SEARCHED_SCANS = 32  # that are looked at for them
 
 
 @dataclass(frozen=True)
@@ -63,12 +64,12 @@ class ScanSettings(Strict):
         return Mounting(self._stated_height_m, self.axes, pose)
 
     def mounting(
-        self, samples: Iterable[NDArray[np.float32]], folder: Path | None = None
+        self, samples: Iterable[NamedPoints], folder: Path | None = None
     ) -> tuple[Mounting, HeightEstimate | None]:
         """The mounting, and how a height of "auto" was estimated; None if it was stated.
 
         Args:
-            samples: points (N, >=3) in metres of some scans; only looked at where the height is "auto".
+            samples: some scans; only looked at where the height is "auto", and then until enough show the ground.
             folder: as for `stated_mounting`.
 
         Raises:
@@ -78,19 +79,27 @@ class ScanSettings(Strict):
         stated = self.stated_mounting(folder)
         if self.sensor_height != "auto":
             return stated, None
-        return measured_mounting(samples, stated)
+        estimate = estimate_named_height(samples, stated, SAMPLE_SCANS)
+        return replace(stated, sensor_height_m=estimate.height_m), estimate
 
     @property
     def _stated_height_m(self) -> float | None:
         return None if self.sensor_height == "auto" else self.sensor_height
 
 
-def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
-    """Points (N, >=3), metres, of up to SAMPLE_SCANS scans, evenly spaced, but those unreadable or empty."""
-    for path in paths[:: max(-(-len(paths) // SAMPLE_SCANS), 1)]:
+def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NamedPoints]:
+    """Up to SEARCHED_SCANS scans but those unreadable or empty: SAMPLE_SCANS evenly spaced ones, then those between.
+
+    Args:
+        paths: of all scans.
+        read: points (N, >=3), metres, of one of them; ScanError if it cannot be read.
+    """
+    step = max(-(-len(paths) // SAMPLE_SCANS), 1)
+    order = [path for first in range(step) for path in paths[first::step]]
+    for path in order[:SEARCHED_SCANS]:
         try:
             points = read(path)
         except ScanError:
             continue  # named when its turn comes
         if len(points):
-            yield points
+            yield NamedPoints(str(path), points)

@@ -2,7 +2,7 @@
 
 import logging
 import weakref
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -81,7 +81,8 @@ class Detector:
         precision: "float32", in which the bundle was proven, or "reduced" where the provider has something faster
             (`asca_deploy.providers`); None for float32, with "auto" for either.
         threads: of the CPU; None for the physical cores granted to the process.
-        score_threshold: overrides that of every class; None keeps the bundle's.
+        score_threshold: overrides that of every class, or of the classes named, such as {"Car": 0.4}; None keeps the
+            bundle's.
         mounting: how the scans' frame lies to the model's. Points come and boxes go in the scans' own frame. None: the
             scans are as those of the training.
         view: "ahead", or "around" for every direction: as many turned passes as the model's field of view needs
@@ -100,7 +101,7 @@ class Detector:
         provider: providers.Provider | Literal["auto"] = "cpu",
         precision: providers.Precision | None = None,
         threads: int | None = None,
-        score_threshold: float | None = None,
+        score_threshold: float | Mapping[str, float] | None = None,
         mounting: Mounting | None = None,
         view: View = "ahead",
     ) -> None:

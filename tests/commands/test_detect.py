@@ -143,7 +143,7 @@ def test_pictures_of_other_boxes_do_not_stay(tmp_path: Path) -> None:
     assert before.keys() >= {"000000.txt", "000000_bev.png", "000001_bev.png"}
     detect([scans], out=out, threads=1, pictures=False)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "they are of the same boxes"
-    detect([split.scan_path("000001")], out=out, threads=1, pictures=False, score=0.99)
+    detect([split.scan_path("000001")], out=out, threads=1, pictures=False, score=["0.99"])
     left = {path.name for path in out.iterdir()}
     assert left == before.keys() - {"000001_bev.png"}, "other scans' stay"
     split.calib_path("000001").unlink()

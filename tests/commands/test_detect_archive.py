@@ -175,10 +175,22 @@ def test_scans_of_the_same_names_below_another_folder_are_others(
         detect([Path("scans")], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
 
 
+def test_scores_of_classes_reach_the_workers(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
+    for scores in (["Car=0.9", "Cyclist=0.4"], ["Cyclist=0.4", "Car=0.9"]):  # the same run
+        run(scans, tmp_path / "out", bundle, score=scores)
+    assert len(here.begun) == 3
+    with pytest.raises(ScanError, match="1 of 40"):
+        detect(
+            [scans], out=tmp_path / "alone", bundle=bundle, threads=1, pictures=False, score=["Cyclist=0.4", "Car=0.9"]
+        )
+    found, alone = ((tmp_path / name / "detections.jsonl").read_bytes() for name in ("out", "alone"))
+    assert found == alone
+
+
 def test_another_run_is_refused(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
     run(scans, tmp_path / "out", bundle)
     with pytest.raises(OutputError, match=r"score = None, now 0\.3; choose another folder"):
-        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1", score=0.3)
+        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1", score=["0.3"])
     other = write_bundle(tmp_path / "other", uses_counts=False)
     with pytest.raises(OutputError, match="bundle_sha256 = "):
         detect([scans], out=tmp_path / "out", bundle=other, cluster="made-up:1")

@@ -312,10 +312,18 @@ def test_a_journal_of_other_settings_is_not_gone_on_with(
 ) -> None:
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(steps, "tracked", _dies)
-        run(drive, tmp_path, score=0.9)
+        run(drive, tmp_path, score=["0.9"])
     assert (tmp_path / JOURNAL_FILE).exists() and "beginning anew" not in capsys.readouterr().out
-    assert min(box["score"] for line in run(drive, tmp_path, score=0.5) for box in line["boxes"]) < 0.9
+    assert min(box["score"] for line in run(drive, tmp_path, score=["0.5"]) for box in line["boxes"]) < 0.9
     assert "beginning anew: another run was killed here, with another score" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("track", [False, True])
+def test_scores_of_classes(drive: Path, tmp_path: Path, track: bool) -> None:
+    lines = run(drive, tmp_path / "few", track=track, score=["Car=0.99", "Cyclist=0.99"])
+    few = {box["class"] for line in lines for box in line["boxes"]}
+    every = {box["class"] for line in run(drive, tmp_path / "all", track=track) for box in line["boxes"]}
+    assert "Car" in every and few == every & {"Pedestrian"}
 
 
 def test_a_journal_of_another_pose_is_not_gone_on_with(
@@ -393,7 +401,7 @@ def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"choose such a name"):
         run(drive, tmp_path, foxglove=tmp_path / "boxes.json")
     with pytest.raises(ConfigError, match=r"score_threshold 1\.2 of class Car must lie"):  # before anything is detected
-        run(drive, tmp_path / "none", track=True, score=1.2)
+        run(drive, tmp_path / "none", track=True, score=["1.2"])
     assert not (tmp_path / "none" / JOURNAL_FILE).exists()
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(OutputError, match=r"mine\.txt"):

@@ -55,7 +55,7 @@ def evaluate(
     json_path: Path | None = None,
     gallery: int | None = 0,
     compare: Path | None = None,
-    score: float | None = None,
+    score: list[str] | None = None,
     min_score: float = 0.05,
     provider: str = "cpu",
     precision: str | None = None,
@@ -130,7 +130,7 @@ def test_predictions_with_a_dataset_are_scored_on_its_split_and_drawn(
     tmp_path: Path, root: Path, texts: dict[str, Any]
 ) -> None:
     (texts["predictions"] / "000002.txt").write_text("")
-    report = evaluate(predictions=texts["predictions"], data=root, out=tmp_path / "out", gallery=None, score=0.95)
+    report = evaluate(predictions=texts["predictions"], data=root, out=tmp_path / "out", gallery=None, score=["0.95"])
     assert report["frames"] == 2  # of three, because `val` lists two
     names = {path.name for path in (tmp_path / "out" / "gallery").iterdir()}
     assert names == {"001_000001.png", "002_000002.png", "index.md"}  # nothing reaches 0.95: four misses each
@@ -240,11 +240,11 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
     assert refusal(tmp_path, **texts, data=root, compare=det, protocol="waymo") == (
         "--compare det belongs to the gallery of --protocol kitti; leave it out"
     )
-    assert refusal(tmp_path, **texts, score=float("nan")) == "--score nan must be a number"
+    assert refusal(tmp_path, **texts, score=["nan"]) == "--score nan must be a number"
     assert refusal(tmp_path, **texts, split="val") == (
         "--split val is a list of the frames of a dataset: give --data ROOT, too"
     )
-    assert refusal(tmp_path, data=root, score=0.04) == (
+    assert refusal(tmp_path, data=root, score=["0.04"]) == (
         "score 0.04 of Car is below --min-score 0.05, the lowest that asca_sim_int8 is run with; lower --min-score"
     )
     assert "bundle.json" in refusal(tmp_path, model=tmp_path, data=root)

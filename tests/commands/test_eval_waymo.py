@@ -42,7 +42,7 @@ def test_waymos_metric_of_the_shipped_bundle(tmp_path: Path, root: Path) -> None
 
 def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
     waymo = {**texts, "protocol": "waymo"}
-    assert refusal(tmp_path, **waymo, score=0.5) == (
+    assert refusal(tmp_path, **waymo, score=["0.5"]) == (
         "--score 0.5 belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
     )
     assert "--gallery 2 belongs to --protocol kitti" in refusal(tmp_path, **waymo, data=root, gallery=2)

@@ -61,6 +61,9 @@ def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path
         exported = run_here("export", folder, "-o", folder, "--scans", scans, "--score", f"Car={score}")
         assert exported.returncode == 0, exported.stderr
         assert load_pillar_bundle(folder).spec.classes[0].score_threshold == score
+    exported = run_here("export", folder, "-o", folder, "--scans", scans, "--score", "0.3")
+    assert exported.returncode == 0, exported.stderr
+    assert {each.score_threshold for each in load_pillar_bundle(folder).spec.classes} == {0.3}
     weights, kept = (load_checkpoint(each / WEIGHTS).detector.state_dict() for each in (with_weights, folder))
     assert weights_sha256(weights) == weights_sha256(kept)
 

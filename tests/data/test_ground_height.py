@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_pillars.data.ground_height import estimate_height, fit_ground_plane, measured_mounting
+from asca_pillars.data.ground_height import (
+    NamedPoints,
+    estimate_height,
+    estimate_named_height,
+    fit_ground_plane,
+    measured_mounting,
+)
 from asca_pillars.data.input_check import ground_z_m
 from asca_pillars.data.mounting import Mounting
 from asca_pillars.errors import ScanError
@@ -72,10 +78,38 @@ def test_the_height_is_estimated_along_the_axes() -> None:
         ([sloped(1.7)[:100]], "scan 1: too few points"),
         ([sloped(1.7, tilt_deg=9)], "tilted by 9 degrees"),
         ([sloped(1.7, noise_m=2.0)], "of the low points"),
-        ([sloped(1.7), sloped(1.2)], "2 scans disagree by 0.5"),
+        ([sloped(1.7), sloped(1.2)], r"2 scans disagree by 0\.50 m .*: 1\.2. m in scan 2, 1\.7. m in scan 1;"),
+        ([sloped(1.7)[:100], sloped(1.7, tilt_deg=9)], r"from scan 1: too few points .* \(and 1 more\)"),
     ],
 )
 def test_an_unsure_height_is_refused(scans: list[NDArray[np.float32]], message: str) -> None:
     with pytest.raises(ScanError, match=message) as error:
         estimate_height(scans)
     assert "--sensor-height" in str(error.value)
+
+
+NO_GROUND = {
+    "too few points": sloped(1.7)[:100],
+    "tilted by 9 degrees": sloped(1.7, tilt_deg=9),
+    "of the low points": sloped(1.7, noise_m=2.0),
+}
+
+
+@pytest.mark.parametrize("why", NO_GROUND)
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_scan_without_ground_is_left_out_and_named(why: str, place: int) -> None:
+    scans = [NamedPoints(f"{number}.bin", sloped(1.7, seed=number)) for number in range(2)]
+    scans.insert(place, NamedPoints("garage.bin", NO_GROUND[why]))
+    estimate = estimate_named_height(scans)
+    assert estimate.height_m == pytest.approx(1.7, abs=0.03) and estimate.scans == 2
+    (left_out,) = estimate.left_out
+    assert left_out.startswith("garage.bin: ") and why in left_out
+    assert f"from 2 scans, which agree within {estimate.spread_m:.2f} m" in str(estimate)
+    assert str(estimate).endswith(f"; left out: {left_out}")
+    assert estimate_height([points for _, points in scans]).left_out[0].startswith(f"scan {place + 1}: ")
+
+
+def test_no_more_scans_are_read_than_needed() -> None:
+    scans = iter([NamedPoints(str(number), sloped(1.7, seed=number)) for number in range(4)])
+    assert estimate_named_height(scans, enough=2).scans == 2
+    assert next(scans).name == "2"
