@@ -44,8 +44,9 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> lis
             the classes in another way.
 
     Raises:
-        DatasetError: there is no box of any class that could be learnt; a label or scan cannot be read.
+        DatasetError: there is no box of any class that could be learnt; a file is missing or cannot be read.
     """
+    split.require_files()
     names = config.model.spec.class_names
     labels = _Labels()
     order = np.random.default_rng(0).permutation(len(split.frame_ids)).tolist()

@@ -204,9 +204,10 @@ def test_another_sensor_height_and_its_remedy(data: Path, height_m: float) -> No
 
 def test_scans_that_were_raised_without_their_labels(data: Path) -> None:
     change_scans(data, lambda points: np.subtract(points[:, 2], 0.6, out=points[:, 2]))
-    assert [item.about for item in found(data)] == ["boxes", "height"]
-    assert "z = -2.33 m, the boxes stand +0.6" in found(data)[0].text
-    assert found(data)[0].text.endswith("calib and labels must belong to the scans")
+    boxes, height = found(data)
+    assert boxes.about == "boxes" and "lowered by half a height" in boxes.text
+    assert height.about == "height" and "z = -2.33 m, the boxes stand +0.6" in height.text
+    assert height.text.endswith("calib and labels must belong to the scans")
 
 
 @pytest.mark.parametrize(
