@@ -11,6 +11,10 @@ from asca_pillars.errors import ScanError
 if TYPE_CHECKING:
     import sqlite3  # not every Python has it
 
+_INSTRUCTIONS = 10_000
+"""SQLite may run a hundred times 10,000 instructions, and a hundred for each byte of the file; files of the smallest
+messages need less than one for each."""
+
 
 class SqliteRecording(Recording):
     """One `.db3` file of any version of rosbag2.
@@ -37,10 +41,12 @@ class SqliteRecording(Recording):
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages of a topic by time; a row without data, or with damaged data, is a message without data."""
         self.damage, count = None, 0
+        declared = sum(one.messages for one in self.topics if one.name == topic)
         numbers = self._numbers[topic]
         if formats := self._formats[topic] - {"cdr"}:
             raise ScanError(f"{self.path}: {topic} is encoded as {', '.join(sorted(formats))[:40]}; cdr is read")
-        with closing(self._connected()) as database:
+        # An error in one query of a connection moves the others': data are read through a connection of their own.
+        with closing(self._connected()) as database, closing(self._connected()) as data:
             try:
                 rows = database.execute(
                     f"SELECT rowid, timestamp FROM messages WHERE topic_id IN ({', '.join('?' * len(numbers))}) "
@@ -48,8 +54,10 @@ class SqliteRecording(Recording):
                     numbers,
                 )
                 for row, recorded_ns in rows:
+                    if count == declared:  # damaged pages that lead to each other have rows without end
+                        raise ValueError("its index of times is damaged")
                     is_usable = isinstance(recorded_ns, int) and 0 <= recorded_ns <= LAST_NS
-                    yield Message(recorded_ns if is_usable else None, self._data(database, row), "cdr")
+                    yield Message(recorded_ns if is_usable else None, self._data(data, row), "cdr")
                     count += 1
             except Exception as error:
                 self.damage = f"{self.path}: ends early, after {count} messages of {topic} ({reason(error)})"
@@ -60,6 +68,8 @@ class SqliteRecording(Recording):
         # The stream of a detector may read in one thread what was opened in another, but never in two at once.
         connection = sqlite3.connect(f"{self._file.resolve().as_uri()}?immutable=1", uri=True, check_same_thread=False)
         connection.text_factory = _text
+        left = iter(range(100 + self._file.stat().st_size // 100))
+        connection.set_progress_handler(lambda: next(left, None) is None, _INSTRUCTIONS)
         return connection
 
     def _read_topics(self, database: "sqlite3.Connection") -> None:
