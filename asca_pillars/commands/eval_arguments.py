@@ -118,9 +118,12 @@ def _check_kitti(given: EvalArguments) -> None:
         raise ConfigError(
             f"--protocol {given.protocol}: {given.data} has no camera, which it needs; choose iou or distance"
         )
-    if given.protocol == "waymo" and (given.gallery or given.score is not None):
-        option = f"--gallery {given.gallery}" if given.gallery else f"--score {_typed(given.score)}"
-        raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
+    options = [f"--gallery {given.gallery}"] if given.gallery else []
+    options += [] if given.score is None else [f"--score {_typed(given.score)}"]
+    if given.protocol == "waymo" and options:
+        raise ConfigError(
+            f"{options[0]} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
+        )
 
 
 def _typed(score: Scores) -> str:

@@ -1,9 +1,12 @@
 """Rotation matrices against scipy's, about every axis; transformed points against the matrix product."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from asca_pillars.geometry.rotations import of_quaternions, of_roll_pitch_yaw, transform_columns, transform_points
@@ -36,7 +39,7 @@ def test_what_is_no_rotation_does_not_look_like_one(quaternion: tuple[float, ...
 @given(st.integers(0, 3), st.integers(1, 3), st.integers(1, 3), st.sampled_from([np.float32, np.float64]))
 def test_points_are_transformed_as_by_a_product(count: int, given_axes: int, axes: int, kind: type) -> None:
     rng = np.random.default_rng(count)
-    points = rng.uniform(-60, 60, (count, given_axes)).astype(kind)
+    points: NDArray[Any] = rng.uniform(-60, 60, (count, given_axes)).astype(kind)
     matrix, shift = rng.normal(size=(axes, given_axes)), rng.normal(size=axes)
     expected = points.astype(np.float64) @ matrix.T
     for found, added in ((transform_points(points, matrix, shift), shift), (transform_points(points, matrix), 0.0)):
