@@ -140,9 +140,12 @@ def _check_kitti(given: EvalArguments) -> None:
         )
     if given.compare is not None:
         _check_compare(given.compare, given)
-    if given.protocol == "waymo" and (given.gallery or given.score is not None):
-        option = f"--score {_typed(given.score)}" if given.score is not None else f"--gallery {given.gallery}"
-        raise ConfigError(f"{option} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out")
+    options = [f"--gallery {given.gallery}"] if given.gallery else []
+    options += [] if given.score is None else [f"--score {_typed(given.score)}"]
+    if given.protocol == "waymo" and options:
+        raise ConfigError(
+            f"{options[0]} belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
+        )
 
 
 def _check_compare(compare: Path, given: EvalArguments) -> None:

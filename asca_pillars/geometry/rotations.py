@@ -41,9 +41,9 @@ def transform_points(
     """Points (N, K) -> (N, J): matrix p + shift, see `transform_columns`.
 
     Args:
-        points: (N, K), K at least 1.
+        points: (N, K), metres, K at least 1.
         matrix: (J, K).
-        shift: (J,), added after that; None: nothing.
+        shift: (J,), metres, added after that; None: nothing.
         out: (N, J) that is written and returned; it may be `points` itself. None: a new array.
     """
     columns = transform_columns(np.ascontiguousarray(points.T), matrix, shift)
@@ -54,7 +54,7 @@ def transform_points(
 
 
 def transform_columns(columns: NDArray[Any], matrix: NDArray[Any], shift: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Points as columns (K, N) -> (J, N): matrix p + shift, in the columns' own floating-point type.
+    """Points as columns (K, N), metres -> (J, N): matrix p + shift, in the columns' own floating-point type.
 
     A matrix product of many points would wake the threads of NumPy's BLAS, which then spin for tens of milliseconds on
     the cores that the network needs.
