@@ -13,7 +13,7 @@ SHARED_NAMES = {"__init__.py", "conftest.py"}
 LAYERS = (  # what is in one of them imports from those before it
     {"errors"},
     {"locks"},
-    {"files", "processes", "schema", "strict", "system", "yaml_text"},
+    {"files", "installation", "processes", "schema", "strict", "system", "yaml_text"},
     {"cluster", "geometry"},
     {"pillars", "tables"},
     {"points"},

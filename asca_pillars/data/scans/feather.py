@@ -7,6 +7,7 @@ import numpy as np
 
 from asca_pillars.data.scans.records import StoredPoints
 from asca_pillars.errors import AscaError, ScanError
+from asca_pillars.installation import install_command
 
 
 def read_feather(path: Path) -> StoredPoints:
@@ -34,7 +35,7 @@ def feather_table(
         import pyarrow
         from pyarrow import feather
     except ModuleNotFoundError:
-        raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
+        raise AscaError(f"{path}: pyarrow not installed: {install_command('import')}") from None
     try:
         table = feather.read_table(path, memory_map=False)
     except (pyarrow.ArrowException, OSError) as reason:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.data.recordings.open_recording import is_recording, open_recording
 from asca_pillars.data.recordings.recorded_scans import SEARCHED_MESSAGES, RecordedScans
