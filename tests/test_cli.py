@@ -20,6 +20,7 @@ from asca_deploy import Detector, sample_scan_path
 from asca_pillars.cli import app
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
+from asca_pillars.installation import install_command
 from asca_pillars.schema import to_dict
 from tests.in_process import run_here
 from tests.scenes import make_scene, write_dataset
@@ -124,8 +125,8 @@ def test_doctor_names_the_missing_extras() -> None:
     result = asca("doctor")
     assert result.returncode == 0, result.stderr
     assert "provider cpu: ok" in result.stdout
-    assert "pip install 'asca-pillars[train]'" in result.stdout and "pip install 'asca-pillars[sim]'" in result.stdout
-    assert "provider openvino is not installed: `pip install 'asca-pillars[openvino]'`" in result.stdout
+    assert install_command("train") in result.stdout and install_command("sim") in result.stdout
+    assert f"provider openvino is not installed: `{install_command('openvino')}`" in result.stdout
     assert "auto takes cpu int8" in result.stdout
 
 
@@ -162,9 +163,9 @@ def test_a_scan_without_points_gives_no_boxes(tmp_path: Path) -> None:
 def test_commands_whose_extra_is_missing_say_what_to_install(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("name: x\n")
     message = refusal(asca("train", tmp_path / "config.yaml", "--data", tmp_path, "--out", tmp_path / "run"))
-    assert "pip install 'asca-pillars[train]'" in message
-    assert "asca-pillars[train]" in refusal(asca("export", "last.ckpt", "-o", tmp_path / "bundle"))
-    assert "asca-pillars[sim]" in refusal(asca("simulate", tmp_path / "sim", "-n", 1))
+    assert install_command("train") in message
+    assert install_command("train") in refusal(asca("export", "last.ckpt", "-o", tmp_path / "bundle"))
+    assert install_command("sim") in refusal(asca("simulate", tmp_path / "sim", "-n", 1))
 
 
 def test_train_refuses_typos_and_missing_data(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
 
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    pytest.importorskip("mkdocs", reason="needs pip install 'asca-pillars[docs]'")
+    pytest.importorskip("mkdocs", reason="needs pip install -e '.[docs]'")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     built = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True, timeout=300)
     assert built.returncode == 0, built.stderr

@@ -12,7 +12,7 @@ LAYERS = (  # what is in one of them imports from those before it
     {"errors", "telemetry"},
     {"locks"},
     {"own_files"},
-    {"files", "input_files", "processes", "schema", "sealed_lines", "strict", "system", "yaml_text"},
+    {"files", "input_files", "installation", "processes", "schema", "sealed_lines", "strict", "system", "yaml_text"},
     {"cluster", "geometry"},
     {"pillars", "tables"},
     {"points"},

@@ -11,6 +11,7 @@ from asca_deploy.auto import summary
 from asca_deploy.providers import AUTO, PROVIDERS, require
 from asca_pillars.commands.extras import EXTRAS, missing_modules
 from asca_pillars.errors import AscaError
+from asca_pillars.installation import install_command
 from asca_pillars.system import cpu_model, package_versions
 
 
@@ -22,8 +23,8 @@ def print_checks(console: Console) -> None:
         _check(console, f"provider {name}", partial(_provider, name))
     for extra in EXTRAS:
         missing = missing_modules(extra)
-        remedy = f"missing {', '.join(missing)}: pip install 'asca-pillars[{extra}]'"
-        console.print(f"  extra {extra}: {remedy if missing else 'ok'}", highlight=False)
+        remedy = f"missing {', '.join(missing)}: {install_command(extra)}"
+        console.print(f"  extra {extra}: {remedy if missing else 'ok'}", highlight=False, soft_wrap=True)
     _check(console, f"bundled model {default_bundle_path().name}", _bundled_model)
 
 

@@ -29,6 +29,7 @@ from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
 from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
 from asca_pillars.files import atomic_directory, remove_directory, write_json
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.installation import install_command
 from asca_pillars.own_files import is_own_picture, require_own_file
 from asca_pillars.pillars.grid import PillarGrid
 from asca_pillars.system import describe_environment
@@ -172,7 +173,7 @@ def report_kitti(task: Task, frames: ScoredFrames, out: Path, json_path: Path | 
     require_own_file(out / CURVES, COMMAND, is_own_picture)
     if missing_modules("eval"):
         (out / CURVES).unlink(missing_ok=True)
-        console.print("No curves.png without matplotlib: pip install 'asca-pillars[eval]'", style="yellow")
+        console.print(f"No curves.png without matplotlib: {install_command('eval')}", style="yellow", soft_wrap=True)
     else:
         write_curves(out / CURVES, ap.overall, report.title)
 

@@ -3,6 +3,7 @@
 import importlib.util
 
 from asca_pillars.errors import AscaError
+from asca_pillars.installation import install_command
 
 EXTRAS = {
     "train": ("torch", "lightning", "onnx", "onnxscript", "tensorboard"),
@@ -24,4 +25,4 @@ def missing_modules(extra: str) -> list[str]:
 def require(extra: str) -> None:
     """Raise AscaError that names what to install unless every module of the extra is there."""
     if missing := missing_modules(extra):
-        raise AscaError(f"{', '.join(missing)} not installed: pip install 'asca-pillars[{extra}]'")
+        raise AscaError(f"{', '.join(missing)} not installed: {install_command(extra)}")

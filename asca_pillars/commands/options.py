@@ -118,7 +118,7 @@ ClusterOption = Annotated[
     typer.Option(
         "--cluster",
         help="Work on a Ray cluster: its address (HOST:PORT), auto, or local for all cores of this machine. "
-        "Needs pip install 'asca-pillars\\[cluster]'; docs/CLUSTER.md.",
+        "Needs the extra cluster, which `asca doctor` says how to install; docs/CLUSTER.md.",
     ),
 ]
 

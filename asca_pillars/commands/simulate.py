@@ -63,7 +63,7 @@ def simulate(
         typer.Option(
             "--report",
             help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/. "
-            "Needs matplotlib: pip install 'asca-pillars\\[eval]'.",
+            "Needs matplotlib, the extra eval: `asca doctor` says how to install it.",
         ),
     ] = False,
     like: Annotated[

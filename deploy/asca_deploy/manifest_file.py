@@ -8,6 +8,7 @@ from typing import Any
 from asca_deploy.bundle import MANIFEST, SCHEMA_VERSION
 from asca_pillars.errors import BundleError, printable
 from asca_pillars.input_files import require_content
+from asca_pillars.installation import upgrade_advice
 
 EXPORT_AGAIN = "export the bundle again with `asca export`"
 LONGEST_REASON = 300
@@ -42,7 +43,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
     if version > SCHEMA_VERSION:
         raise BundleError(
             f"{manifest}: schema_version {reprlib.repr(version)} is newer than {SCHEMA_VERSION}, which this version "
-            "reads; upgrade with `pip install --upgrade asca-pillars`"
+            f"reads; {upgrade_advice()}"
         )
     if version < 2:
         raise BundleError(f"{manifest}: schema_version {reprlib.repr(version)} is no longer read; {EXPORT_AGAIN}")

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from asca_deploy.graph import Tensor
 from asca_pillars.errors import BundleError, ProviderError
+from asca_pillars.installation import install_command
 
 if TYPE_CHECKING:
     import openvino
 
 _DEVICE = "CPU"
-_REMEDY = "`pip install 'asca-pillars[openvino]'`"
 _HINTS = {"float32": "f32", "reduced": "bf16"}
 _TYPES = {"f32": "float32", "u8": "uint8", "i32": "int32", "i64": "int64"}
 
@@ -30,7 +30,7 @@ _TYPES = {"f32": "float32", "u8": "uint8", "i32": "int32", "i64": "int64"}
 def require(precision: str) -> None:
     """Raise ProviderError, which says what to install or to choose, unless OpenVINO computes in this precision here."""
     if importlib.util.find_spec("openvino") is None:
-        raise ProviderError(f"provider openvino is not installed: {_REMEDY}")
+        raise ProviderError(f"provider openvino is not installed: `{install_command('openvino')}`")
     if precision == "reduced" and not _has_bfloat16():
         raise ProviderError(
             f"provider openvino has no precision reduced on this CPU ({_device_name()}), which lacks bfloat16; "
@@ -128,7 +128,9 @@ def _properties(precision: str, threads: int) -> dict[str, Any]:
 def _core() -> "openvino.Core":
     core = _import_openvino().Core()
     if _DEVICE not in core.available_devices:
-        raise ProviderError(f"provider openvino finds no CPU that it can use; reinstall it: {_REMEDY}")
+        raise ProviderError(
+            "provider openvino finds no CPU that it can use; reinstall it: `pip install --force-reinstall openvino`"
+        )
     return core
 
 
@@ -145,7 +147,9 @@ def _import_openvino() -> Any:
     try:
         import openvino
     except ImportError as error:
-        raise ProviderError(f"provider openvino cannot be imported ({error}); reinstall it: {_REMEDY}") from error
+        raise ProviderError(
+            f"provider openvino cannot be imported ({error}); reinstall it: `pip install --force-reinstall openvino`"
+        ) from error
     finally:
         if absent:
             del sys.modules[telemetry]

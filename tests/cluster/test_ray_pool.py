@@ -15,7 +15,7 @@ from asca_pillars.cluster.schedule import work_off
 from asca_pillars.cluster.shards import Shard, cut
 from asca_pillars.errors import ClusterError
 
-pytest.importorskip("ray", reason="needs pip install 'asca-pillars[cluster]'")
+pytest.importorskip("ray", reason="needs pip install -e '.[cluster]'")
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
 DEADLY = 5

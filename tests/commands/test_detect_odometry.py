@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.errors import ConfigError, ScanError
 from tests.commands.short_drive import POINTS, SCANS

@@ -1,6 +1,7 @@
 """`asca detect` of recordings: what is written, that a kill changes nothing, and how it refuses."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_deploy import find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
@@ -25,6 +26,7 @@ from asca_pillars.commands.recording_journal import JOURNAL_FILE, Journal, ScanR
 from asca_pillars.data.boxes.box_records import read_frames
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.errors import AscaError, ConfigError, OutputError, ScanError
+from asca_pillars.installation import install_command
 from benchmarks.made_recordings import write_recording
 from tests.commands.short_drive import POINTS, SCANS
 from tests.data.recordings.cloud_recordings import laid_out, stamps, write_mcap
@@ -410,5 +412,5 @@ def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
 
 def test_missing_libraries_are_named(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(extras.EXTRAS, "recordings", ("no_such_library",))
-    with pytest.raises(AscaError, match=r"pip install 'asca-pillars\[recordings\]'"):
+    with pytest.raises(AscaError, match=re.escape(install_command("recordings"))):
         run(drive, tmp_path)

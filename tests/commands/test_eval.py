@@ -21,6 +21,7 @@ from asca_pillars.commands.eval_steps import Protocol
 from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.errors import AscaError
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
+from asca_pillars.installation import install_command
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint
 from tests.saved_checkpoint import save_checkpoint
@@ -122,7 +123,7 @@ def test_the_base_install_is_enough_for_everything_but_the_curves(tmp_path: Path
     command = [sys.executable, "-c", BASE_INSTALL]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode == 0 and not result.stderr, result.stderr
-    assert "No curves.png without matplotlib: pip install 'asca-pillars[eval]'" in result.stdout.splitlines()
+    assert f"No curves.png without matplotlib: {install_command('eval')}" in result.stdout.splitlines()
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.md"}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.commands import detect_recording as steps
 from asca_pillars.commands.recording_journal import JOURNAL_FILE
@@ -19,7 +19,7 @@ from tests.commands.test_detect_recording import run
 
 
 def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
-    rerun = pytest.importorskip("rerun", reason="needs pip install 'asca-pillars[view]'")
+    rerun = pytest.importorskip("rerun", reason="needs pip install -e '.[view]'")
     lines = run(drive, tmp_path / "out", track=True, rerun=tmp_path / "out.rrd")
     boxes: dict[int, list[str]] = {}
     points = 0

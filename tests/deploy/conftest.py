@@ -24,7 +24,7 @@ from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
 from asca_pillars.tables.neck_tables import MaskRule
 
 needs_openvino = pytest.mark.skipif(
-    importlib.util.find_spec("openvino") is None, reason="needs pip install 'asca-pillars[openvino]'"
+    importlib.util.find_spec("openvino") is None, reason="needs pip install -e '.[openvino]'"
 )
 
 CHANNELS = 8

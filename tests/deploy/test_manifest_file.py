@@ -14,7 +14,7 @@ def test_no_usable_schema_version(bundle_copy: Path, version: object) -> None:
 
 def test_newer_schema_version_is_said_before_anything_else(bundle_copy: Path) -> None:
     edit(bundle_copy, lambda data: data.update(schema_version=SCHEMA_VERSION + 1, graphs="packed"))
-    assert_refused(bundle_copy, r"schema_version 4 is newer .*pip install --upgrade asca-pillars")
+    assert_refused(bundle_copy, r"schema_version 4 is newer .*reads; upgrade with `git -C .* pull`")
 
 
 def test_older_schema_version(bundle_copy: Path) -> None:

@@ -59,7 +59,7 @@ def test_what_is_available(found: list[tuple[str, str]]) -> None:
     [
         (BARE, "cuda", "float32", r"not in this onnxruntime .*which has cpu; .*onnxruntime-gpu"),
         (BARE, "tensorrt", "reduced", "pip install tensorrt"),
-        (BARE, "openvino", "float32", r"pip install 'asca-pillars\[openvino\]'"),
+        (BARE, "openvino", "float32", r"provider openvino is not installed: `pip install .*\[openvino\]'`"),
         (BARE, "cpu", "reduced", r"cpu has no precision reduced.*provider openvino.*--int8"),
         (OLD_CPU, "openvino", "reduced", r"Example 9000.*bfloat16; choose float32"),
         (GPU, "tensorrt", "float32", "NVIDIA_TF32_OVERRIDE=0"),

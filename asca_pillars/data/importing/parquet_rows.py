@@ -6,6 +6,7 @@ from typing import Any
 
 from asca_pillars.errors import AscaError, DatasetError
 from asca_pillars.input_files import require_content
+from asca_pillars.installation import install_command
 
 _BATCH = 8  # rows that are in memory at once: a range image has millions of numbers
 
@@ -23,7 +24,7 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
         import pyarrow
         from pyarrow import parquet
     except ModuleNotFoundError:
-        raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
+        raise AscaError(f"{path}: pyarrow not installed: {install_command('import')}") from None
     try:
         require_content(path, DatasetError)
         with parquet.ParquetFile(path) as file:

@@ -8,6 +8,7 @@ import numpy as np
 from asca_pillars.data.scans.records import StoredPoints
 from asca_pillars.errors import AscaError, ScanError
 from asca_pillars.input_files import require_content
+from asca_pillars.installation import install_command
 
 _FEW_ROWS = 2**23
 """Rows that a file may have however small it is; a column of equal numbers is compressed to nearly nothing."""
@@ -40,7 +41,7 @@ def feather_table(
         import pyarrow
         from pyarrow import compute, dataset, feather
     except ModuleNotFoundError:
-        raise AscaError(f"{path}: pyarrow not installed: pip install 'asca-pillars[import]'") from None
+        raise AscaError(f"{path}: pyarrow not installed: {install_command('import')}") from None
     try:
         require_content(path, error)
         rows, most = dataset.dataset(path, format="feather").count_rows(), max(_FEW_ROWS, 2 * path.stat().st_size)

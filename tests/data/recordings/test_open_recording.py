@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.data.recordings import recorded_scans
 from asca_pillars.data.recordings.open_recording import is_recording, open_recording

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("rosbags", reason="needs pip install 'asca-pillars[recordings]'")
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.data.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.data.recordings.recording import Message

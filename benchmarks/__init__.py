@@ -1,0 +1,1 @@
+"""Commands that measure this project; a package, or the `benchmarks` that pyarrow 17 installs would hide them."""
