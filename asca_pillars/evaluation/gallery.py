@@ -13,7 +13,7 @@ from rich.progress import track
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
-from asca_pillars.files import atomic_path
+from asca_pillars.files import atomic_path, portable_name
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.drawing import Color, Image
 from asca_pillars.pictures.visualize import BoxLayer, draw_layers, draw_on_image, read_image, write_png
@@ -80,7 +80,7 @@ def write_gallery(
     rows = [_INTRODUCTION.format(title=title), "| frame | missed | false |", "| --- | ---: | ---: |"]
     bar = track(frames, "Drawing", console=console, disable=console is None)
     for rank, frame in enumerate(bar, start=1):
-        name = f"{rank:03d}_{frame.frame_id}.png"
+        name = f"{portable_name(f'{rank:03d}_{frame.frame_id}')}.png"
         write_png(Path(folder) / name, _draw(frame, split, Path(labels), Path(predictions), ranges))
         rows.append(f"| [{frame.frame_id}]({name}) | {frame.missed.sum()} | {frame.false_positive.sum()} |")
     with atomic_path(Path(folder) / INDEX) as temporary:
