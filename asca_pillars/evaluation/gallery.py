@@ -16,7 +16,7 @@ from rich.progress import track
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image, read_labels
 from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
-from asca_pillars.files import write_text
+from asca_pillars.files import portable_name, write_text
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.own_files import page_end
 from asca_pillars.pictures.drawing import BACKGROUND, Color, Image, Texts
@@ -136,7 +136,7 @@ def write_gallery(
     bar = track(chosen, "Drawing", console=console, disable=console is None)
     for rank, matches in enumerate(bar, start=1):
         frame_id = matches[0].frame_id
-        name = f"{rank:03d}_{frame_id}.png"
+        name = f"{portable_name(f'{rank:03d}_{frame_id}')}.png"
         write_png(Path(folder) / name, _draw(matches, detectors, split, Path(labels), ranges))
         counts = [f"{kind.sum()}" for one in matches for kind in (one.missed, one.false_positive)]
         rows.append(f"| [{frame_id}]({name}) | {' | '.join(counts)} |")

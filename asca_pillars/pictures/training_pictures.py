@@ -6,6 +6,7 @@ import numpy as np
 
 from asca_pillars.data.frames import LabeledFrame, Motion, within_ranges
 from asca_pillars.data.training_frames import TrainingFrames
+from asca_pillars.files import portable_name
 from asca_pillars.geometry.anchors import IGNORED
 from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_layers, write_png
@@ -25,7 +26,8 @@ def draw_training_frames(folder: Path, frames: TrainingFrames, count: int) -> li
         number = position * total // min(count, total)
         frame, _ = frames.draw(0, number)
         frame = within_ranges(frame, frames.spec.ranges)
-        path = folder / f"{position:02d}_{frame.frame_id.replace('/', '_')}.png"
+        name = portable_name(f"{position:02d}_{frame.frame_id}".replace("/", "_"))
+        path = folder / f"{name}.png"
         write_png(path, draw_training_frame(frame, frames))
         said.append(f"{path}: {len(frame.boxes)} boxes{_moved(frame.motion)}")
     return said

@@ -57,6 +57,8 @@ class BatchLoader(DataLoader[Any]):
                 late = text.startswith("DataLoader timed out")
                 looks += 1
                 if late and looks < MOST_LOOKS:
+                    if batches is None:  # late answers to the start of an epoch would be taken for batches
+                        self._iterator = None
                     continue
                 _kill(self)
                 reason = f"no batch in {looks * LOOK_AGAIN_S} seconds" if late else text

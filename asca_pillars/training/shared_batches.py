@@ -9,7 +9,7 @@ import mmap
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from multiprocessing.reduction import DupFd
+from multiprocessing import reduction
 from typing import Any
 
 import torch
@@ -48,7 +48,7 @@ class SharedInputs:
         try:
             with open(descriptor, "wb", closefd=False) as file:
                 self.placed = tree_map_only(Tensor, lambda tensor: self._place(tensor, file), inputs)
-            self.memory = DupFd(descriptor)
+            self.memory = reduction.DupFd(descriptor)
         finally:
             os.close(descriptor)
 

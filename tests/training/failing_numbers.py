@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,8 @@ class Numbers:
     def __getitem__(self, index: int) -> Any:
         if index == 4 and self.what == "unsendable":
             return Unsendable()
-        if index == 4 and self.what:
+        if self.what == "slow":
+            time.sleep(3 if index == 4 else 0)
+        elif index == 4 and self.what:
             os.kill(os.getpid(), getattr(signal, self.what))
         return index

@@ -39,6 +39,12 @@ def test_batches_come_in_order_epoch_after_epoch() -> None:
         assert list(loader) == [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9], [10, 11]]
 
 
+def test_an_epoch_begins_while_processes_are_at_the_last_one() -> None:
+    loader = loader_of("slow")
+    assert next(iter(loader)) == [0, 1]
+    assert list(loader) == [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9], [10, 11]]
+
+
 @pytest.mark.parametrize(
     ("what", "said"),
     [("SIGKILL", "exited unexpectedly"), ("unsendable", "exited unexpectedly"), ("SIGSTOP", "no batch in 4 seconds")],

@@ -128,11 +128,10 @@ def renamed(imported: Imported, names: Mapping[str, str]) -> Imported:
     Raises:
         ConfigError: a class that no box has, or a new name that is none.
     """
-    for name in names.values():
-        try:
-            text_of(name, "the new name")
-        except ValueError as reason:
-            raise ConfigError(f"--rename: {reason}; give a name of one line") from None
+    try:
+        names = {old: text_of(new, "the new name") for old, new in names.items()}
+    except ValueError as reason:
+        raise ConfigError(f"--rename: {reason}; give a name of one line") from None
     there = {kind for frame in imported.frames for kind in frame.records.types}
     if unknown := sorted(set(names) - there):
         raise ConfigError(

@@ -99,7 +99,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> li
         if not isinstance(time, int) or time not in missing:
             continue
         poses = None
-        if row[_LASER] == TOP:  # the only one whose pixels have poses
+        if _is_top(row):  # the only one whose pixels have poses
             while time not in early and (other := next(pixel_poses, None)) is not None:
                 early |= {other[0]: other[1]} if other[0] in missing else {}
             poses = early.pop(time, None)
@@ -211,11 +211,16 @@ def _pixel_poses(path: Path, left_out: LeftOut) -> Iterator[tuple[int, NDArray[n
     columns = (_TIME, _LASER, f"{_PIXEL_POSE}.values", f"{_PIXEL_POSE}.shape")
     for number, row in enumerate(parquet_rows(path, columns) if path.is_file() else ()):
         try:
-            image = _image(row, _PIXEL_POSE) if row[_LASER] == TOP else None
+            image = _image(row, _PIXEL_POSE) if _is_top(row) else None
             if image is not None:
                 yield whole_number(row[_TIME], _TIME), image
         except ValueError as reason:
             left_out.add("poses", f"{path}, row {number}", reason)
+
+
+def _is_top(row: dict[str, Any]) -> bool:
+    laser = row[_LASER]  # perhaps an array, which has no truth value
+    return isinstance(laser, int) and laser == TOP
 
 
 def _image(row: dict[str, Any], name: str) -> NDArray[np.float32] | None:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.files import portable_name
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.processes import in_processes
 
@@ -114,7 +115,7 @@ def prepare_database(
         "class_names": list(class_names),
         "camera_view": camera_view,
     }
-    path = prepared / "objects" / f"{split.name}-{_key(split, built_from)}.json"
+    path = prepared / "objects" / f"{portable_name(split.name)}-{_key(split, built_from)}.json"
     if not path.exists():
         require_writable(prepared)
         read = partial(_read_objects, split, tuple(class_names), camera_view)

@@ -105,6 +105,18 @@ def test_one_bad_image_of_waymo_costs_its_frame(table: str, column: str, value: 
     assert BoxSplit(tmp_path / "out").frame_ids == ("segment/1000",)
 
 
+@pytest.mark.parametrize("value", [[1, 2], {"a": 1}, "1", 1.5, None])
+@pytest.mark.parametrize("table", ["lidar", "lidar_pose", "lidar_calibration"])
+def test_a_sensor_of_waymo_is_a_number(table: str, value: Any, tmp_path: Path) -> None:
+    source = write_segment(tmp_path / "waymo", moved_m=1.0)
+    change_parquet(source / table / "segment.parquet", "key.laser_name", lambda old: [value] * len(old), False)
+    if table == "lidar_pose":  # points stay where they were measured
+        assert "boxes: Vehicle 1" in invoke("import", source, tmp_path / "out", "--from", "waymo")
+    else:
+        with pytest.raises(DatasetError, match="no labelled scan there that can be used"):
+            invoke("import", source, tmp_path / "out", "--from", "waymo")
+
+
 @pytest.mark.parametrize(
     ("column", "value"),
     [

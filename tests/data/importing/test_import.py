@@ -86,7 +86,14 @@ def test_classes_by_other_names(tmp_path: Path) -> None:
     source = (own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
     output = invoke("import", *source, "--rename", "Forklift=Truck", "--rename", "Car=Truck")
     assert "boxes: Truck 8" in output
-    for text, message in (("Bus=Truck", "no box has that class; there are Car, Forklift"), ("Car", "write OLD=NEW")):
+    assert "boxes: Big one 4" in invoke(
+        "import", *source, "--rename", "Car= Big\n one", "--rename", "Forklift=Truck"
+    ).replace("Truck 4, ", "")
+    for text, message in (
+        ("Bus=Truck", "no box has that class; there are Car, Forklift"),
+        ("Car", "write OLD=NEW"),
+        ("Car= ", "the new name is ' ', no name"),
+    ):
         with pytest.raises(ConfigError, match=message):
             invoke("import", *source, "--rename", text)
 
