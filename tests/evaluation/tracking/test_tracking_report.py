@@ -190,7 +190,7 @@ def test_ranges_are_those_of_the_model_whatever_the_axes(tmp_path: Path) -> None
     own = [BOX | {"x_m": 0, "y_m": 50, "track_id": 1}]
     root = street(tmp_path / "own", "y-forward", own)
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "recording.json").write_text(json.dumps({"ranges_m": [[0, 69], [-30, 30]]}))
+    (tmp_path / "out" / "recording.json").write_text(json.dumps({"classes": ["Car"], "ranges_m": [[0, 69], [-30, 30]]}))
     (car,) = score(root, tmp_path / "out", [{"scan": "0.npy", "boxes": own}]).scores
     assert car.clear.labels == 1 and car.clear.mota == 1
 
