@@ -11,15 +11,15 @@ The names below are the stable ones (docs/API.md). They are imported when they a
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from asca_pillars.telemetry import disable_telemetry
+from asca_pillars.base.telemetry import disable_telemetry
 
 if TYPE_CHECKING:
     from asca_deploy import Bundle, Detector, ScanQueue, Tracker, Tracks, load_bundle
-    from asca_pillars.data.mounting import Mounting
-    from asca_pillars.data.scans.scan_reader import Scan, read_scan
-    from asca_pillars.errors import AscaError
-    from asca_pillars.geometry.detections import Detection, Detections
-    from asca_pillars.geometry.frame_report import FrameReport
+    from asca_pillars.base.errors import AscaError
+    from asca_pillars.detection.detections import Detection, Detections
+    from asca_pillars.detection.report import FrameReport
+    from asca_pillars.scans.mounting import Mounting
+    from asca_pillars.scans.scan_reader import Scan, read_scan
 
 __version__ = "0.1.0"
 
@@ -43,19 +43,19 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AscaError": "asca_pillars.errors",
+    "AscaError": "asca_pillars.base.errors",
     "Bundle": "asca_deploy",
-    "Detection": "asca_pillars.geometry.detections",
-    "Detections": "asca_pillars.geometry.detections",
+    "Detection": "asca_pillars.detection.detections",
+    "Detections": "asca_pillars.detection.detections",
     "Detector": "asca_deploy",
-    "FrameReport": "asca_pillars.geometry.frame_report",
-    "Mounting": "asca_pillars.data.mounting",
-    "Scan": "asca_pillars.data.scans.scan_reader",
+    "FrameReport": "asca_pillars.detection.report",
+    "Mounting": "asca_pillars.scans.mounting",
+    "Scan": "asca_pillars.scans.scan_reader",
     "ScanQueue": "asca_deploy",
     "Tracker": "asca_deploy",
     "Tracks": "asca_deploy",
     "load_bundle": "asca_deploy",
-    "read_scan": "asca_pillars.data.scans.scan_reader",
+    "read_scan": "asca_pillars.scans.scan_reader",
 }
 
 

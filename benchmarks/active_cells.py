@@ -14,16 +14,16 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.config import load_config, pillar_spec
+from asca_pillars.base.system import cpu_model
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.config.tree import load_config, pillar_spec
 from asca_pillars.data.frames import read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.detection.targets import assign_targets
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.pillars.map_pooling import map_cells
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.system import cpu_model
-from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, NeckTables
+from asca_pillars.ops.pillar.map_pooling import map_cells
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables
+from asca_pillars.ops.pillar.spec import PillarSpec
 
 
 def main(

@@ -15,10 +15,10 @@ import numpy as np
 import typer
 
 from asca_deploy import Detector
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scans.find_scans import find_scans
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_reader import read_scan
 
 
 def main(

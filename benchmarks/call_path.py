@@ -17,8 +17,8 @@ import typer
 import asca_deploy
 import asca_pillars
 from asca_deploy import Detector, sample_scan_path
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.scans.scan_reader import read_scan
 
 ROOTS = [Path(package.__file__).parent for package in (asca_pillars, asca_deploy) if package.__file__]
 

@@ -31,13 +31,13 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from asca_pillars.base.files import write_json
+from asca_pillars.cli.detect_archive import DetectShard, bundle_digest
+from asca_pillars.cli.options import RuntimeOptions
+from asca_pillars.cli.run_command import run_command
 from asca_pillars.cluster.shards import cut
-from asca_pillars.commands.detect_archive import DetectShard, bundle_digest
-from asca_pillars.commands.options import RuntimeOptions
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.files import write_json
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy.conftest import make_scan, write_bundle
 
 POINTS = 300

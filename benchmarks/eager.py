@@ -26,17 +26,17 @@ from rich.progress import track
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import compare
 from asca_deploy.providers import Precision, Provider
-from asca_export.exporter import MIN_SCANS, export_bundle
-from asca_pillars.commands.bench_tables import comparison_table
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.config import pillar_spec
-from asca_pillars.data.scans.find_scans import find_scans
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import AscaError
-from asca_pillars.geometry.decode import HeadMaps
+from asca_export.pillar.export import MIN_SCANS, export_bundle
+from asca_pillars.base.errors import AscaError
+from asca_pillars.base.system import cpu_model, default_threads, package_versions
+from asca_pillars.cli.bench_tables import comparison_table
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.config.tree import pillar_spec
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.system import cpu_model, default_threads, package_versions
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.scan_reader import read_scan
 from benchmarks.padded import PaddedDetector
 from benchmarks.random_weights import random_weights
 

@@ -27,9 +27,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.errors import AscaError
-from asca_pillars.files import write_json
+from asca_pillars.base.errors import AscaError
+from asca_pillars.base.files import write_json
+from asca_pillars.cli.run_command import run_command
 from benchmarks.fuzz_inputs import Kind, kinds
 
 OUTCOMES = ("read", "refused", "traceback", "slow", "not finite", "too many points")

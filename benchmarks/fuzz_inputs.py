@@ -11,16 +11,16 @@ import yaml
 
 from asca_deploy import default_bundle_path
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.config import Config, load_config
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import shipped_configs
+from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_records import read_frame_file, read_frames, read_time
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels
-from asca_pillars.data.mounting import read_pose
-from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
-from asca_pillars.schema import to_dict
-from asca_pillars.settings import shipped_configs
+from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
+from asca_pillars.scans.mounting import read_pose
+from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.sim.simulation_configs import load_simulation_config
-from asca_pillars.tables.voxel_spec import VoxelSpec
 from benchmarks.fuzz_recordings import read_recording, recording_seeds
 
 LABEL = "Car 0.00 0 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57"

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from asca_pillars.data.recordings.odometry import read_poses
-from asca_pillars.data.recordings.open_recording import open_recording
-from asca_pillars.data.recordings.recorded_scans import RecordedScans
-from asca_pillars.errors import ScanError
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.recordings.odometry import read_poses
+from asca_pillars.scans.recordings.open_recording import open_recording
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans
 from benchmarks.made_recordings import TOPIC, TYPE, point_cloud2
 
 ODOMETRY_TOPIC, ODOMETRY = "/odom", "nav_msgs/msg/Odometry"

@@ -22,14 +22,14 @@ from asca_deploy import default_bundle_path, sample_scan_path
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.detector import usable_points
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.data.input_check import check_input
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.base.system import cpu_model
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.detection.decode import HeadMaps, rotated_nms
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.geometry.decode import HeadMaps, rotated_nms
-from asca_pillars.pillars.map_pooling import map_cells
-from asca_pillars.system import cpu_model
-from asca_pillars.tables.neck_tables import NeckTableBuilder
+from asca_pillars.ops.pillar.map_pooling import map_cells
+from asca_pillars.ops.pillar.neck_rulebooks import NeckTableBuilder
+from asca_pillars.scans.input_check import check_input
+from asca_pillars.scans.scan_reader import read_scan
 
 CAMERA_VIEW = 0.84, 0.25  # |y| / x and |z| / x: about what KITTI's camera 2 sees
 DISTURBANCE = np.zeros(4 << 20, np.float32)  # 16 MB

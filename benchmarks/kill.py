@@ -29,9 +29,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.commands.run_command import run_command
+from asca_pillars.base.files import write_json
+from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.files import write_json
 
 POLL_S = 0.002
 FRAMES = 10

@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from asca_pillars.commands.run_command import run_command
+from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.boxes.box_split import BoxSplit
 
 TOPIC, FRAME_ID = "/points", "lidar"

@@ -27,10 +27,10 @@ from rich.progress import Progress
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.resident_memory import peak_memory_mib, resident_mib
 from asca_deploy.providers import Precision, Provider
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import AscaError
-from asca_pillars.files import atomic_path
+from asca_pillars.base.errors import AscaError
+from asca_pillars.base.files import atomic_path
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.scans.scan_reader import read_scan
 
 CHUNK = 50  # scans of one stream, then as many single calls
 CROPS = 199  # sizes that come again and again, or allocators would go on finding new ones; prime to CHUNK

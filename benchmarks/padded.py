@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import FEATURES, Pillars
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.detections import Detections
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.ops.pillar.prepare import FEATURES, Pillars
+from asca_pillars.ops.pillar.spec import PillarSpec
 
 
 @dataclass(frozen=True)

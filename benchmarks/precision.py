@@ -21,11 +21,11 @@ from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark.box_differences import box_difference
 from asca_deploy.providers import Precision, Provider
 from asca_export.parity import COMPARED_ANCHORS
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.data.scans.find_scans import find_scans
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ProviderError
-from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.base.errors import ProviderError
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.scan_reader import read_scan
 
 ROWS = (
     "class logits of the best anchors, rms",

@@ -20,15 +20,15 @@ from torch import nn
 
 from asca_deploy import sample_scan_path
 from asca_deploy.bundle import PillarBundle
-from asca_export.exporter import MIN_SCANS, export_bundle
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.config import load_config
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ConfigError
+from asca_export.pillar.export import MIN_SCANS, export_bundle
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import load_config
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
-from asca_pillars.pillar_config import PillarModel
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import batch_pillars
+from asca_pillars.scans.scan_reader import read_scan
 
 Neck: TypeAlias = Literal["dense", "sparse"]
 

@@ -25,12 +25,12 @@ import typer
 from asca_deploy import Detections, Detector, ScanQueue, Tracker
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import find_bundle
-from asca_pillars.commands.run_command import run_command
+from asca_pillars.base.system import cpu_model
+from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.evaluation.tracking.tracking_report import tracking_report, tracking_tables
-from asca_pillars.system import cpu_model
 from benchmarks.made_recordings import stamped_scans, write_recording
 
 PACED_SCANS = 200

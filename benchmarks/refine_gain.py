@@ -25,22 +25,22 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_deploy import Detector
-from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
-from asca_pillars.commands.run_command import run_command
+from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.system import cpu_model
+from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import ConfigError
+from asca_pillars.detection.decode import PostProcess
+from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.geometry.decode import PostProcess
-from asca_pillars.geometry.detections import Detections
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.refine.refine_detector import RefineDetector
-from asca_pillars.models.second_stage.open_first_stage import open_first_stage
-from asca_pillars.models.second_stage.proposal_cache import ProposalCache
-from asca_pillars.models.second_stage.refined_detector import judge
-from asca_pillars.points.refined_detections import Scores, refined_detections, refined_scores
-from asca_pillars.system import cpu_model
+from asca_pillars.models.two_stage.network import RefineDetector
+from asca_pillars.models.two_stage.open_first_stage import open_first_stage
+from asca_pillars.models.two_stage.proposal_cache import ProposalCache
+from asca_pillars.models.two_stage.refined_detector import judge
+from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores
 
 Judged = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]
 """The R proposals of a frame, and the second stage's confidence (R,), logits, and residuals (R, 7) for them."""

@@ -32,8 +32,9 @@ from rich.progress import track
 from rich.table import Table
 from shapely.geometry import MultiPoint, Polygon
 
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.config import Config, InsertMethod, load_config
+from asca_pillars.base.schema import parse
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.config.tree import Config, InsertMethod, load_config
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.insertion.free_space import FreeSpace
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
@@ -41,7 +42,6 @@ from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
 from asca_pillars.pictures.drawing import BACKGROUND
 from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_layers, write_png
-from asca_pillars.schema import parse
 
 METHODS: dict[InsertMethod, str] = {"gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}
 MAX_HEIGHT_ERROR_M = 0.2

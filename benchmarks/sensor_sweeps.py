@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.commands.run_command import run_command
+from asca_pillars.cli.run_command import run_command
 from asca_pillars.sim.simulation import simulate_frame
 from asca_pillars.sim.simulation_configs import load_simulation_config
 

@@ -24,9 +24,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from asca_pillars.commands.run_command import run_command
+from asca_pillars.base.processes import one_thread_per_process
+from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import in_image
-from asca_pillars.processes import one_thread_per_process
 from asca_pillars.sim.annotation import label_camera_view
 from asca_pillars.sim.casting.raycast import cast
 from asca_pillars.sim.scalar_draws import draws_of

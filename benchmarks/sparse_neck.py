@@ -24,11 +24,11 @@ from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import Comparison, compare
 from asca_deploy.benchmark.speed_comparison import Run
 from asca_deploy.benchmark.timing import Track, silently
-from asca_pillars.commands.bench_tables import comparison_table
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.data.scans.find_scans import find_scans
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.system import cpu_model, default_threads, package_versions
+from asca_pillars.base.system import cpu_model, default_threads, package_versions
+from asca_pillars.cli.bench_tables import comparison_table
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.scan_reader import read_scan
 from benchmarks.host_path import camera_view
 from benchmarks.random_weights import Neck, export_random_weights, random_weights
 

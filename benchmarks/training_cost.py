@@ -18,11 +18,11 @@ import torch
 import typer
 from rich.progress import track
 
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.config import load_config
+from asca_pillars.base.system import cpu_model
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.config.tree import load_config
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.models.build import build_model
-from asca_pillars.system import cpu_model
 from asca_pillars.training.bfloat16 import settled
 from asca_pillars.training.dataset import open_dataset
 

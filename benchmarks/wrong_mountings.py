@@ -20,15 +20,15 @@ from rich.progress import track
 from rich.table import Table
 
 from asca_deploy import Detections, Detector
-from asca_pillars.commands.run_command import run_command
-from asca_pillars.commands.scan_input import ScanInput
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scan_settings import ScanSettings
-from asca_pillars.data.scans.find_scans import find_scans
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import AscaError
+from asca_pillars.base.errors import AscaError
+from asca_pillars.base.schema import parse
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.cli.scan_input import ScanInput
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.schema import parse
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_reader import read_scan
+from asca_pillars.scans.scan_settings import ScanSettings
 
 MIN_IOU = 0.5
 Points = NDArray[np.float32]

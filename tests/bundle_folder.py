@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from asca_pillars.own_files import json_object
+from asca_pillars.base.own_files import json_object
 
 EXPORT = ("asca export", "bundle.json", json_object("file"))
 """Command, marker and its recognizer, as `atomic_directory` and `require_replaceable` take them."""

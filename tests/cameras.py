@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.errors import DatasetError
 
 
 def make_calibration(

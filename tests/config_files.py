@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from asca_pillars.config import load_config
-from asca_pillars.errors import ConfigError
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.config.tree import load_config
 
 
 def write(folder: Path, text: str) -> Path:

@@ -15,17 +15,17 @@ import torch
 from typer.testing import CliRunner
 
 from asca_deploy import sample_scan_path
-from asca_pillars.cli import app
+from asca_pillars.cli.main import app
 from asca_pillars.data.boxes.box_records import json_line, read_frames
-from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.made_recordings import point_cloud2
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.data.recordings.cloud_recordings import stamps, store, write_mcap
 from tests.models.openpcdet import mmdetection3d_networks
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
 from tests.saved_checkpoint import save_checkpoint
+from tests.scans.recordings.cloud_recordings import stamps, store, write_mcap
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from asca_pillars.cli import app, main
+from asca_pillars.cli.main import app, main
 
 
 def invoke(*arguments: object) -> str:

@@ -5,8 +5,8 @@ from typing import Any
 
 import torch
 
+from asca_pillars.base.schema import to_dict
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.schema import to_dict
 
 
 def checkpoint_content(checkpoint: Checkpoint) -> dict[str, Any]:

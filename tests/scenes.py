@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import Calibration, KittiSplit, objects_from_boxes, write_calibration, write_image_set
 from asca_pillars.data.kitti import write_labels as write_label_file
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import PillarLimits
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.prepare import PillarLimits
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.scans.scan_reader import write_scan
 
 # Rectangular, asymmetric, with a positive minimum.
 GRID = PillarGrid(x_range_m=(4.8, 25.28), y_range_m=(-6.4, 7.68), v_max_m=0.32, zones=2)

@@ -43,7 +43,7 @@ RUNTIME = """
 from asca_deploy.tracker import Tracker
 from asca_pillars import Detector, Mounting, read_scan
 from asca_deploy import sample_scan_path
-from asca_pillars.data.ground_height import estimate_height
+from asca_pillars.scans.ground_height import estimate_height
 
 points = read_scan(sample_scan_path()).points
 cos, sin = np.cos(0.05), np.sin(0.05)
@@ -66,13 +66,13 @@ step("tracker", lambda: [Tracker()(found, 0.1 * scan, np.array(pose)) for scan i
 
 LOADERS = """
 from asca_deploy import Detector, sample_scan_path
-from asca_pillars.config import AugmentConfig
+from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_placement import rays_entering
 from asca_pillars.data.insertion.free_space import find_free_space
 from asca_pillars.data.kitti.calibration import in_image
-from asca_pillars.data.scans.scan_reader import read_scan
+from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.geometry.frame_change import FrameChange
 from tests.scenes import CALIBRATION
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from asca_pillars.files import atomic_directory, atomic_path
-from asca_pillars.locks import recover
-from asca_pillars.own_files import require_replaceable
+from asca_pillars.base.files import atomic_directory, atomic_path
+from asca_pillars.base.locks import recover
+from asca_pillars.base.own_files import require_replaceable
 from tests.bundle_folder import EXPORT, names, old_bundle
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="locks")
@@ -17,8 +17,8 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="locks")
 
 KILLED = """
 import os, signal, sys
-from asca_pillars.files import atomic_directory, atomic_path
-from asca_pillars.own_files import json_object
+from asca_pillars.base.files import atomic_directory, atomic_path
+from asca_pillars.base.own_files import json_object
 place, kind = sys.argv[1:]
 if kind == "file":
     with atomic_path(place + "/last.ckpt") as temporary:

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from asca_pillars.cli import app
+from asca_pillars.cli.main import app
 
 PAGE = (Path(__file__).parent.parent / "docs" / "OWN_CLASSES.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(bash|python|yaml)\n(.*?)```", PAGE, flags=re.DOTALL)

@@ -15,8 +15,8 @@ from asca_pillars.models.pillar.attention import ChannelAttention, PaperAttentio
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
 from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pillar.neck import RPNNeck
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillarize import PillarLimits
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.prepare import PillarLimits
 
 LIMITS, GRID = PillarLimits(max_pillars=40, max_points=8), PillarGrid()
 CHANNELS = 6

@@ -18,10 +18,10 @@ from pathlib import Path
 from rich.progress import track
 
 from asca_pillars.ablation.family import Row
-from asca_pillars.errors import TrainingError
-from asca_pillars.files import write_json
-from asca_pillars.own_files import require_no_link, written_by
-from asca_pillars.system import default_threads
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.base.files import write_json
+from asca_pillars.base.own_files import require_no_link, written_by
+from asca_pillars.base.system import default_threads
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ import json
 from dataclasses import astuple, dataclass, replace
 
 from asca_pillars.ablation.family import Family
-from asca_pillars.geometry.anchors import KITTI_CLASSES
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.schema import to_dict
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.detection.anchors import KITTI_CLASSES
 
 _FINE_M = 0.08
 _SIZES = 5  # of a class, the first fields: name, sizes and height, which thresholds do not change

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from asca_pillars.ablation.family import Family
-from asca_pillars.points.voxel_scan import Deform
-from asca_pillars.pv_rcnn_config import Attention, Gate, PvRcnnModel
-from asca_pillars.schema import to_dict
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.pv_rcnn import Attention, Gate, PvRcnnModel
+from asca_pillars.ops.pv_rcnn.prepare import Deform
 
 BASE = "ablation_two_stage"
 """The configuration that ships for these rows; MSAA's row repeats its sources without the points."""

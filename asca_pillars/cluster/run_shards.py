@@ -8,11 +8,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from asca_pillars.base.errors import ClusterError
+from asca_pillars.base.locks import recover
 from asca_pillars.cluster.ray_pool import RayPool, connected
 from asca_pillars.cluster.schedule import Outcome, Result, work_off
 from asca_pillars.cluster.shards import Shard, cut
-from asca_pillars.errors import ClusterError
-from asca_pillars.locks import recover
 
 
 def run_shards(

@@ -5,7 +5,7 @@
 
 A shard's name is made of the number of its first item and of a digest of its items. A file that is there is therefore
 the result of these items and no others, also where the list of items has changed since. Each line has a digest
-(`sealed_lines`), and there are as many as items: a file that was cut or damaged is no result.
+(`base.sealed_lines`), and there are as many as items: a file that was cut or damaged is no result.
 """
 
 import hashlib
@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from asca_pillars.errors import OutputError
-from asca_pillars.files import atomic_path, write_json
-from asca_pillars.sealed_lines import sealed, unsealed
+from asca_pillars.base.errors import OutputError
+from asca_pillars.base.files import atomic_path, write_json
+from asca_pillars.base.sealed_lines import sealed, unsealed
 
 RUN_SETTINGS = "run.json"
 _SUFFIX = ".jsonl"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.config import AugmentConfig
+from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.corruption import corrupt_objects, lose_reflectance
 from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle

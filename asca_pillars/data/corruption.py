@@ -7,7 +7,7 @@ and how exact these are. Each change is off unless the configuration asks for it
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.config import AugmentConfig
+from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.geometry.boxes import points_in_boxes
 
 FEWEST_POINTS = 5  # an object keeps so many, or it is not cut, for it could not be found

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.ranges import Ranges
 

@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.mounting import Mounting
 from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.scans.mounting import Mounting
 
 
 class LabeledBoxes(NamedTuple):

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.config import Config
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import other_spelling, read_frame, within_ranges
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.yaw_units import doubt_of_yaws
-from asca_pillars.errors import DatasetError
 
 FRAMES_WITH_POINTS = 50
 """Frames with boxes whose points are looked at before all of them are taken to be without points."""

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from asca_pillars.config import AugmentConfig, Config
+from asca_pillars.config.tree import AugmentConfig, Config
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.open_split import open_split
-from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.detection.spec import DetectorSpec
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.own_files import PICTURE_SOFTWARE
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, Curve, KittiResults
-from asca_pillars.files import atomic_path
-from asca_pillars.own_files import PICTURE_SOFTWARE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.input_files import read_text
 from asca_pillars.data.kitti import KittiSplit, in_image, objects_from_boxes, read_labels, write_labels
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import DatasetError
+from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.input_files import read_text
+from asca_pillars.scans.scan_reader import read_scan
 
 KITTI_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 FOLDED_KITTI_TYPES = frozenset(name.casefold() for name in KITTI_TYPES)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import DatasetError
+from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares
@@ -27,8 +27,8 @@ from asca_pillars.evaluation.kitti.states import is_neighbor
 from asca_pillars.evaluation.predictions import FOLDED_KITTI_TYPES, ScoredFrames
 from asca_pillars.evaluation.waymo import WaymoTruth, difficulty_levels, min_iou
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
-from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
+from asca_pillars.scans.scan_reader import read_scan
 
 _LEVEL_2 = 2
 

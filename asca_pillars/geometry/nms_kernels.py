@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.compiling import compiled, given, inner, written
+from asca_pillars.base.compiling import compiled, given, inner, written
 
 _Doubles = NDArray[np.float64]
 _Integers = NDArray[np.int64]

@@ -2,18 +2,18 @@
 
 from typing import assert_never
 
-from asca_pillars.config import DataConfig, ModelConfig
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import DataConfig, ModelConfig
+from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import PillarPreparation
-from asca_pillars.models.pv_rcnn.pv_rcnn_detector import build_pv_rcnn_detector
-from asca_pillars.models.pv_rcnn.voxel_preparation import VoxelPreparation
-from asca_pillars.models.refine.refine_detector import build_refine_detector
-from asca_pillars.models.second_stage.refine_preparation import cached_preparation
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import PillarPreparation
+from asca_pillars.models.pv_rcnn.network import build_pv_rcnn_detector
+from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
 from asca_pillars.models.trainable import Preparation, Trainable
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pv_rcnn_config import PvRcnnModel
-from asca_pillars.refine_config import RefineModel
+from asca_pillars.models.two_stage.network import build_refine_detector
+from asca_pillars.models.two_stage.preparation import cached_preparation
 
 
 def build_model(model: ModelConfig) -> Trainable:

@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from asca_pillars.config import Config, ModelConfig
-from asca_pillars.data.expected_input import ExpectedInput
-from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.files import atomic_path
-from asca_pillars.input_files import require_content
+from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.input_files import require_content
+from asca_pillars.base.schema import parse
+from asca_pillars.config.tree import Config, ModelConfig
 from asca_pillars.models.build import build_model
 from asca_pillars.models.trainable import Trainable
-from asca_pillars.schema import parse
+from asca_pillars.scans.expected_input import ExpectedInput
 
 
 class Checkpoint(NamedTuple):

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.models.trainable import Trainable
 

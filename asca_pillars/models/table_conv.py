@@ -1,4 +1,4 @@
-"""Convolutions at active cells alone, by the tables of `asca_pillars.tables`, forward and backward without a scatter.
+"""Convolutions at active cells alone, by the tables of `ops.sparse`, forward and backward without a scatter.
 
 Features are rows, one for each active cell; a table's entry beyond the last row stands for zeros. Every sum stays
 inside a matrix product or runs in a fixed order, so results do not differ from run to run.

@@ -7,8 +7,8 @@ import numpy as np
 from torch import Tensor, nn
 
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
 
 
 class Movable(Protocol):

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.own_files import PICTURE_SOFTWARE
 from asca_pillars.data.kitti.calibration import Calibration, project_edges
-from asca_pillars.files import atomic_path
+from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import footprints
-from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.own_files import PICTURE_SOFTWARE
 from asca_pillars.pictures.drawing import BACKGROUND, OVERSAMPLING, SUBPIXEL_BITS, Color, Image, Texts, View, subpixels
 
 _CLASS_COLORS: dict[str, Color] = {

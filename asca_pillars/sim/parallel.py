@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from asca_pillars.base.errors import ConfigError, DatasetError
+from asca_pillars.base.files import write_text
+from asca_pillars.base.own_files import json_object, require_no_link, require_own, require_own_file
+from asca_pillars.base.processes import in_processes
 from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
-from asca_pillars.errors import ConfigError, DatasetError
-from asca_pillars.files import write_text
-from asca_pillars.own_files import json_object, require_no_link, require_own, require_own_file
-from asca_pillars.processes import in_processes
 
 COMMAND = "asca simulate"
 Item = TypeVar("Item")

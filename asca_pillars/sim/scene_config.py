@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, fields
 
-from asca_pillars.errors import ConfigError
-from asca_pillars.strict import Strict
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.strict import Strict
 
 
 @dataclass(frozen=True)

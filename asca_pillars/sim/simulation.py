@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.base.strict import Strict
 from asca_pillars.cluster.run_shards import run_each
 from asca_pillars.data.kitti import (
     Calibration,
@@ -20,7 +21,7 @@ from asca_pillars.data.kitti import (
     write_labels,
 )
 from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
-from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
 from asca_pillars.sim.parallel import (
@@ -37,7 +38,6 @@ from asca_pillars.sim.sensor.image_border import outside_image
 from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import Returns, measure
 from asca_pillars.sim.world.scene import Scene, build, draw_scene
-from asca_pillars.strict import Strict
 
 _SHARD_FRAMES = 20  # of a cluster's worker: a second or two
 

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from asca_pillars.schema import parse
-from asca_pillars.settings import read_settings, shipped_configs
+from asca_pillars.base.schema import parse
+from asca_pillars.base.settings import read_settings, shipped_configs
 from asca_pillars.sim.simulation import SimulationConfig
 
 KIND = "simulation"

@@ -2,7 +2,7 @@
 
 import torch
 
-from asca_pillars.config import Precision
+from asca_pillars.config.tree import Precision
 
 
 def has_bfloat16(device: str | None = None) -> bool:

@@ -12,10 +12,10 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
-from asca_pillars.config import ModelConfig
-from asca_pillars.errors import TrainingError
-from asca_pillars.files import atomic_path
-from asca_pillars.input_files import require_content
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.input_files import require_content
+from asca_pillars.config.tree import ModelConfig
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import read_plain, unread
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset
 
-from asca_pillars.config import Config
+from asca_pillars.base.errors import AscaError, WorkerError
+from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.data.training_frames import TrainingFrames, open_frames
-from asca_pillars.errors import AscaError, WorkerError
 from asca_pillars.models.build import build_preparation
 from asca_pillars.models.trainable import Movable, Preparation
 

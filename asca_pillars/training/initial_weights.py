@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import Any
 
 from asca_deploy.shipped import find_checkpoint
-from asca_pillars.config import Config
-from asca_pillars.errors import TrainingError
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.pv_rcnn_config import PvRcnnModel
 
 _FIRST_STAGE = tuple(f"network.{part}." for part in PvRcnnModel.FIRST_STAGE)
 

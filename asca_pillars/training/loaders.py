@@ -11,8 +11,8 @@ from typing import Any
 import lightning as L  # noqa: N812  (Lightning's own convention)
 from torch.utils.data import DataLoader
 
-from asca_pillars.config import Config
-from asca_pillars.errors import WorkerError
+from asca_pillars.base.errors import WorkerError
+from asca_pillars.config.tree import Config
 from asca_pillars.training.dataset import Collate, LabeledDataset, open_dataset
 from asca_pillars.training.loader_processes import loader_context, start_loader_process
 from asca_pillars.training.sampler import EpochSampler

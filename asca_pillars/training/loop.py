@@ -17,15 +17,15 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from asca_deploy.bundle import WEIGHTS
-from asca_pillars.config import Config, ModelConfig, TrainConfig
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.base.locks import only_writer, recover
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, ModelConfig, TrainConfig
+from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.require_boxes import require_boxes
-from asca_pillars.errors import TrainingError
-from asca_pillars.locks import only_writer, recover
 from asca_pillars.models.checkpoint import save_weights
-from asca_pillars.models.second_stage.open_first_stage import with_first_stage
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.refine_config import RefineModel
+from asca_pillars.models.two_stage.open_first_stage import with_first_stage
 from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from asca_pillars.config import Config
-from asca_pillars.data.expected_input import ExpectedInput
-from asca_pillars.errors import AscaError, TrainingError
+from asca_pillars.base.errors import AscaError, TrainingError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.tree import Config
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.models.build import build_model
-from asca_pillars.schema import to_dict
+from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.training.dataset import Batch
 from asca_pillars.training.schedules import make_schedule, steps_per_epoch
 

@@ -4,8 +4,15 @@ from pathlib import Path
 
 import yaml
 
-from asca_pillars.own_files import Recognizer, json_object, require_not_input, require_own, starting_with, written_by
-from asca_pillars.yaml_text import parse_yaml
+from asca_pillars.base.own_files import (
+    Recognizer,
+    json_object,
+    require_not_input,
+    require_own,
+    starting_with,
+    written_by,
+)
+from asca_pillars.base.yaml_text import parse_yaml
 
 COMMAND = "asca train"
 CONFIG_FILE = "config.yaml"

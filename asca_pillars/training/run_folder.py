@@ -9,19 +9,19 @@ import yaml
 from rich.progress import track
 from torch import Tensor
 
-from asca_pillars.config import Config, Precision, load_config
-from asca_pillars.data.expected_input import ExpectedInput
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.base.files import write_json, write_text
+from asca_pillars.base.own_files import require_own_file
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import read_settings
+from asca_pillars.base.system import describe_environment
+from asca_pillars.config.tree import Config, Precision, load_config
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.data.measure_input import measure_expected_input
 from asca_pillars.data.training_frames import TrainingFrames
-from asca_pillars.errors import TrainingError
-from asca_pillars.files import write_json, write_text
 from asca_pillars.models.checkpoint import weights_sha256
-from asca_pillars.own_files import require_own_file
-from asca_pillars.schema import to_dict
-from asca_pillars.settings import read_settings
-from asca_pillars.system import describe_environment
+from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.measure_input import measure_expected_input
 from asca_pillars.training.run_files import (
     COMMAND,
     CONFIG_FILE,

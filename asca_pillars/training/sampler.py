@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from torch.utils.data import Sampler
 
-from asca_pillars.errors import TrainingError
+from asca_pillars.base.errors import TrainingError
 
 
 class EpochSampler(Sampler[list[tuple[int, int]]]):

@@ -7,7 +7,7 @@ from typing import Any
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, OneCycleLR, StepLR
 
-from asca_pillars.config import TrainConfig
+from asca_pillars.config.tree import TrainConfig
 
 
 def make_schedule(optimizer: Optimizer, recipe: TrainConfig, epoch_steps: int) -> Any:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from asca_pillars.errors import AscaError, WorkerError
+from asca_pillars.base.errors import AscaError, WorkerError
 from asca_pillars.training.dataset import Batch, Sample
 
 _ALIGNMENT = 64

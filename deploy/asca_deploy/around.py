@@ -15,12 +15,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.ground_height import fit_ground_plane
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.decode import nms_by_class
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.decode import nms_by_class
+from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.scans.ground_height import fit_ground_plane
 
 CAMERA_FIELD_RAD = math.pi / 4
 """To each side of a camera's view: KITTI's sees 41 degrees to each side, and a car there is often cut."""

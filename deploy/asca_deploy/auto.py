@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from asca_deploy.graph import first_line
 from asca_deploy.providers import Precision, Provider, arithmetic
-from asca_pillars.errors import ProviderError
+from asca_pillars.base.errors import ProviderError
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.geometry.overlap import iou_3d
 
 REFERENCE: tuple[Provider, Precision] = ("cpu", "float32")

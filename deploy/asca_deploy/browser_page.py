@@ -13,11 +13,11 @@ from pathlib import Path
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.manifest_file import read_manifest
-from asca_pillars.data.scans.scan_reader import read_scan, write_scan
-from asca_pillars.errors import BundleError, ConfigError
-from asca_pillars.files import atomic_directory, write_json
-from asca_pillars.input_files import require_content
-from asca_pillars.own_files import json_object, require_not_input, require_replaceable
+from asca_pillars.base.errors import BundleError, ConfigError
+from asca_pillars.base.files import atomic_directory, write_json
+from asca_pillars.base.input_files import require_content
+from asca_pillars.base.own_files import json_object, require_not_input, require_replaceable
+from asca_pillars.scans.scan_reader import read_scan, write_scan
 
 PAGE = "page.json"
 PAGE_FOLDER = ("asca export --browser", PAGE, json_object("bundle", "scan", "onnxruntime_web", "files"))

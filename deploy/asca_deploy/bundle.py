@@ -12,18 +12,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from asca_pillars.data.expected_input import ExpectedInput
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.detector_spec import DetectorSpec
-from asca_pillars.own_files import json_object
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.points.first_stage import FirstStageSettings
-from asca_pillars.points.refine_geometry import RefineSettings
-from asca_pillars.points.refined_detections import Scores
-from asca_pillars.points.voxel_scan import VoxelSetSettings
-from asca_pillars.strict import Strict
-from asca_pillars.tables.neck_tables import MaskRule
-from asca_pillars.tables.voxel_spec import VoxelSpec
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.own_files import json_object
+from asca_pillars.base.strict import Strict
+from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
+from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
+from asca_pillars.ops.two_stage.decode import Scores
+from asca_pillars.ops.two_stage.first_stage import FirstStageSettings
+from asca_pillars.ops.two_stage.prepare import RefineSettings
+from asca_pillars.scans.expected_input import ExpectedInput
 
 SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
@@ -104,7 +104,7 @@ class PillarSection(Strict):
     neck: Literal["dense", "sparse"] = "dense"
     """`sparse`: backbone.onnx takes rows and neighbor tables, and answers at active head cells alone."""
     active_cells: MaskRule | None = None
-    """Which cells are active in a sparse neck, see `asca_pillars.tables.neck_tables`; None of a dense one."""
+    """Which cells are active in a sparse neck, see `asca_pillars.ops.pillar.neck_rulebooks`; None of a dense one."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.channels <= _MOST_CHANNELS:

@@ -20,15 +20,15 @@ from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pipeline import Laps
 from asca_deploy.shipped import find_bundle
 from asca_deploy.stream import overlapped
-from asca_pillars.data.input_check import InputWarning, check_input
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.errors import ConfigError, ScanError
-from asca_pillars.geometry import decode
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.base.errors import ConfigError, ScanError
+from asca_pillars.base.kernels import load_kernels
+from asca_pillars.base.system import check_threads
+from asca_pillars.detection import decode
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.report import FrameReport, ScanCounts, summed
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.frame_report import FrameReport, ScanCounts, summed
-from asca_pillars.geometry.kernels import load_kernels
-from asca_pillars.system import check_threads
+from asca_pillars.scans.input_check import InputWarning, check_input
+from asca_pillars.scans.mounting import Mounting
 
 _log = logging.getLogger("asca_deploy")
 

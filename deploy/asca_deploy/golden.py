@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.detector import Detector
-from asca_deploy.pillar_backbone import HeadAnswer
-from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
-from asca_deploy.refine_pipeline import RefinePipeline, refine_inputs
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import BundleError
-from asca_pillars.files import atomic_directory, write_json
-from asca_pillars.geometry.decode import HeadMaps, decode_candidates, sigmoid, suppress
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.own_files import json_object, require_not_input, require_replaceable
-from asca_pillars.points.first_stage import FirstPass, proposed_from
-from asca_pillars.points.refine_geometry import refine_scan
-from asca_pillars.points.refined_detections import reported_detections
-from asca_pillars.system import cpu_model, package_versions
-from asca_pillars.tables.neck_tables import table_inputs
+from asca_deploy.pillar.backbone import HeadAnswer
+from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
+from asca_deploy.two_stage.pipeline import RefinePipeline, refine_inputs
+from asca_pillars.base.errors import BundleError
+from asca_pillars.base.files import atomic_directory, write_json
+from asca_pillars.base.own_files import json_object, require_not_input, require_replaceable
+from asca_pillars.base.system import cpu_model, package_versions
+from asca_pillars.detection.decode import HeadMaps, decode_candidates, sigmoid, suppress
+from asca_pillars.detection.detections import Detections
+from asca_pillars.ops.pillar.neck_rulebooks import table_inputs
+from asca_pillars.ops.two_stage.decode import reported_detections
+from asca_pillars.ops.two_stage.first_stage import FirstPass, proposed_from
+from asca_pillars.ops.two_stage.prepare import refine_scan
+from asca_pillars.scans.scan_reader import read_scan
 
 GOLDEN = "golden.json"
 GOLDEN_FOLDER = ("asca export --golden", GOLDEN, json_object("schema_version", "bundle", "scan", "stages"))

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from numpy.typing import NDArray
 
-from asca_pillars.errors import BundleError
+from asca_pillars.base.errors import BundleError
 
 
 class Tensor(NamedTuple):

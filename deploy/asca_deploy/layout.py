@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import FEATURES
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD
+from asca_pillars.ops.pillar.prepare import FEATURES
+from asca_pillars.ops.pillar.spec import PillarSpec
 
 _SAME_M = 1e-6
 

@@ -22,11 +22,11 @@ from asca_deploy.bundle import (
 from asca_deploy.layout import difference, layout_of
 from asca_deploy.manifest_file import EXPORT_AGAIN, LONGEST_REASON, first_misread, read_manifest
 from asca_deploy.onnx_file import has_external_data, read_metadata
-from asca_pillars.errors import AscaError, BundleError, printable
-from asca_pillars.files import write_json
+from asca_pillars.base.errors import AscaError, BundleError, printable
+from asca_pillars.base.files import write_json
+from asca_pillars.base.input_files import require_content
+from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
-from asca_pillars.input_files import require_content
-from asca_pillars.schema import parse, to_dict
 
 ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from asca_deploy.bundle import MANIFEST, SCHEMA_VERSION
-from asca_pillars.errors import BundleError, printable
-from asca_pillars.input_files import require_content
-from asca_pillars.installation import upgrade_advice
+from asca_pillars.base.errors import BundleError, printable
+from asca_pillars.base.input_files import require_content
+from asca_pillars.base.installation import upgrade_advice
 
 EXPORT_AGAIN = "export the bundle again with `asca export`"
 LONGEST_REASON = 300

@@ -1,6 +1,6 @@
 """onnxruntime, which is imported here and nowhere else: its reports to its maker are off by then."""
 
-from asca_pillars import telemetry
+from asca_pillars.base import telemetry
 
 telemetry.disable_telemetry()
 

@@ -5,13 +5,13 @@ from typing import Any, Literal
 
 from asca_deploy import auto, providers
 from asca_deploy.bundle import Bundle, PillarBundle, PvRcnnBundle
-from asca_deploy.pillar_pipeline import PillarPipeline
+from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_deploy.pipeline import Laps, Pipeline
-from asca_deploy.pv_rcnn_pipeline import PvRcnnPipeline
-from asca_deploy.refine_pipeline import RefinePipeline
+from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_deploy.shipped import sample_scan_path
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.geometry.detections import Detections
+from asca_deploy.two_stage.pipeline import RefinePipeline
+from asca_pillars.detection.detections import Detections
+from asca_pillars.scans.scan_reader import read_scan
 
 
 def open_pipeline(

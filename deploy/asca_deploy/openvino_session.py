@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.graph import Tensor
-from asca_pillars.errors import BundleError, ProviderError
-from asca_pillars.installation import install_command
+from asca_pillars.base.errors import BundleError, ProviderError
+from asca_pillars.base.installation import install_command
 
 if TYPE_CHECKING:
     import openvino

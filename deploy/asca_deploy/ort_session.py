@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.graph import Tensor, first_line
 from asca_deploy.onnx_runtime import onnxruntime
-from asca_pillars.errors import BundleError, ProviderError, printable
+from asca_pillars.base.errors import BundleError, ProviderError, printable
 
 OLDEST = (1, 25)
 

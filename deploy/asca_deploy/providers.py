@@ -17,7 +17,7 @@ from typing import Literal, get_args
 
 from asca_deploy import openvino_session, ort_session
 from asca_deploy.graph import Session
-from asca_pillars.errors import ProviderError
+from asca_pillars.base.errors import ProviderError
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
 Precision = Literal["float32", "reduced"]

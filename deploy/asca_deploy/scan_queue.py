@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from numpy.typing import NDArray
 
-from asca_pillars.errors import ConfigError
+from asca_pillars.base.errors import ConfigError
 
 WhenFull: TypeAlias = Literal["drop", "wait"]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from asca_deploy.bundle import MANIFEST, WEIGHTS
 from asca_deploy.manifest import load_bundle
 from asca_deploy.manifest_file import refuse_run_folder
-from asca_pillars.errors import BundleError
-from asca_pillars.input_files import require_content
+from asca_pillars.base.errors import BundleError
+from asca_pillars.base.input_files import require_content
 
 
 def default_bundle_path() -> Path:

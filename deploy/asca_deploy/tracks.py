@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.detections import Detection, Detections
+from asca_pillars.detection.detections import Detection, Detections
 
 _DIGITS = 4
 

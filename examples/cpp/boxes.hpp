@@ -1,4 +1,4 @@
-// Head maps -> boxes: threshold, decode, rotated non-maximum suppression (asca_pillars/geometry/decode.py).
+// Head maps -> boxes: threshold, decode, rotated non-maximum suppression (asca_pillars/detection/decode.py).
 #pragma once
 
 #include <algorithm>

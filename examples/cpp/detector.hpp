@@ -1,4 +1,4 @@
-// A bundle in ONNX Runtime: points in, boxes out (asca_deploy/pillar_pipeline.py).
+// A bundle in ONNX Runtime: points in, boxes out (asca_deploy/pillar/pipeline.py).
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// The pillar grid that bundle.json describes (asca_pillars/pillars/grid.py): cells of points, and where cells stand.
+// The pillar grid that bundle.json describes (asca_pillars/ops/pillar/grid.py): cells of points, and where cells stand.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// Points -> pillars (asca_pillars/pillars/pillarize.py, docs/BUNDLE.md).
+// Points -> pillars (asca_pillars/ops/pillar/prepare.py, docs/BUNDLE.md).
 #pragma once
 
 #include <algorithm>

@@ -18,12 +18,12 @@ from torch import Tensor, nn
 from asca_deploy.bundle import Bundle
 from asca_deploy.graph import Tensor as Declared
 from asca_deploy.manifest import essentials, graph_files
-from asca_deploy.pillar_graphs import PILLAR_FEATURES
+from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
-from asca_export.masked_forms import MaskedBackbone
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.pillar_config import TRACED_PILLARS
-from asca_pillars.pillars.pillarize import FEATURES
+from asca_export.pillar.masked_forms import MaskedBackbone
+from asca_pillars.config.pillar import TRACED_PILLARS
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.ops.pillar.prepare import FEATURES
 
 B = TypeVar("B", bound=Bundle)
 

@@ -9,20 +9,20 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
-from asca_deploy.pillar_backbone import Maps
-from asca_deploy.pillar_pipeline import Canvas, PillarPipeline
-from asca_export.masked_forms import NEVER
-from asca_pillars.errors import ExportError
+from asca_deploy.pillar.backbone import Maps
+from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
+from asca_export.pillar.masked_forms import NEVER
+from asca_pillars.base.errors import ExportError
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.geometry.detector_spec import DetectorSpec
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.models.pillar.pillar_preparation import PillarBatch, batch_pillars
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.points.refined_detections import Scores, reported_detections
-from asca_pillars.tables.voxel_spec import VoxelSpec
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.models.pillar.preparation import PillarBatch, batch_pillars
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
+from asca_pillars.ops.two_stage.decode import Scores, reported_detections
 
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
 BOX_TOLERANCE_M = 0.01

@@ -17,10 +17,10 @@ from asca_deploy.bundle import BUNDLE_FOLDER, WEIGHTS
 from asca_deploy.manifest import load_pillar_bundle, write_bundle_manifest
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
-from asca_pillars.data.measure_input import measure_expected_input
-from asca_pillars.data.scans.find_scans import find_scans
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.files import atomic_directory
+from asca_pillars.base.files import atomic_directory
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.measure_input import measure_expected_input
+from asca_pillars.scans.scan_reader import read_scan
 
 
 def main(

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.pillar_pipeline import Canvas
+from asca_deploy.pillar.pipeline import Canvas
 from asca_export import graphs, qdq
 from asca_export.fast_forms import CanvasSteps, FastBackbone
 from asca_export.quantize import STEPS, input_moments, layer_names, round_weights, scale_to_steps
@@ -25,9 +25,9 @@ from asca_export.sparse_quantize import (
     round_products,
     scale_rows_to_steps,
 )
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.pillars.map_pooling import pool_pillars
-from asca_pillars.pillars.pillarize import Pillars
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.ops.pillar.map_pooling import pool_pillars
+from asca_pillars.ops.pillar.prepare import Pillars
 
 
 class Encoded(NamedTuple):

@@ -14,10 +14,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
 from asca_export.quantize import HEAD
-from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck, block_layers
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.tables.neck_tables import SAME, NeckTables, table_inputs
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.ops.pillar.neck_rulebooks import SAME, NeckTables, table_inputs
 
 
 class NeckProduct(NamedTuple):

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
-from asca_deploy.pillar_graphs import PILLAR_FEATURES
+from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.quantize import HEAD
 from asca_export.row_graphs import RowGraph
 from asca_export.sparse_forms import SparseBackbone
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.tables.neck_tables import NeckTables, table_inputs
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.ops.pillar.neck_rulebooks import NeckTables, table_inputs
 
 JOINED = f"{HEAD}.joined"
 """What the head's product reads, by name."""

@@ -7,7 +7,7 @@ from typing import Any, TextIO
 import pytest
 
 from asca_pillars.ablation import ablation_runs
-from asca_pillars.commands import ablate_steps
+from asca_pillars.cli import ablate_steps
 from tests.in_process import run_here
 
 

@@ -14,12 +14,12 @@ import yaml
 from asca_pillars.ablation import ablation_runs
 from asca_pillars.ablation.ablation_runs import finish_runs, runs
 from asca_pillars.ablation.pillar_variants import VARIANTS
-from asca_pillars.commands import ablate_steps
-from asca_pillars.commands.ablate import ablate
-from asca_pillars.config import load_config, pillar_spec
-from asca_pillars.errors import AscaError, ConfigError, TrainingError
-from asca_pillars.own_files import written_by
-from asca_pillars.schema import to_dict
+from asca_pillars.base.errors import AscaError, ConfigError, TrainingError
+from asca_pillars.base.own_files import written_by
+from asca_pillars.base.schema import to_dict
+from asca_pillars.cli import ablate_steps
+from asca_pillars.cli.ablate import ablate
+from asca_pillars.config.tree import load_config, pillar_spec
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 

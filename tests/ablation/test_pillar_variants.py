@@ -3,9 +3,9 @@
 import pytest
 
 from asca_pillars.ablation.pillar_variants import VARIANTS, Variant
-from asca_pillars.config import load_config
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.settings import shipped_configs
+from asca_pillars.base.settings import shipped_configs
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import load_config
 
 
 @pytest.mark.parametrize("variant", VARIANTS.values(), ids=lambda variant: variant.name)

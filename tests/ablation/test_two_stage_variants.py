@@ -9,14 +9,14 @@ import torch
 import yaml
 
 from asca_pillars.ablation.two_stage_variants import BASE, TWO_STAGE
-from asca_pillars.commands.ablate import ablate
-from asca_pillars.commands.ablate_steps import check, family_of, parse_variants
-from asca_pillars.config import load_config
-from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.cli.ablate import ablate
+from asca_pillars.cli.ablate_steps import check, family_of, parse_variants
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import load_config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.pv_rcnn_config import PvRcnnModel
-from asca_pillars.schema import to_dict
 from asca_pillars.training.loop import train
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SETTINGS, tiny_config
 from tests.scenes import write_dataset

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
-from asca_pillars.pillar_config import CpaReading, PillarModel
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.config.pillar import CpaReading, PillarModel
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import batch_pillars
 from benchmarks.padded import PaddedDetector
 from tests.scenes import make_scene
 from tests.training.test_loop import CONFIG

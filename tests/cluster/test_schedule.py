@@ -7,9 +7,9 @@ from typing import Literal
 
 import pytest
 
+from asca_pillars.base.errors import BundleError
 from asca_pillars.cluster.schedule import TRIES, Outcome, work_off
 from asca_pillars.cluster.shards import Shard, cut
-from asca_pillars.errors import BundleError
 
 
 class MadeUpPool:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asca_pillars.base.errors import OutputError
 from asca_pillars.cluster.shards import Shard, ShardFolder, cut
-from asca_pillars.errors import OutputError
 
 
 @given(items=st.lists(st.integers(), max_size=40), size=st.integers(1, 12))

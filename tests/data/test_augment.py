@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.config import AugmentConfig
+from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.augment import augment, flip_y, move_objects, rotate, scale
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.boxes import points_in_boxes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from asca_pillars.config import AugmentConfig
+from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.corruption import FEWEST_POINTS, corrupt_objects, lose_reflectance
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.scenes import make_scene

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.labels_beside import labels_beside
-from asca_pillars.errors import DatasetError
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import write_dataset
 

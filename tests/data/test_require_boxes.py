@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.config import Config, DataConfig, InsertConfig
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, DataConfig, InsertConfig
 from asca_pillars.data.insertion.insert_objects import prepare_inserter
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.require_boxes import require_boxes
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import DatasetError
-from asca_pillars.pillar_config import PillarModel
+from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.loop import train
 from tests.scenes import SPEC, write_dataset
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.config import Config, DataConfig
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.kitti import parse_object, read_labels
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.data.yaw_units import doubt_of_yaws
-from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.pillar_config import PillarModel
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.in_process import invoke
 from tests.scenes import SPEC, write_dataset

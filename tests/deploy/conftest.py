@@ -16,12 +16,12 @@ from onnx import TensorProto, helper, numpy_helper
 
 from asca_deploy.bundle import CanvasFormat, PillarBundle, PillarSection, Provenance
 from asca_deploy.manifest import essentials, graph_files, write_bundle_manifest
-from asca_deploy.pillar_graphs import PILLAR_FEATURES
-from asca_pillars.data.expected_input import ExpectedInput
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
-from asca_pillars.tables.neck_tables import MaskRule
+from asca_deploy.pillar.graphs import PILLAR_FEATURES
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule
+from asca_pillars.ops.pillar.prepare import FEATURES, PillarLimits
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.scans.expected_input import ExpectedInput
 
 needs_openvino = pytest.mark.skipif(
     importlib.util.find_spec("openvino") is None, reason="needs pip install -e '.[openvino]'"

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
-from asca_pillars.errors import ConfigError
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detector, auto
 from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider
-from asca_pillars.errors import BundleError, ProviderError
-from asca_pillars.geometry.anchors import KITTI_CLASSES
-from asca_pillars.geometry.detections import Detections
-from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.base.errors import BundleError, ProviderError
+from asca_pillars.detection.anchors import KITTI_CLASSES
+from asca_pillars.detection.detections import Detections
+from asca_pillars.ops.pillar.spec import PillarSpec
 from tests.deploy.conftest import SPEC
 
 BOXES = np.array(

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from asca_deploy import Detector
-from asca_pillars.cli import app
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import BundleError, ConfigError, OutputError
+from asca_pillars.base.errors import BundleError, ConfigError, OutputError
+from asca_pillars.cli.main import app
+from asca_pillars.scans.scan_reader import write_scan
 
 Points = NDArray[np.float32]
 
@@ -72,7 +72,7 @@ def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path, monkeypatch: py
 def test_a_bundle_to_compare_with_is_looked_at_first(
     tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("asca_pillars.commands.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("asca_pillars.cli.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
     with pytest.raises(BundleError, match="none: no such folder"):
         CliRunner().invoke(
             app, ["bench", "-b", str(tiny_bundle), "--compare", str(tmp_path / "none")], catch_exceptions=False
@@ -82,7 +82,7 @@ def test_a_bundle_to_compare_with_is_looked_at_first(
 def test_a_file_that_cannot_be_written_is_told_before_the_work(
     tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("asca_pillars.commands.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("asca_pillars.cli.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
     with pytest.raises(OutputError, match="is a folder"):
         CliRunner().invoke(app, ["bench", "-b", str(tiny_bundle), "--json", str(tmp_path)], catch_exceptions=False)
 
@@ -114,7 +114,7 @@ def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:
 def test_of_many_scans_some_are_timed(
     tiny_bundle: Path, scan: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("asca_pillars.commands.bench.MOST_SCANS", 3)
+    monkeypatch.setattr("asca_pillars.cli.bench.MOST_SCANS", 3)
     for number in range(7):
         write_scan(tmp_path / "scans" / f"{number}.bin", scan[: 1000 - number])
     command = ["bench", str(tmp_path / "scans"), "-b", str(tiny_bundle), "--rounds", "1", "--json"]

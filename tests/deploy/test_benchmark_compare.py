@@ -10,7 +10,7 @@ from asca_deploy.benchmark import alternate, compare, measure_matrix
 from asca_deploy.benchmark.box_differences import box_difference
 from asca_deploy.benchmark.speed_comparison import FRAMES_PER_TURN
 from asca_deploy.providers import PROVIDERS
-from asca_pillars.system import default_threads
+from asca_pillars.base.system import default_threads
 
 Points = NDArray[np.float32]
 SCANS = [np.full((count, 4), count, np.float32) for count in (1, 2)]

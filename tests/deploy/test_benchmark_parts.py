@@ -13,10 +13,10 @@ from asca_deploy.benchmark.roofline import SIZE, gemm_rate
 from asca_deploy.benchmark.scaling import resample
 from asca_deploy.benchmark.throughput import FRAMES
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.data.mounting import Mounting, read_pose
-from asca_pillars.errors import AscaError
+from asca_pillars.base.errors import AscaError
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.pillars.pillarize import PillarCounts
+from asca_pillars.ops.pillar.prepare import PillarCounts
+from asca_pillars.scans.mounting import Mounting, read_pose
 from tests.deploy.conftest import STAGES
 
 Points = NDArray[np.float32]

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from asca_deploy import sample_scan_path, shipped_bundles
 from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.data.scans.scan_reader import read_scan, write_scan
-from asca_pillars.errors import ScanError
+from asca_pillars.base.errors import ScanError
 from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.fuzz import damaged
 from benchmarks.fuzz_inputs import Kind, read_points, scan_seeds
-from tests.data.scans.pcd_cases import CASES
 from tests.deploy import conftest as tiny
+from tests.scans.pcd_cases import CASES
 
 ROOT = Path(__file__).parents[2]
 MODULES = ROOT / "deploy" / "asca_deploy" / "browser"

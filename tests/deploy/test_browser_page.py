@@ -20,11 +20,11 @@ from asca_deploy import Detector, sample_scan_path, shipped_bundles
 from asca_deploy.browser_page import ORT_FILES, find_ort_web, write_page
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
-from asca_deploy.pillar_pipeline import PillarPipeline
-from asca_pillars.cli import app
-from asca_pillars.data.scans.scan_reader import read_scan, write_scan
-from asca_pillars.errors import BundleError, ConfigError, OutputError
-from asca_pillars.pillars.pillarize import PillarCounts
+from asca_deploy.pillar.pipeline import PillarPipeline
+from asca_pillars.base.errors import BundleError, ConfigError, OutputError
+from asca_pillars.cli.main import app
+from asca_pillars.ops.pillar.prepare import PillarCounts
+from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.deploy.chromium import CHROMIUM, Tab, file_server, open_tab
 
 ORT_WEB = os.environ.get("ASCA_ORT_WEB")

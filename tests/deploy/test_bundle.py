@@ -6,7 +6,7 @@ from asca_deploy import shipped
 from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
-from asca_pillars.errors import BundleError, ConfigError
+from asca_pillars.base.errors import BundleError, ConfigError
 
 
 def test_a_bundle_is_found_by_folder_and_by_shipped_name(tiny_bundle: Path) -> None:

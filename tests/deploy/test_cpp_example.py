@@ -13,8 +13,8 @@ import pytest
 
 from asca_deploy import sample_scan_path, shipped_bundles
 from asca_deploy.golden import write_golden
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, table_inputs
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, table_inputs
+from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cpp"

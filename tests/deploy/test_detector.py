@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.errors import BundleError, ConfigError, ScanError
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.pillars.pillarize import PillarCounts
+from asca_pillars.base.errors import BundleError, ConfigError, ScanError
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.ops.pillar.prepare import PillarCounts
 from tests.deploy.conftest import STAGES, make_scan
 from tests.same_detections import same
 

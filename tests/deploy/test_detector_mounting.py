@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector, sample_scan_path
 from asca_deploy.around import about_ground, turns_around
-from asca_pillars.data.ground_height import fit_ground_plane
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import ConfigError
+from asca_pillars.base.errors import ConfigError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.scans.ground_height import fit_ground_plane
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_reader import read_scan
 from tests.deploy.conftest import EXPECTED_INPUT, make_scan
 
 Points = NDArray[np.float32]

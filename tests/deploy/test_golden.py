@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from asca_deploy import Detector
 from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.cli import app
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import ConfigError, OutputError
+from asca_pillars.base.errors import ConfigError, OutputError
+from asca_pillars.cli.main import app
+from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
 
 

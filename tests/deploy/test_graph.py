@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.providers import Provider
-from asca_pillars.errors import BundleError
+from asca_pillars.base.errors import BundleError
 from tests.deploy.conftest import needs_openvino, sign
 
 by_provider = pytest.mark.parametrize("provider", ["cpu", pytest.param("openvino", marks=needs_openvino)])

@@ -13,10 +13,10 @@ from asca_deploy import shipped_bundles
 from asca_deploy.bundle import MANIFEST, GraphFile, Parity
 from asca_deploy.layout import difference, layout_of
 from asca_deploy.manifest import bundle_to_json, graph_files, load_bundle, load_pillar_bundle, write_bundle_manifest
-from asca_pillars.errors import BundleError
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import FEATURES
+from asca_pillars.base.errors import BundleError
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.prepare import FEATURES
+from asca_pillars.ops.pillar.spec import PillarSpec
 from tests.deploy.conftest import sign
 
 

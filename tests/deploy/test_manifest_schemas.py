@@ -16,8 +16,8 @@ from asca_deploy import Detector
 from asca_deploy.bundle import MANIFEST, PvRcnnBundle
 from asca_deploy.manifest import graph_files, load_bundle, load_pillar_bundle
 from asca_deploy.shipped import shipped_bundles
-from asca_pillars.errors import BundleError
-from asca_pillars.schema import to_dict
+from asca_pillars.base.errors import BundleError
+from asca_pillars.base.schema import to_dict
 from tests.deploy.test_manifest import NOT_THE_GRAPHS, assert_refused, edit
 
 

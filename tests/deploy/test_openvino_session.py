@@ -16,9 +16,9 @@ from asca_deploy import Detections, Detector, auto, openvino_session, sample_sca
 from asca_deploy.graph import Session, Tensor
 from asca_deploy.openvino_session import OpenVinoSession
 from asca_deploy.ort_session import OrtSession
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import BundleError, ProviderError
-from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.base.errors import BundleError, ProviderError
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.scans.scan_reader import read_scan
 from tests.deploy.conftest import needs_openvino
 
 pytestmark = needs_openvino

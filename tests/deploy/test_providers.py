@@ -7,7 +7,7 @@ import pytest
 
 from asca_deploy import Detector, openvino_session, providers
 from asca_deploy.providers import Precision, Provider, available, require
-from asca_pillars.errors import BundleError, ProviderError
+from asca_pillars.base.errors import BundleError, ProviderError
 
 CPU = "CPUExecutionProvider"
 CUDA = "CUDAExecutionProvider"

@@ -9,8 +9,8 @@ from onnx import helper, numpy_helper
 
 from asca_deploy import Detector
 from asca_deploy.providers import open_session
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import BundleError, ProviderError
+from asca_pillars.base.errors import BundleError, ProviderError
+from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
 from tests.deploy.conftest import needs_openvino
 from tests.deploy.test_graph import respoil

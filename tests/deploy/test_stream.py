@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.pillar_pipeline import CanvasBackbone, PillarPipeline
+from asca_deploy.pillar.pipeline import CanvasBackbone, PillarPipeline
 from asca_deploy.stream import overlapped
-from asca_pillars.errors import ScanError
+from asca_pillars.base.errors import ScanError
 from tests.deploy.conftest import make_scan
 from tests.same_detections import same
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import asca_deploy
 from asca_deploy.benchmark import benchmark
-from asca_pillars.commands.export import export
+from asca_pillars.cli.export import export
 
 bundle, scan = sys.argv[1:]
 points = np.load(scan)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asca_deploy.tracker import Tracker
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.detections import Detections
 
 NAMES = ("Car", "Pedestrian")
 CAR, PERSON = (4.0, 1.8, 1.5), (0.8, 0.6, 1.7)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.recall import RecallRow, RecallTally
-from asca_pillars.geometry.detections import Detections
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
 SIZES = ((3.9, 1.6, 1.56), (0.8, 0.6, 1.73), (1.76, 0.6, 1.73))

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.waymo import (
     EVERYWHERE,
     RANGES_M,
@@ -17,7 +18,6 @@ from asca_pillars.evaluation.waymo import (
     mean_over_classes,
     waymo_detection,
 )
-from asca_pillars.geometry.detections import Detections
 
 NAMES = ("Vehicle", "Pedestrian", "Cyclist")
 SIZES = np.array([[4.6, 1.9, 1.7], [0.9, 0.8, 1.75], [1.8, 0.8, 1.75]])

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.kitti.kitti_labels import KittiObject
-from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.kitti.objects import frame_objects
 from asca_pillars.evaluation.predictions import ScoredFrames, read_truth
 from asca_pillars.evaluation.waymo_frames import evaluated_classes, upright_boxes, waymo_frames

@@ -6,11 +6,11 @@ from math import ceil, pi
 import numpy as np
 import pytest
 
+from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.waymo import (
     LEVELS,
     WaymoTruth,
 )
-from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
 from tests.evaluation.test_waymo import NAMES, PEDESTRIAN, VEHICLE, box, score_of
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from asca_export.exporter import export_bundle
-from asca_pillars.pillar_config import CpaReading
+from asca_export.pillar.export import export_bundle
+from asca_pillars.config.pillar import CpaReading
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.made_once import made_once
 

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from asca_export import graphs
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone, FastEncoder, Upsample, fast_encoder
-from asca_pillars.pillar_config import CpaReading
+from asca_pillars.config.pillar import CpaReading
 from tests.export.tiny import tiny_detector
 
 

@@ -14,13 +14,13 @@ from onnx import numpy_helper
 from asca_deploy import Detector
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.manifest import load_pillar_bundle
-from asca_deploy.pillar_pipeline import CanvasBackbone, PillarPipeline
+from asca_deploy.pillar.pipeline import CanvasBackbone, PillarPipeline
 from asca_export import graphs, int8
-from asca_export.exporter import export_bundle
-from asca_pillars.config import pillar_spec
-from asca_pillars.errors import ExportError
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.pillar_config import CpaReading
+from asca_export.pillar.export import export_bundle
+from asca_pillars.base.errors import ExportError
+from asca_pillars.config.pillar import CpaReading
+from asca_pillars.config.tree import pillar_spec
+from asca_pillars.models.pillar.network import PillarDetector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 
 Exports = Callable[[CpaReading], Path]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.pillar_pipeline import Canvas
+from asca_deploy.pillar.pipeline import Canvas
 from asca_export import quantize
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps, FastBackbone
 from asca_export.quantize import WEIGHT_STEPS, canvas_steps, input_moments, layer_names, round_weights, scale_to_steps

@@ -13,12 +13,12 @@ from asca_deploy.benchmark import benchmark
 from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
-from asca_deploy.pillar_pipeline import PillarPipeline, open_backbone
-from asca_export.exporter import export_bundle
-from asca_pillars.errors import ConfigError, ProviderError
+from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
+from asca_export.pillar.export import export_bundle
+from asca_pillars.base.errors import ConfigError, ProviderError
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.pillar_config import PillarModel
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 from tests.same_detections import same
 from tests.scenes import SPEC

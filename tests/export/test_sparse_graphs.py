@@ -11,7 +11,7 @@ import torch
 from torch.utils._pytree import tree_map_only
 
 from asca_deploy.ort_session import OrtSession
-from asca_deploy.pillar_graphs import PILLAR_FEATURES
+from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.fast_forms import CanvasSteps
 from asca_export.quantize import HEAD, STEPS, canvas_steps
 from asca_export.sparse_forms import SparseBackbone
@@ -24,13 +24,13 @@ from asca_export.sparse_quantize import (
     round_products,
     scale_rows_to_steps,
 )
-from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
-from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import Placement, batch_pillars
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pillars.pillarize import Pillars
-from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder, NeckTables, table_inputs
+from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
+from asca_pillars.models.pillar.preparation import Placement, batch_pillars
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables, table_inputs
+from asca_pillars.ops.pillar.prepare import Pillars
 from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
 from tests.scenes import SPEC
 

@@ -5,11 +5,11 @@ from typing import Any
 
 import torch
 
-from asca_pillars.config import Config
+from asca_pillars.config.pillar import CpaReading, NetworkConfig, PillarModel
+from asca_pillars.config.tree import Config
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.pillar.pillar_detector import PillarDetector, build_pillar_detector
-from asca_pillars.pillar_config import CpaReading, NetworkConfig, PillarModel
-from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
+from asca_pillars.ops.pillar.spec import PillarSpec
 from tests.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)

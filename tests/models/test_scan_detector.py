@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.pillar_config import PillarModel
 from tests.scenes import make_scene
 from tests.training.test_loop import CONFIG
 

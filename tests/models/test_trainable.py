@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import Config
-from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config
+from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.build import build_model
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.models.trainable import Movable, Trainable
-from asca_pillars.pillar_config import PillarModel
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, VARIANTS, batch, frame, tiny_detector
-from tests.models.second_stage.tiny_refine import opened_config, write_first_stage
+from tests.models.two_stage.tiny_refine import opened_config, write_first_stage
 from tests.scenes import SPEC, write_dataset
 from tests.second_device import SecondDevice, move_weights, on_gpu
 from tests.training.test_loop import CONFIG, NETWORK

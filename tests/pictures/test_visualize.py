@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.kitti.calibration import Calibration
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_bev, draw_layers, draw_on_image, write_png
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image, objects_3d
-from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import bev_intersection
 from asca_pillars.sim.scene_config import SceneConfig

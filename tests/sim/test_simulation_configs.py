@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from asca_pillars.errors import ConfigError
-from asca_pillars.settings import shipped_configs
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.settings import shipped_configs
 from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
 from asca_pillars.sim.simulation_configs import KIND, load_simulation_config
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from asca_pillars.config import Precision, load_config
+from asca_pillars.config.tree import Precision, load_config
 from asca_pillars.training import bfloat16
 from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.loop import train
+from tests.config.test_tree import CONFIGS
 from tests.scenes import write_dataset
-from tests.test_config import CONFIGS
 from tests.training.test_loop import CONFIG
 
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
+from asca_pillars.config.tree import AugmentConfig, Config, DataConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import DatasetError
-from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.detection.targets import assign_targets
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, PillarPreparation, Placement, TargetedPillars
-from asca_pillars.pillar_config import LossConfig, NetworkConfig, PillarModel
-from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import LabeledPillars, PillarPreparation, Placement, TargetedPillars
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
 from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from asca_deploy import shipped
-from asca_pillars.errors import BundleError, TrainingError
+from asca_pillars.base.errors import BundleError, TrainingError
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.pillar_config import PillarModel
 from asca_pillars.training.loop import train
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG, NETWORK

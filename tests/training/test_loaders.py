@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from asca_pillars.config import Config, TrainConfig
-from asca_pillars.errors import WorkerError
-from asca_pillars.pillar_config import NetworkConfig, PillarModel
-from asca_pillars.schema import to_dict
+from asca_pillars.base.errors import WorkerError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.pillar import NetworkConfig, PillarModel
+from asca_pillars.config.tree import Config, TrainConfig
 from asca_pillars.training import loaders
 from asca_pillars.training.loader_processes import loader_context, start_loader_process
 from asca_pillars.training.loaders import BatchLoader

@@ -15,19 +15,19 @@ import pytest
 import torch
 import yaml
 
-from asca_pillars.config import AugmentConfig, Config, DataConfig, TrainConfig
-from asca_pillars.data.expected_input import ExpectedInput
-from asca_pillars.errors import ScanError, TrainingError
+from asca_pillars.base.errors import ScanError, TrainingError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.pillar import CpaReading, NetworkConfig, PillarModel
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import AugmentConfig, Config, DataConfig, TrainConfig
+from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.evaluation.recall import RecallRow, RecallTally
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
+from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.trainable import Trainable
-from asca_pillars.pillar_config import CpaReading, NetworkConfig, PillarModel
-from asca_pillars.pillars.pillarize import PillarLimits
-from asca_pillars.pv_rcnn_config import PvRcnnModel
-from asca_pillars.refine_config import RefineModel
-from asca_pillars.schema import to_dict
+from asca_pillars.ops.pillar.prepare import PillarLimits
+from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.training.callbacks import TrainingInterruptedError
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import syncs_statistics, train

@@ -7,10 +7,10 @@ from pathlib import Path
 import yaml
 
 from asca_deploy import Detector
+from asca_pillars.base.schema import to_dict
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.schema import to_dict
+from asca_pillars.scans.scan_reader import read_scan
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.in_process import invoke
 from tests.training.test_loop import CONFIG

@@ -8,26 +8,26 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.config import AugmentConfig, load_config
+from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_pillars.config.tree import AugmentConfig, load_config
+from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.data.augment import move_scene
 from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import ConfigError, TrainingError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.refine.refine_detector import RefineDetector
 from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.models.second_stage.open_first_stage import open_first_stage, with_first_stage
-from asca_pillars.models.second_stage.refine_preparation import LabeledProposals, move_proposed
-from asca_pillars.models.second_stage.refined_detector import refine
-from asca_pillars.points.first_stage import propose_on
-from asca_pillars.points.roi_targets import match_proposals
-from asca_pillars.refine_config import RefineModel
+from asca_pillars.models.two_stage.network import RefineDetector
+from asca_pillars.models.two_stage.open_first_stage import open_first_stage, with_first_stage
+from asca_pillars.models.two_stage.preparation import LabeledProposals, move_proposed
+from asca_pillars.models.two_stage.refined_detector import refine
+from asca_pillars.ops.two_stage.first_stage import propose_on
+from asca_pillars.ops.two_stage.roi_targets import match_proposals
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
-from tests.models.refine.test_pillar_refiner import proposed_frame
-from tests.models.second_stage.tiny_refine import (
+from tests.models.two_stage.test_pillar_refiner import proposed_frame
+from tests.models.two_stage.tiny_refine import (
     STILL_OBJECTS,
     opened_config,
     tiny_refine_config,

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from asca_pillars.config import Config
-from asca_pillars.errors import OutputError
-from asca_pillars.schema import to_dict
-from asca_pillars.system import describe_environment
+from asca_pillars.base.errors import OutputError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.system import describe_environment
+from asca_pillars.config.tree import Config
 from asca_pillars.training.run_files import YAML_HEAD, require_own_run
 from asca_pillars.training.run_folder import Seen, claim
 from tests.in_process import run_here

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from asca_pillars.base.errors import DatasetError, OutputError, TrainingError
+from asca_pillars.base.locks import only_writer
+from asca_pillars.base.schema import to_dict
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import DatasetError, OutputError, TrainingError
-from asca_pillars.locks import only_writer
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.schema import to_dict
 from asca_pillars.training.loop import train
 from asca_pillars.training.run_folder import Seen, claim
 from tests.scenes import write_dataset

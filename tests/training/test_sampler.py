@@ -2,7 +2,7 @@
 
 import pytest
 
-from asca_pillars.errors import TrainingError
+from asca_pillars.base.errors import TrainingError
 from asca_pillars.training.sampler import EpochSampler
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from asca_pillars.config import TrainConfig
+from asca_pillars.config.tree import TrainConfig
 from asca_pillars.training.callbacks import weight_average
 from asca_pillars.training.module import DetectionModule
 from asca_pillars.training.schedules import cooldown_start, warmup_stable_decay

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from asca_pillars.config import TrainConfig
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.tree import TrainConfig
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.schema import to_dict
 from tests.scenes import write_dataset
 from tests.training.test_loop import CONFIG
 

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.files import file_inside, is_hidden
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, read_time, records_from
-from asca_pillars.data.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, visible_files
-from asca_pillars.errors import DatasetError
-from asca_pillars.files import file_inside, is_hidden
+from asca_pillars.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, visible_files
 
 DATASET_FILE = "dataset.yaml"
 _DEEPEST = 64

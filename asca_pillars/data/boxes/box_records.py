@@ -23,11 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
 from asca_pillars.data.yaw_units import LARGEST_YAW_RAD, why_no_yaw
-from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.input_files import read_text
 
 FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
 _SHORT = {name.rpartition("_")[0]: name for name in FIELDS}

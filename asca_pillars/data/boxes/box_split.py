@@ -22,17 +22,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import ConfigError, DatasetError
+from asca_pillars.base.settings import read_settings
 from asca_pillars.data.boxes.box_frames import DATASET_FILE, BoxFrame, find_frames
 from asca_pillars.data.boxes.box_records import BoxRecords
 from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.data.labeled_split import LabeledBoxes
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.data.scan_settings import ScanSettings, sample_points
-from asca_pillars.data.scans.scan_reader import ReflectanceScale, read_scan
-from asca_pillars.data.scans.stored_scans import folder_reflectance_scale, stored_points
-from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.settings import read_settings
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_reader import ReflectanceScale, read_scan
+from asca_pillars.scans.scan_settings import ScanSettings, sample_points
+from asca_pillars.scans.stored_scans import folder_reflectance_scale, stored_points
 
 ALL_AROUND_DEG = 360.0
 

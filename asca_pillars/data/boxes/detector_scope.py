@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.detector_spec import DetectorSpec
+from asca_pillars.detection.spec import DetectorSpec
 
 Interval = tuple[float, float]
 

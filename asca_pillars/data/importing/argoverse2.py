@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import can_be_written, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import LeftOut, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.data.scans.feather import feather_table
-from asca_pillars.data.scans.find_scans import files_below
-from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.rotations import of_quaternions
+from asca_pillars.scans.feather import feather_table
+from asca_pillars.scans.find_scans import files_below
 
 AXLE_HEIGHT_M = 0.33
 """Of the vehicle's frame above the ground: a wheel's radius. The sweeps themselves show 0.35."""

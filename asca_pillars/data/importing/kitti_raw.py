@@ -14,14 +14,14 @@ from xml.etree import ElementTree
 import numpy as np
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import LeftOut, numbers, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG, TYPES
-from asca_pillars.data.scans.find_scans import files_below, visible_files
-from asca_pillars.errors import DatasetError
-from asca_pillars.input_files import read_text
+from asca_pillars.scans.find_scans import files_below, visible_files
 
 LABELS = "tracklet_labels.xml"
 _DOCTYPE = "<!DOCTYPE boost_serialization>"

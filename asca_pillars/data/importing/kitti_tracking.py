@@ -10,14 +10,14 @@ from pathlib import Path
 
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import LeftOut
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects, parse_object, read_calibration
-from asca_pillars.data.scans.find_scans import visible_files
-from asca_pillars.errors import DatasetError
-from asca_pillars.input_files import read_text
+from asca_pillars.scans.find_scans import visible_files
 
 LABELED_VIEW_DEG = 81.0
 """Of KITTI's left color camera: 1242 pixels at a focal length of 721."""

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.files import file_inside
+from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import LeftOut, entry, numbers, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.errors import DatasetError
-from asca_pillars.files import file_inside
 from asca_pillars.geometry.rotations import of_quaternions
-from asca_pillars.input_files import read_text
 
 CHANNEL = "LIDAR_TOP"
 DETECTION_CLASSES = {

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from asca_pillars.errors import AscaError, DatasetError
-from asca_pillars.input_files import require_content
-from asca_pillars.installation import install_command
+from asca_pillars.base.errors import AscaError, DatasetError
+from asca_pillars.base.input_files import require_content
+from asca_pillars.base.installation import install_command
 
 _BATCH = 8  # rows that are in memory at once: a range image has millions of numbers
 

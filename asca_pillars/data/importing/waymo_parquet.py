@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.files import atomic_path, portable_name, write_text
 from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
@@ -23,10 +25,8 @@ from asca_pillars.data.importing.foreign_values import LeftOut, numbers, text_of
 from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
 from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
-from asca_pillars.data.scans.find_scans import visible_files
-from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path, portable_name, write_text
 from asca_pillars.geometry.frame_change import is_rigid
+from asca_pillars.scans.find_scans import visible_files
 
 TOP = 1
 """The roof's sensor."""

@@ -7,11 +7,11 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.processes import in_processes
 from asca_pillars.data.insertion.free_space import CELLS_PER_NODE, FreeSpace, find_free_space
 from asca_pillars.data.insertion.ground_fit import Ground
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.processes import in_processes
 
 VERSION = 2  # of what is computed; files of another version are computed again
 _AT_ONCE = 16

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace
 from asca_pillars.data.insertion.gt_database import StoredObject
-from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import paired_bev_touch
 from asca_pillars.geometry.ranges import Ranges

@@ -23,12 +23,12 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.files import portable_name
+from asca_pillars.base.processes import in_processes
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.files import portable_name
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.processes import in_processes
 
 VERSION = 1
 _AT_ONCE = 16

@@ -5,11 +5,11 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from asca_pillars.config import DataConfig
-from asca_pillars.data.scans.find_scans import PREPARED_FILE, PREPARED_NOTE
-from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path
-from asca_pillars.own_files import require_own, starting_with
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.own_files import require_own, starting_with
+from asca_pillars.config.tree import DataConfig
+from asca_pillars.scans.find_scans import PREPARED_FILE, PREPARED_NOTE
 
 
 def prepared_folder(root: str | Path, data: DataConfig) -> Path:

@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.tables.voxel_spec import VoxelSpec
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 
 InspectedSpec: TypeAlias = PillarSpec | VoxelSpec
 """Of the families that are inspected."""

@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.config import DataConfig
-from asca_pillars.data.input_check import FrameDoubt
+from asca_pillars.base.errors import DatasetError, ScanError
+from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.inspection.box_conventions import ConventionFit, convention_fits
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.yaw_units import doubt_of_yaws
-from asca_pillars.errors import DatasetError, ScanError
-from asca_pillars.geometry.anchors import ClassSpec
+from asca_pillars.detection.anchors import ClassSpec
+from asca_pillars.detection.targets import Assigner
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.geometry.targets import Assigner
+from asca_pillars.scans.input_check import FrameDoubt
 
 
 class Spread(NamedTuple):

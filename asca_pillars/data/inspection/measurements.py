@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.config import DataConfig
+from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
-from asca_pillars.data.input_check import FrameDoubt, doubt_frame, ground_z_m
 from asca_pillars.data.inspection.box_conventions import count_points
 from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.data.scans.scan_reader import decide_scale
-from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.detection.targets import Assigner, assign_targets
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.geometry.targets import Assigner, assign_targets
+from asca_pillars.scans.input_check import FrameDoubt, doubt_frame, ground_z_m
+from asca_pillars.scans.scan_reader import decide_scale
 
 DOUBT_POINTS = 8_192
 """Of a scan that its axes are judged by."""

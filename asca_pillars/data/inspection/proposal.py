@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.config import Config
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.tree import Config
 from asca_pillars.data.inspection.findings import FEWEST_BOXES
 from asca_pillars.data.inspection.input_cells import InspectedSpec
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.errors import DatasetError
-from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD, ClassSpec
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.pillars.fitting import NECK_STRIDE
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.schema import to_dict
-from asca_pillars.tables.voxel_spec import MAP_MULTIPLE
+from asca_pillars.ops.pillar.fitting import NECK_STRIDE
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.ops.pv_rcnn.spec import MAP_MULTIPLE
 
 HELD = 0.98  # share of the boxes that each range has to hold
 MATCHED = 0.6  # share of the boxes that an anchor should overlap by positive_iou; the best positive_iou that gives it

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.input_files import read_text
 from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, image_boxes
 from asca_pillars.data.yaw_units import why_no_yaw
-from asca_pillars.errors import DatasetError
-from asca_pillars.files import atomic_path
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.input_files import read_text
 
 _TOO_LARGE = 1e9  # of any field; far above, float32 boxes are no longer finite
 

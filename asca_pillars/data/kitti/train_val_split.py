@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from asca_pillars.base.errors import DatasetError, OutputError
 from asca_pillars.data.kitti.kitti_split import write_image_set
-from asca_pillars.data.scans.find_scans import visible_files
-from asca_pillars.errors import DatasetError, OutputError
+from asca_pillars.scans.find_scans import visible_files
 
 FRAMES = 7481
 _IN_TRAIN = (

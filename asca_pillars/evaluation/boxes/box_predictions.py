@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import NamedRecords, json_line, records_from
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.errors import DatasetError
+from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
 from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame, stated_scope
 from asca_pillars.evaluation.predictions import shortage
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.geometry.detections import Detections
 
 NEAR_LABEL_M = 4.0
 """From an object that is labelled at the edge of the view: the largest distance at which any protocol matches."""

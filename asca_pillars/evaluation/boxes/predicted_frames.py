@@ -7,11 +7,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import NamedRecords, read_frames
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.errors import DatasetError
 
 _SAME_TIME_S = 1e-3
 _DEEPEST = 64  # folders of a scan's path that are looked at

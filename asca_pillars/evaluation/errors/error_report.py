@@ -8,19 +8,19 @@ from typing import Any
 
 from rich.console import Console
 
+from asca_pillars.base.errors import ConfigError, DatasetError
+from asca_pillars.base.files import write_json, write_text
+from asca_pillars.base.own_files import Recognizer, ending_with, json_object, page_end, require_own_file
+from asca_pillars.base.schema import parse, to_dict
+from asca_pillars.base.strict import Strict
 from asca_pillars.data.kitti.kitti_split import read_image_set
-from asca_pillars.data.scans.find_scans import visible_files
-from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
 from asca_pillars.evaluation.errors.error_page import error_page
 from asca_pillars.evaluation.errors.error_summary import DatasetErrors, match_frames, summarize
 from asca_pillars.evaluation.errors.error_tables import PRINTED_NOTES, error_notes, error_tables, group_tables
 from asca_pillars.evaluation.errors.worst_cases import draw_cases, worst_cases
 from asca_pillars.evaluation.report_page import ReportPage
-from asca_pillars.files import write_json, write_text
-from asca_pillars.own_files import Recognizer, ending_with, json_object, page_end, require_own_file
-from asca_pillars.schema import parse, to_dict
-from asca_pillars.strict import Strict
+from asca_pillars.scans.find_scans import visible_files
 
 JSON, MARKDOWN, PAGE = "errors.json", "errors.md", "errors.html"
 _COMMAND = "asca eval"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from asca_pillars.base.strict import Strict
 from asca_pillars.data.insertion.ground_fit import fit_ground
 from asca_pillars.evaluation.errors.block_bootstrap import Resamples, resamples
 from asca_pillars.evaluation.errors.box_errors import (
@@ -29,7 +30,6 @@ from asca_pillars.evaluation.errors.false_detections import TRAITS, Surroundings
 from asca_pillars.evaluation.errors.label_fit import END_ON_DEG, STATISTICS, label_fit
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, min_overlap
 from asca_pillars.geometry.overlap import paired_iou_3d
-from asca_pillars.strict import Strict
 
 CLEAR_RANGE_M = 35.0
 CLEAR_TRUNCATION = 0.1

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.detection.assignment import greedy_matches
 from asca_pillars.evaluation.kitti.average_precision import min_overlap as kitti_min_overlap
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
@@ -30,7 +31,6 @@ from asca_pillars.evaluation.kitti.states import (
     is_type,
     truth_states,
 )
-from asca_pillars.geometry.assignment import greedy_matches
 
 DONT_CARE_SHARE = 0.5  # of a detection's 2D box: in one DontCare area, more makes it ignored
 

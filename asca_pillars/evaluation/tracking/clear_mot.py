@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asca_pillars.detection.assignment import UNMATCHED, best_assignments
 from asca_pillars.evaluation.tracking.tracked_frames import TrackedFrame
-from asca_pillars.geometry.assignment import UNMATCHED, best_assignments
 
 
 class ClearMot(NamedTuple):

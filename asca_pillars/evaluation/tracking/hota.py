@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.detection.assignment import UNMATCHED, best_assignments
 from asca_pillars.evaluation.tracking.tracked_frames import TrackedFrame, counts_of_ids
-from asca_pillars.geometry.assignment import UNMATCHED, best_assignments
 
 _Doubles = NDArray[np.float64]
 Pair = tuple[int, int]

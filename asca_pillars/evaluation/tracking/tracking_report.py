@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import NamedRecords
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
-from asca_pillars.data.scans.find_scans import natural_order
-from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame, stated_scope
 from asca_pillars.evaluation.report_page import TextTable
 from asca_pillars.evaluation.tracking.clear_mot import ClearMot, clear_mot
 from asca_pillars.evaluation.tracking.hota import Hota, hota
 from asca_pillars.evaluation.tracking.tracked_frames import Boxes, TrackedFrame, tracked_frame
-from asca_pillars.input_files import read_text
+from asca_pillars.scans.find_scans import natural_order
 
 CLEAR_IOU = 0.25
 """3D IoU from which on a box has found an object, for MOTA, switches and fragmentations."""

@@ -8,10 +8,13 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from asca_pillars.config import Config
-from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.files import atomic_path
-from asca_pillars.input_files import require_content
+from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.input_files import require_content
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import unread
 from asca_pillars.models.openpcdet.links import Link, convert_state
@@ -19,9 +22,6 @@ from asca_pillars.models.openpcdet.mmdetection3d_links import FIRST_LINEAR, FUSI
 from asca_pillars.models.openpcdet.pointpillars_links import pointpillars_links
 from asca_pillars.models.openpcdet.pv_rcnn_links import FIRST_CONVOLUTION, pv_rcnn_links
 from asca_pillars.models.openpcdet.weights_alone import load_weights_alone
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pv_rcnn_config import PvRcnnModel
-from asca_pillars.schema import to_dict
 
 CONFIG_OF = {
     "vfe.pfn_layers.0.linear.weight": "openpcdet_pointpillars_kitti",

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from asca_pillars.errors import TrainingError
+from asca_pillars.base.errors import TrainingError
 
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 _COUNTER = "num_batches_tracked"

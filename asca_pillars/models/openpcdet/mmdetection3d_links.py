@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator, Mapping
 
 from torch import Tensor
 
-from asca_pillars.errors import TrainingError
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.models.openpcdet.links import Link
 from asca_pillars.models.openpcdet.map_links import map_links
 from asca_pillars.models.openpcdet.pointpillars_links import encoder_links
 from asca_pillars.models.openpcdet.pv_rcnn_links import pv_rcnn_links
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pv_rcnn_config import PvRcnnModel
 
 _ENCODER, _VOXELS = "voxel_encoder.pfn_layers.0", "middle_encoder"
 FIRST_LINEAR = f"{_ENCODER}.linear.weight"

@@ -11,11 +11,11 @@ from collections.abc import Iterator, Mapping
 
 from torch import Tensor
 
-from asca_pillars.errors import TrainingError
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.openpcdet.links import Link, norm_links
 from asca_pillars.models.openpcdet.map_links import map_links
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pillars.pillarize import FEATURES
+from asca_pillars.ops.pillar.prepare import FEATURES
 
 _Z = FEATURES.index("z")
 _X_CENTER, _Z_CENTER = FEATURES.index("x_center"), len(FEATURES)  # the last is the one feature that ours does not have

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator, Mapping
 import torch
 from torch import Tensor
 
+from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.models.openpcdet.links import Link, norm_links, without_singletons
 from asca_pillars.models.openpcdet.map_links import map_links
 from asca_pillars.models.openpcdet.sparse_layout import dense_order
-from asca_pillars.points.voxel_scan import LEVEL_SOURCES
-from asca_pillars.pv_rcnn_config import PvRcnnModel
+from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
 
 FIRST_CONVOLUTION = "backbone_3d.conv_input.0.weight"
 _JOINED = ("points", *LEVEL_SOURCES)  # after the map

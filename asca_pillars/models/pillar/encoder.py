@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from asca_pillars.config.pillar import CpaReading
 from asca_pillars.models.map_layers import NORM_EPS, NORM_MOMENTUM
 from asca_pillars.models.pillar.attention import ChannelAttention, ChannelLinear, PaperAttention, PointAttention
 from asca_pillars.models.row_product import linear_rows
-from asca_pillars.pillar_config import CpaReading
-from asca_pillars.pillars.pillarize import FEATURES, PillarLimits
+from asca_pillars.ops.pillar.prepare import FEATURES, PillarLimits
 
 
 @torch.library.custom_op("asca::pillar_max", mutates_args=())
@@ -73,7 +73,7 @@ class PillarEncoder(nn.Module):
         """Point features (M, 9) -> pillar features (P, C), which are unitless.
 
         Args:
-            features: (M, 9) decorated points, see `pillars.pillarize.FEATURES`.
+            features: (M, 9) decorated points, see `ops.pillar.prepare.FEATURES`.
             pillar_index: (M,) index of each point's pillar, ascending.
             point_counts: (P,) points of each pillar.
             frame_pillars: pillars of each frame of a batch, summing to P; None is one frame.

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.geometry.decode import HeadMaps
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.row_product import linear_rows
 
 POSITIVE_PRIOR = 0.01  # what an untrained head says of every anchor: focal loss starts calm (arXiv 1708.02002, 4.1)

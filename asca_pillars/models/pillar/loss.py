@@ -7,15 +7,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.geometry.anchors import ANCHOR_YAWS_RAD
+from asca_pillars.config.pillar import LossConfig
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.geometry.boxes import decode_boxes
-from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.overlap import paired_iou_3d
-from asca_pillars.pillar_config import LossConfig
 
 
 class TargetBatch(NamedTuple):
-    """`geometry.targets.Targets` of B frames.
+    """`detection.targets.Targets` of B frames.
 
     Attributes:
         state: (B, H, W, A) int8, 1 positive, 0 negative, -1 without part.

@@ -10,8 +10,8 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
 from asca_pillars.models.row_product import linear_rows
 from asca_pillars.models.table_conv import at_active_cells, table_conv
-from asca_pillars.pillars.grid import HEAD_STRIDE, NECK_STRIDE
-from asca_pillars.tables.neck_tables import MaskRule, NeckTables
+from asca_pillars.ops.pillar.grid import HEAD_STRIDE, NECK_STRIDE
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTables
 
 
 class RPNLayers(nn.Module):
@@ -60,7 +60,7 @@ class SparseRPNNeck(RPNLayers):
     of a level at head cells where only another level is active.
 
     Args:
-        rule: which cells are active, see `tables.neck_tables`.
+        rule: which cells are active, see `ops.pillar.neck_rulebooks`.
         widths: as for `RPNLayers`.
     """
 

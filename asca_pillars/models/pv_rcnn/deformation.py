@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.refine.set_abstraction import found_once
+from asca_pillars.models.two_stage.set_abstraction import found_once
 
 _OFFSET_CHANNELS = 16  # of f', which the paper does not give
 _INITIAL_STD = 1e-3  # of the last weights: training starts at almost undeformed keypoints, and all weights learn

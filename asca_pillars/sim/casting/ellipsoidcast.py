@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.geometry.compiling import cached
+from asca_pillars.base.compiling import cached
 from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
 from asca_pillars.sim.casting.windows import PLAIN, TURN, Window, columns_of, keep, ray_chance, rings_of, window_of
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.geometry.compiling import cached
+from asca_pillars.base.compiling import cached
 from asca_pillars.sim.casting.groundcast import (
     GROUND,
     RAIL,

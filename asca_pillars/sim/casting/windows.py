@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.geometry.compiling import cached
+from asca_pillars.base.compiling import cached
 from asca_pillars.sim.casting.rays import NearestHits, RayLimits
 
 Floats = npt.NDArray[np.float64]

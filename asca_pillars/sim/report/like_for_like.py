@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import Calibration, KittiSplit, boxes_from_objects, in_image
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import DatasetError
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.detection.detections import Detections
+from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.sim.report.look_alikes import NEIGHBORS, LikeRow, compare_objects
 from asca_pillars.sim.report.object_records import ObjectRecord, record_objects, seen_objects
 from asca_pillars.sim.report.reference import CLASSES

@@ -8,8 +8,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from asca_pillars.base.files import write_json, write_text
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.files import write_json, write_text
 from asca_pillars.sim.report.like_for_like import LikeForLike
 from asca_pillars.sim.report.look_alikes import ALL, MEASURES, NEIGHBORS, LikeRow
 from asca_pillars.sim.report.plots import new_figure, save_figure

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import DatasetError
 from asca_pillars.sim.report.fit_statistics import fits_of
 from asca_pillars.sim.report.label_statistics import label_statistics
 from asca_pillars.sim.report.reference import CLASSES, Statistics, kitti_reference

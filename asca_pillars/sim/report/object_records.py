@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiObject
+from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
-from asca_pillars.geometry.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.sim.report.reference import CLASSES
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
-from asca_pillars.schema import parse
-from asca_pillars.strict import Strict
+from asca_pillars.base.schema import parse
+from asca_pillars.base.strict import Strict
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 BAND_M = 10.0  # of what is told by range, from 0 to 80 m

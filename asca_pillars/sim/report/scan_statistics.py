@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, boxes_from_objects, in_image, objects_3d
-from asca_pillars.data.scans.scan_reader import read_scan
 from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.sim.report.fit_statistics import object_fits
 from asca_pillars.sim.report.ground_points import ground_mask
 from asca_pillars.sim.report.reference import (

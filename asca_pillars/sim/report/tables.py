@@ -10,10 +10,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from asca_pillars.base.files import write_json, write_text
+from asca_pillars.base.own_files import page_end
+from asca_pillars.base.schema import to_dict
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.files import write_json, write_text
-from asca_pillars.own_files import page_end
-from asca_pillars.schema import to_dict
 from asca_pillars.sim.report.comparison import Comparison, Row
 from asca_pillars.sim.report.reference import CAR_FIT_RANGE_M, NEAR_CARS_M, Fit
 from asca_pillars.sim.report.scan_statistics import OBJECTS

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.insertion.ground_fit import fit_ground
+from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.geometry.detections import Detections
 
 PERSON_HEIGHT_M, THIN_M = (0.9, 2.2), 1.0
 BRIGHT_MEAN = 0.45

@@ -12,9 +12,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.errors import ConfigError
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.strict import Strict
 from asca_pillars.sim.sensor import hdl64
-from asca_pillars.strict import Strict
 
 MAX_COLUMNS = 4096  # the ray caster tells firings apart by ring * 4096 + column
 

@@ -18,12 +18,12 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from asca_pillars.base.files import write_json, write_text
+from asca_pillars.base.own_files import require_own_file, starting_with
 from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.kitti import in_image, write_image_set
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.files import write_json, write_text
-from asca_pillars.own_files import require_own_file, starting_with
+from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
 from asca_pillars.sim.parallel import (
     COMMAND,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.geometry.compiling import cached
+from asca_pillars.base.compiling import cached
 
 Floats = npt.NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.detection.detections import Detections
 
 SAME_OBJECT_M = 0.5  # boxes of a class whose centers are farther apart than this are of different objects
 

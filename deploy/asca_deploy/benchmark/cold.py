@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.errors import AscaError
+from asca_pillars.base.errors import AscaError
+from asca_pillars.scans.mounting import Mounting
 
 _FIRST_BOXES = """
 import sys, time
 from asca_deploy import Detector
 imported = time.time()
 import json, numpy
-from asca_pillars.data.mounting import Mounting
+from asca_pillars.scans.mounting import Mounting
 points, options, mounting = numpy.load(sys.argv[2]), json.loads(sys.argv[3]), json.loads(sys.argv[4])
 start = time.time()
 detector = Detector(sys.argv[1], mounting=Mounting(**mounting), **options)
@@ -34,7 +34,7 @@ print(json.dumps([imported, loaded - start, boxes - loaded, boxes]))
 _DETECT = """
 import sys
 from asca_deploy.benchmark.resident_memory import peak_memory_mib
-from asca_pillars.cli import app
+from asca_pillars.cli.main import app
 app(["detect", sys.argv[2], "--bundle", sys.argv[1], "--out", sys.argv[3], *sys.argv[4:]], standalone_mode=False)
 print(peak_memory_mib())
 """

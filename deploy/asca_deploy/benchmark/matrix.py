@@ -13,9 +13,9 @@ from asca_deploy.benchmark.speed_comparison import Contestant, compare
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
 from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider
-from asca_pillars.data.mounting import Mounting
-from asca_pillars.errors import AscaError
-from asca_pillars.system import default_threads
+from asca_pillars.base.errors import AscaError
+from asca_pillars.base.system import default_threads
+from asca_pillars.scans.mounting import Mounting
 
 ON_THE_CPU = ("cpu", "openvino")  # the number of threads matters to these
 

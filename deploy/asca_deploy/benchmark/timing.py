@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
-from asca_pillars.geometry.frame_report import FrameReport
-from asca_pillars.pillars.pillarize import PillarCounts
+from asca_pillars.detection.report import FrameReport
+from asca_pillars.ops.pillar.prepare import PillarCounts
 
 Track: TypeAlias = Callable[[int, str], Iterable[int]]
 """Numbers 0..count-1 of what is being done, in words; a command line puts a progress bar behind it."""

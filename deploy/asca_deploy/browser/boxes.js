@@ -1,4 +1,4 @@
-/** Head maps -> boxes: threshold, decode, rotated non-maximum suppression (asca_pillars/geometry/decode.py). */
+/** Head maps -> boxes: threshold, decode, rotated non-maximum suppression (asca_pillars/detection/decode.py). */
 
 const DIRECTION_OFFSET = Math.PI / 4; // where bundle.json does not say
 const MAX_LOG_RATIO = Math.log(100);

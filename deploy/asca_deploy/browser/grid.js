@@ -1,4 +1,4 @@
-/** The pillar grid that bundle.json describes (asca_pillars/pillars/grid.py): cells of points, and where cells stand. */
+/** The pillar grid that bundle.json describes (asca_pillars/ops/pillar/grid.py): cells of points, and where cells stand. */
 
 const HEAD_STRIDE = 2;
 
@@ -51,7 +51,7 @@ export function cellOf(grid, x, y, z) {
   return interval(y, grid.rowEdges) * grid.nx + grid.columnOfSlice[interval(x, grid.sliceEdges)];
 }
 
-// As in asca_pillars/data/input_check.py.
+// As in asca_pillars/scans/input_check.py.
 const BEHIND_SHARE = 0.2;
 const BODY_M = 3;
 

@@ -1,4 +1,4 @@
-/** Points -> pillars -> pseudo-image (asca_pillars/pillars/pillarize.py, docs/BUNDLE.md). */
+/** Points -> pillars -> pseudo-image (asca_pillars/ops/pillar/prepare.py, docs/BUNDLE.md). */
 
 import { cellOf } from "./grid.js";
 

@@ -1,4 +1,4 @@
-/** Cells of pillars -> the tables that a sparse neck reads (asca_pillars/tables/neck_tables.py, docs/BUNDLE.md). */
+/** Cells of pillars -> the tables that a sparse neck reads (asca_pillars/ops/pillar/neck_rulebooks.py, docs/BUNDLE.md). */
 
 const LEVELS = 3;
 

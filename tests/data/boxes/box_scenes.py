@@ -6,7 +6,7 @@ import numpy as np
 
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.kitti import write_image_set
-from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.scans.scan_reader import write_scan
 from tests.scenes import make_scene
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.errors import DatasetError
 
 
 def test_a_file_for_each_frame_gives_the_same(root: Path) -> None:

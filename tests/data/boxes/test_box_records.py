@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import json_line, read_frame_file, read_frames, records_from
-from asca_pillars.errors import DatasetError
 
 BOX = {"class": "Forklift", "x_m": 10, "y_m": -2.5, "z_m": -0.7, "length_m": 2.5, "width_m": 1.2, "height_m": 2.1}
 BOX |= {"yaw_rad": 0.3}

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 import yaml
 
-from asca_pillars.commands.prepare import prepare
-from asca_pillars.config import Config, DataConfig, InsertConfig, pillar_spec
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.cli.prepare import prepare
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, DataConfig, InsertConfig, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
@@ -16,14 +19,11 @@ from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_i
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.mounting import Mounting
 from asca_pillars.data.open_split import open_split
-from asca_pillars.data.scans.scan_reader import read_scan, write_scan
 from asca_pillars.data.training_frames import open_frames
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.anchors import ClassSpec
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.schema import to_dict
+from asca_pillars.detection.anchors import ClassSpec
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import SPEC, make_scene, write_dataset
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope, scope_from_json
-from asca_pillars.pillars.pillar_spec import PillarSpec
+from asca_pillars.ops.pillar.spec import PillarSpec
 
 
 @pytest.mark.parametrize("around", [False, True])

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.argoverse2 import read_argoverse2
 from asca_pillars.data.importing.imported import usable
 from asca_pillars.data.importing.nuscenes import read_nuscenes
-from asca_pillars.errors import DatasetError
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.importing.test_import import write_argoverse2, write_nuscenes
 from tests.data.importing.test_waymo_parquet import write_segment

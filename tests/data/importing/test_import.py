@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from asca_pillars.base.errors import AscaError, ConfigError, DatasetError, OutputError, ScanError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.imported import usable
 from asca_pillars.data.importing.nuscenes import read_nuscenes
-from asca_pillars.data.scans.find_scans import find_scans
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import AscaError, ConfigError, DatasetError, OutputError, ScanError
 from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.scan_reader import read_scan
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.in_process import invoke
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.importing.imported import usable
 from asca_pillars.data.importing.kitti_raw import read_kitti_raw
 from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
-from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.in_process import invoke
 

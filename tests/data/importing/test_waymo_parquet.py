@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError, OutputError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.waymo_parquet import read_waymo
-from asca_pillars.errors import DatasetError, OutputError
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.in_process import invoke
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiSplit, objects_from_boxes, write_calibration, write_image_set, write_labels
-from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.scans.scan_reader import write_scan
 from tests.scenes import CALIBRATION, SIZES
 
 # Never exactly level or straight ahead, so that no ray is parallel to the sides of a box.

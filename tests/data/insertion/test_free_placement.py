@@ -10,9 +10,9 @@ from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_placement import MARGIN_M, Scene, is_clear, rays_entering, to_free_place
 from asca_pillars.data.insertion.free_space import FreeSpace, find_free_space
 from asca_pillars.data.insertion.gt_database import StoredObject
-from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.boxes import footprints, points_in_boxes, wrap_angle
-from asca_pillars.pillars.grid import PillarGrid
+from asca_pillars.ops.pillar.grid import PillarGrid
 from tests.data.insertion.simple_streets import LEVEL, cast, stand, street
 
 GRID = PillarGrid(x_range_m=(0, 40.96), y_range_m=(-20.48, 20.48), v_max_m=0.32, zones=1).ranges

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion import gt_database
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
 from asca_pillars.data.kitti import KittiObject, KittiSplit, read_labels, write_labels
-from asca_pillars.errors import AscaError, DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.insertion.simple_streets import TYPES, write_streets

@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 from torch.utils.data import DataLoader
 
-from asca_pillars.commands.prepare import prepare
-from asca_pillars.config import Config, DataConfig, InsertConfig
+from asca_pillars.base.errors import ConfigError, DatasetError
+from asca_pillars.cli.prepare import prepare
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, DataConfig, InsertConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_labels, write_labels
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
-from asca_pillars.pillar_config import PillarModel
+from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.dataset import Collate, open_dataset
 from asca_pillars.training.loader_processes import loader_context
 from tests.data.insertion.simple_streets import TYPES, write_streets

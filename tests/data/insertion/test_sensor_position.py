@@ -11,7 +11,7 @@ from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects
 from asca_pillars.data.kitti import KittiSplit, write_image_set
-from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.scans.scan_reader import write_scan
 from tests.data.insertion.simple_streets import TYPES, write_streets
 from tests.data.insertion.test_insert_objects import METHODS, config, open_inserter
 from tests.scenes import SPEC

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.config import Config, DataConfig
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.inspection.box_conventions import (
     CONVENTIONS,
@@ -20,7 +21,6 @@ from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.pillar_config import PillarModel
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.in_process import invoke
 from tests.scenes import SPEC, make_scene

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from asca_pillars.commands.inspect import inspect
+from asca_pillars.base.schema import to_dict
+from asca_pillars.cli.inspect import inspect
+from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.measurements import MatchOutcome, match
-from asca_pillars.geometry.targets import assign_targets
-from asca_pillars.pillar_config import LossConfig, PillarModel
-from asca_pillars.schema import to_dict
+from asca_pillars.detection.targets import assign_targets
 from asca_pillars.training.dataset import open_dataset
 from tests.data.inspection.conftest import FRAMES
 from tests.data.inspection.test_inspect_dataset import CONFIG

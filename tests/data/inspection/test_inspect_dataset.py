@@ -16,19 +16,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.config import Config, DataConfig, pillar_spec
+from asca_pillars.base.schema import to_dict
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, DataConfig, pillar_spec
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dataset
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.data.scans.stored_scans import stored_points
-from asca_pillars.geometry.anchors import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pillars.pillarize import PillarLimits
-from asca_pillars.schema import to_dict
+from asca_pillars.ops.pillar.prepare import PillarLimits
+from asca_pillars.scans.scan_reader import read_scan
+from asca_pillars.scans.stored_scans import stored_points
 from asca_pillars.training.dataset import open_dataset
 from tests.data.inspection.conftest import FRAMES
 from tests.scenes import GRID, SIZES, SPEC, make_scene
@@ -273,7 +273,7 @@ def test_runs_without_torch(clean: Path, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "from pathlib import Path; from asca_pillars.commands.inspect import inspect\n"
+        "from pathlib import Path; from asca_pillars.cli.inspect import inspect\n"
         "inspect(Path(sys.argv[1]), config=Path(sys.argv[2]), frames=2)"
     )
     command = [sys.executable, "-W", "error", "-c", code, str(clean), str(tmp_path / "config.yaml")]

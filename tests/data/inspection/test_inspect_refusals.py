@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from asca_pillars.commands.inspect import inspect
-from asca_pillars.config import Config, pillar_spec
+from asca_pillars.base.errors import DatasetError, OutputError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.cli.inspect import inspect
+from asca_pillars.config.tree import Config, pillar_spec
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.errors import DatasetError, OutputError
-from asca_pillars.schema import to_dict
 from tests.data.inspection.conftest import FRAMES
 from tests.data.inspection.test_inspect_dataset import CONFIG, change_files, inspected, with_data, with_grid
 

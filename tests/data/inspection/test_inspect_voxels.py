@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 import yaml
 
-from asca_pillars.commands.inspect import inspect
-from asca_pillars.config import Config, load_config
+from asca_pillars.base.schema import parse, to_dict
+from asca_pillars.base.settings import shipped_configs
+from asca_pillars.cli.inspect import inspect
+from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.inspection.measurements import measure_scan
 from asca_pillars.data.inspection.proposal import differences, propose
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.schema import parse, to_dict
-from asca_pillars.settings import shipped_configs
-from asca_pillars.tables.cell_map import CellMap
-from asca_pillars.tables.voxels import voxelize
+from asca_pillars.ops.pv_rcnn.voxels import voxelize
+from asca_pillars.ops.sparse.rulebook import CellMap
+from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.training.dataset import open_dataset
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.inspection.conftest import FRAMES

@@ -9,21 +9,21 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from asca_pillars.cli import app
-from asca_pillars.config import Config, DataConfig, load_config, pillar_spec
+from asca_pillars.base.errors import AscaError, DatasetError, OutputError
+from asca_pillars.base.schema import parse
+from asca_pillars.cli.main import app
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config, DataConfig, load_config, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.inspection.proposal import differences, propose
 from asca_pillars.data.kitti import write_image_set
-from asca_pillars.data.scans.scan_reader import write_scan
-from asca_pillars.errors import AscaError, DatasetError, OutputError
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import PillarLimits, pillarize
-from asca_pillars.schema import parse
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.prepare import PillarLimits, pillarize
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.scans.scan_reader import write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import SPEC
 

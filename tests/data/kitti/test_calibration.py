@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import objects_from_boxes
 from asca_pillars.data.kitti.calibration import (
     image_boxes,
@@ -11,7 +12,6 @@ from asca_pillars.data.kitti.calibration import (
     read_calibration,
     write_calibration,
 )
-from asca_pillars.errors import DatasetError
 from asca_pillars.geometry.boxes import corners
 from tests.cameras import assert_one_line, make_calibration
 

@@ -8,6 +8,7 @@ import struct
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import (
     DEFAULT_IMAGE_SIZE_WH,
     KittiSplit,
@@ -18,8 +19,7 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
-from asca_pillars.data.scans.scan_reader import read_scan
-from asca_pillars.errors import DatasetError
+from asca_pillars.scans.scan_reader import read_scan
 from tests.cameras import assert_one_line
 
 BOX_FIELDS = ("height_m", "width_m", "length_m", "x_m", "y_m", "z_m", "rotation_y")

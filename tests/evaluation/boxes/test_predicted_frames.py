@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.errors import DatasetError
 from asca_pillars.evaluation.boxes.box_predictions import read_box_predictions
 from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame
 

@@ -10,10 +10,10 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from asca_pillars.cli import app
-from asca_pillars.commands.eval_tracks import evaluate_tracks
+from asca_pillars.base.errors import ConfigError, DatasetError, OutputError
+from asca_pillars.cli.eval_tracks import evaluate_tracks
+from asca_pillars.cli.main import app
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.evaluation.tracking.tracking_report import (
     TrackingReport,
     tracking_json,

@@ -13,18 +13,18 @@ import torch
 from torch import Tensor
 
 from asca_deploy import Detector
-from asca_export.exporter import export_bundle
-from asca_pillars.config import Config, load_config
-from asca_pillars.errors import ConfigError, TrainingError
-from asca_pillars.geometry.decode import HeadMaps
+from asca_export.pillar.export import export_bundle
+from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import Config, load_config
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
-from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
-from asca_pillars.pillar_config import PillarModel
-from asca_pillars.pillars.pillarize import Pillars
-from asca_pillars.pv_rcnn_config import PvRcnnModel
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.models.pillar.preparation import batch_pillars
+from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from asca_pillars.ops.pillar.prepare import Pillars
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS
 from tests.models.openpcdet import test_import_pointpillars as openpcdet

@@ -9,18 +9,18 @@ import pytest
 import torch
 
 from asca_deploy.browser_page import write_page
-from asca_export.exporter import export_bundle
-from asca_pillars.config import Config, load_config
-from asca_pillars.errors import BundleError, ConfigError, TrainingError
-from asca_pillars.geometry.decode import HeadMaps, PostProcess
+from asca_export.pillar.export import export_bundle
+from asca_pillars.base.errors import BundleError, ConfigError, TrainingError
+from asca_pillars.config.pillar import NetworkConfig, PillarModel
+from asca_pillars.config.tree import Config, load_config
+from asca_pillars.detection.decode import HeadMaps, PostProcess
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
-from asca_pillars.models.pillar.pillar_detector import PillarDetector
-from asca_pillars.models.pillar.pillar_preparation import batch_pillars
-from asca_pillars.pillar_config import NetworkConfig, PillarModel
-from asca_pillars.pillars.grid import PillarGrid
-from asca_pillars.pillars.pillar_spec import PillarSpec
-from asca_pillars.pillars.pillarize import PillarLimits, Pillars
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.models.pillar.preparation import batch_pillars
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.prepare import PillarLimits, Pillars
+from asca_pillars.ops.pillar.spec import PillarSpec
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS
 from tests.models.openpcdet.foreign_networks import PointPillars, random_weights, write_foreign

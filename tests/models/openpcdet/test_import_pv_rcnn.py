@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.config import Config, load_config
-from asca_pillars.errors import ConfigError, TrainingError
+from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import Config, load_config
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
-from asca_pillars.models.pv_rcnn.pv_rcnn import PvRcnn as OurNetwork
-from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector
-from asca_pillars.points.refine_geometry import grid_neighbors
-from asca_pillars.pv_rcnn_config import PvRcnnModel
-from asca_pillars.tables.voxels import VoxelGrid
+from asca_pillars.models.pv_rcnn.layers import PvRcnn as OurNetwork
+from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
+from asca_pillars.ops.two_stage.prepare import grid_neighbors
 from tests.models.openpcdet.foreign_networks import PvRcnn, pooled, random_weights, write_foreign
 from tests.models.pv_rcnn import tiny_pv_rcnn
 from tests.models.pv_rcnn.tiny_pv_rcnn import NETWORK, SETTINGS, batch, frame
-from tests.tables.test_cell_map import at_cells, dense
+from tests.ops.sparse.test_rulebook import at_cells, dense
 
 SPEC = dataclasses.replace(  # with the strides of the published model, which has no other kernels
     tiny_pv_rcnn.SPEC, grid=VoxelGrid((4.8, 24.0), (-6.4, 6.4), (-3.0, 1.0), (0.2, 0.2, 0.1)), last_stride=2

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from asca_pillars.config.pillar import CpaReading
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
-from asca_pillars.pillar_config import CpaReading
-from asca_pillars.pillars.pillarize import PillarLimits
+from asca_pillars.ops.pillar.prepare import PillarLimits
 
 LIMITS = PillarLimits(max_pillars=40, max_points=6)
 READINGS = ("none", "paper", "channel", "point", "linear")

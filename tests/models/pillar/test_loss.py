@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from asca_pillars.config.pillar import LossConfig
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.targets import Targets, assign_targets
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.geometry.decode import HeadMaps
-from asca_pillars.geometry.targets import Targets, assign_targets
 from asca_pillars.models.pillar.loss import LossTerms, TargetBatch, box_loss, detection_loss, focal_loss
-from asca_pillars.pillar_config import LossConfig
 from tests.scenes import SPEC, make_scene
 
 CONFIG = LossConfig()

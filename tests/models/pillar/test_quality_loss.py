@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.geometry.boxes import decode_boxes
-from asca_pillars.geometry.decode import HeadMaps
 from asca_pillars.geometry.overlap import iou_3d
 from asca_pillars.models.pillar.loss import (
     TargetBatch,
@@ -21,9 +22,8 @@ from asca_pillars.models.pillar.loss import (
     quality_focal_loss,
     states_by_class,
 )
-from asca_pillars.models.pillar.pillar_detector import build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import LabeledPillars, batch_pillars, batch_targets
-from asca_pillars.pillar_config import LossConfig, NetworkConfig, PillarModel
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import LabeledPillars, batch_pillars, batch_targets
 from tests.models.pillar.test_loss import COUNT, NO_TARGETS, batched, noisy_maps, perfect_maps, scene_targets
 from tests.scenes import SPEC, make_scene
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.errors import ConfigError
-from asca_pillars.geometry.targets import assign_targets
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
+from asca_pillars.detection.targets import assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch, detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
-from asca_pillars.models.pillar.pillar_detector import PillarDetector, PillarOutputs, build_pillar_detector
-from asca_pillars.models.pillar.pillar_preparation import (
+from asca_pillars.models.pillar.network import PillarDetector, PillarOutputs, build_pillar_detector
+from asca_pillars.models.pillar.preparation import (
     LabeledPillars,
     PillarBatch,
     Placement,
@@ -22,8 +23,7 @@ from asca_pillars.models.pillar.pillar_preparation import (
     batch_targets,
 )
 from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.pillar_config import LossConfig, NetworkConfig, PillarModel
-from asca_pillars.tables.neck_tables import MaskRule, NeckTableBuilder
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder
 from tests.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(2, 1, 1), upsample_channels=8)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.errors import ConfigError
+from asca_pillars.base.errors import ConfigError
 from asca_pillars.models.pv_rcnn.deformation import AuthorsDeformation, PaperDeformation, Surroundings
-from asca_pillars.points.voxel_scan import Deform, SourceBalls, VoxelSetSettings
+from asca_pillars.ops.pv_rcnn.prepare import Deform, SourceBalls, VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import SETTINGS, batch, frame, tiny_detector
 
 

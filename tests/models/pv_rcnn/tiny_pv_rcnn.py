@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from asca_pillars.config import Config, DataConfig, TrainConfig
+from asca_pillars.config.pv_rcnn import PvRcnnModel, PvRcnnNetwork
+from asca_pillars.config.tree import Config, DataConfig, TrainConfig
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.geometry.decode import PostProcess
-from asca_pillars.models.pv_rcnn.pv_rcnn_detector import PvRcnnDetector, build_pv_rcnn_detector
-from asca_pillars.models.pv_rcnn.voxel_batch import LabeledVoxels
-from asca_pillars.points.anchor_proposals import AnchorProposals
-from asca_pillars.points.voxel_scan import SourceBalls, VoxelSetSettings
-from asca_pillars.pv_rcnn_config import PvRcnnModel, PvRcnnNetwork
-from asca_pillars.tables.voxel_spec import VoxelSpec
-from asca_pillars.tables.voxels import VoxelGrid
+from asca_pillars.detection.decode import PostProcess
+from asca_pillars.models.pv_rcnn.batch import LabeledVoxels
+from asca_pillars.models.pv_rcnn.network import PvRcnnDetector, build_pv_rcnn_detector
+from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, VoxelSetSettings
+from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals
+from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
+from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
 from tests.scenes import make_scene
 
 SPEC = VoxelSpec(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_calibration
 from asca_pillars.data.kitti import write_labels as write_label_file
-from asca_pillars.data.scans.scan_reader import write_scan
+from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.report.reference import Sensor
 from tests.scenes import CALIBRATION
 

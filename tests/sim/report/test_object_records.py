@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.kitti import KittiObject, objects_from_boxes
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.detection.detections import Detections
 from asca_pillars.sim.report.object_records import record_objects, seen_objects
 from tests.scenes import CALIBRATION
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from asca_pillars.geometry.detections import Detections
+from asca_pillars.detection.detections import Detections
 from asca_pillars.sim.report.unlabelled_clusters import connected, find_clusters, firing_rows
 
 NAMES = ("Car", "Pedestrian", "Cyclist")

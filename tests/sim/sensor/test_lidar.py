@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
-from asca_pillars.errors import ConfigError
-from asca_pillars.schema import parse
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.schema import parse
 from asca_pillars.sim.bodies.primitives import Surface, quads
 from asca_pillars.sim.casting.raycast import Bodies, cast
 from asca_pillars.sim.sensor.lidar import Lidar, draw_firings

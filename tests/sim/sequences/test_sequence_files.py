@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.errors import ConfigError, DatasetError
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.sim.sequences.sequence_files import SequencePlan, simulate_sequence_frame, simulate_sequences
 from asca_pillars.sim.simulation import SimulationConfig

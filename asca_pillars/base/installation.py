@@ -1,0 +1,34 @@
+"""How this package was installed, and the commands that add to it or replace it."""
+
+import shlex
+from pathlib import Path
+
+_PROJECT = 'name = "asca-pillars"'
+
+
+def source_tree() -> Path | None:
+    """The source tree that this code runs from; None where a wheel was installed."""
+    root = Path(__file__).parents[2]
+    try:
+        text = (root / "pyproject.toml").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return None
+    return root if _PROJECT in text.splitlines() else None
+
+
+def install_command(extra: str) -> str:
+    """The command that adds what an extra needs, such as `pip install 'asca-pillars[train]'`.
+
+    Neither form needs the package to be on an index: of a wheel that is installed pip reads the requirements where it
+    lies.
+    """
+    root = source_tree()
+    if root is None:
+        return f"pip install 'asca-pillars[{extra}]'"
+    return f"pip install -e {shlex.quote(f'{root}[{extra}]')}"
+
+
+def upgrade_advice() -> str:
+    """How to get a newer version."""
+    root = source_tree()
+    return "install a newer asca-pillars" if root is None else f"upgrade with `git -C {shlex.quote(str(root))} pull`"

@@ -1,0 +1,74 @@
+"""Settings from YAML files: those that ship by name, and `key.subkey=value` overrides."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.input_files import read_text
+from asca_pillars.base.schema import parse
+from asca_pillars.base.yaml_text import MAX_CHARACTERS, parse_yaml
+
+T = TypeVar("T")
+
+
+def shipped_configs(kind: str = "") -> dict[str, Path]:
+    """The configurations that come along, by name: those of the installed package, or of the checkout.
+
+    Args:
+        kind: folder below configs/ for those of something else than a model.
+    """
+    package = Path(__file__).parents[1]
+    folders = (package / "configs" / kind, package.parent / "configs" / kind)
+    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+
+
+def read_settings(type_: type[T], path: str | Path, overrides: Sequence[str], shipped: Mapping[str, Path]) -> T:
+    """Settings of a dataclass from a YAML file that holds what differs from its defaults.
+
+    Args:
+        type_: the dataclass.
+        path: the YAML file, or one of the names in `shipped`.
+        overrides: `key.subkey=value` texts, value in YAML notation; they win over the file.
+        shipped: names that stand for files.
+
+    Raises:
+        ConfigError: unreadable YAML, an unknown key anywhere (the nearest is named), an impossible value.
+    """
+    path = shipped.get(str(path), Path(path))
+    try:
+        if path.stat().st_size > 4 * MAX_CHARACTERS:  # a character has up to four bytes
+            raise ConfigError(f"{path}: {path.stat().st_size} bytes are too many for settings; give another file")
+        data = parse_yaml(read_text(path, ConfigError))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); these ship: {', '.join(shipped)}") from None
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date like 2026-99-99
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: expected `key: value` lines, found a {type(data).__name__}")
+    settings = parse(type_, data, str(path))
+    if not overrides:
+        return settings
+    for override in overrides:
+        _apply(data, override)
+    return parse(type_, data, f"{path} with {' '.join(overrides)}")
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    """Set `key.subkey=value` in the nested dictionary `data`."""
+    key, separator, text = override.partition("=")
+    if not separator or not key:
+        raise ConfigError(f"`{override}`: an override is written key.subkey=value, such as train.epochs=20")
+    *parents, leaf = key.strip().split(".")
+    for parent in parents:
+        data = data.setdefault(parent, {})
+        if not isinstance(data, dict):
+            raise ConfigError(f"`{override}`: `{parent}` is a value, it has no keys")
+    try:
+        data[leaf] = parse_yaml(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"`{override}`: the value is not valid YAML: {' '.join(str(error).split())}") from None

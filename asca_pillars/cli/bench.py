@@ -1,0 +1,125 @@
+"""`asca bench`: where the milliseconds go, and on what machine."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from asca_pillars.cli.options import (
+    AroundOption,
+    AxesOption,
+    BundleOption,
+    ColumnsOption,
+    JsonOption,
+    PoseOption,
+    PrecisionOption,
+    ProviderOption,
+    ReflectanceScaleOption,
+    RuntimeOptions,
+    ScansArgument,
+    SensorHeightOption,
+    ThreadsOption,
+)
+
+MOST_SCANS = 100  # they are held in memory, and every round goes over all of them
+
+
+def bench(
+    scans: ScansArgument = None,
+    *,
+    bundle: BundleOption = None,
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
+    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Timed passes over the scans, for each table.")] = 30,
+    compare: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--compare",
+            help="Another bundle, run in turn with the first on the same scans: how many times as fast it is, with "
+            "quartiles over the rounds. Such ratios hold on a busy machine, times do not. Repeatable.",
+        ),
+    ] = None,
+    matrix: Annotated[
+        bool,
+        typer.Option(
+            "--matrix",
+            help="Every provider, precision and number of threads in turn (of the --compare bundles too): speed, and "
+            "how far the boxes are from float32 on the stock CPU provider. What cannot run says why.",
+        ),
+    ] = False,
+    scaling: Annotated[
+        bool, typer.Option("--scaling", help="Each stage at 1,000 to 1,000,000 points, made from the first scan.")
+    ] = False,
+    stream: Annotated[
+        bool,
+        typer.Option("--stream", help="Scans per second and latency of detector.stream(scans) beside single calls."),
+    ] = False,
+    cold: Annotated[
+        bool,
+        typer.Option("--cold", help="New processes: seconds to the first boxes, and the peak memory of asca detect."),
+    ] = False,
+    around: AroundOption = False,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Time every stage from points to boxes: p50, p95, FPS, cold start, memory, and the machine it ran on.
+
+    Two lines say where to look for more speed: what is spent outside the graphs, and the roofline, the share of the
+    machine's measured matrix multiplications per second that the backbone reaches. Of more than 100 scans some are
+    timed, evenly spaced.
+
+    Example: asca bench my_scans/ --matrix --compare asca_small_sim
+    """
+    import logging
+    import os
+    import sys
+
+    from rich.console import Console
+
+    from asca_deploy import sample_scan_path
+    from asca_deploy.manifest import load_bundle
+    from asca_pillars.base.errors import ConfigError, ScanError
+    from asca_pillars.base.files import write_json
+    from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.cli.bench_parts import Parts, measure_parts, named_bundles
+    from asca_pillars.cli.models import open_detector
+    from asca_pillars.cli.scan_input import ScanInput, scan_settings
+    from asca_pillars.cli.writable_file import require_writable
+    from asca_pillars.scans.find_scans import name_scans
+
+    # A pipe has no width, and the tables are wider than the 80 columns that rich takes then.
+    piped = not sys.stdout.isatty() and "COLUMNS" not in os.environ
+    console = Console(markup=False, highlight=False, width=120 if piped else None)
+    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # `asca detect` warns of odd scans; here they are timed
+    if around and (matrix or cold):
+        raise ConfigError("--matrix and --cold time single passes: leave --around out, or them")
+    settings = scan_settings(
+        sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
+    )
+    paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
+    scan_input = ScanInput(settings, paths)
+    for line in scan_input.said:
+        console.print(line, style="yellow", soft_wrap=True)
+    timed = paths[:: -(-len(paths) // MOST_SCANS)]
+    if len(timed) < len(paths):
+        console.print(f"timing {len(timed)} of the {len(paths)} scans, evenly spaced", style="yellow")
+    points = [scan_input.read(path).points for path in timed]
+    if scaling and not len(points[0]):
+        raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
+    bundles = named_bundles([bundle, *(compare or ())])
+    for folder in bundles.values():
+        load_bundle(folder)  # a damaged one is named now and not after minutes
+    report_json = "asca bench", json_object("fps", "stages_ms", "runs_on", "graphs_sha256")
+    require_writable(json, *report_json)
+    options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    detector = open_detector(options, mounting=scan_input.mounting, around=around)
+    parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold)
+    result = measure_parts(detector, points, rounds, parts, bundles, console)
+    if json is not None:
+        require_own_file(json, *report_json)
+        write_json(json, result)

@@ -1,0 +1,57 @@
+"""The command `asca`: registers what `commands` holds. Each command imports what it needs when it runs."""
+
+from typing import Annotated
+
+import typer
+
+from asca_pillars import __version__
+from asca_pillars.cli.ablate import ablate
+from asca_pillars.cli.bench import bench
+from asca_pillars.cli.detect import detect
+from asca_pillars.cli.doctor import doctor
+from asca_pillars.cli.eval import evaluate
+from asca_pillars.cli.export import export
+from asca_pillars.cli.import_dataset import import_dataset
+from asca_pillars.cli.import_weights import import_weights
+from asca_pillars.cli.inspect import inspect
+from asca_pillars.cli.prepare import prepare
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.cli.simulate import simulate
+from asca_pillars.cli.train import train
+
+app = typer.Typer(
+    help="LiDAR 3D detection: boxes from a point cloud on an ordinary CPU, and the pipeline that trains the model.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command()(detect)
+app.command()(bench)
+app.command()(simulate)
+app.command("import")(import_dataset)
+app.command()(inspect)
+app.command()(prepare)
+app.command()(train)
+app.command("eval")(evaluate)
+app.command()(export)
+app.command("import-weights")(import_weights)
+app.command()(ablate)
+app.command()(doctor)
+
+
+def main() -> None:
+    """Run the command; what the user can mend is one line on stderr and exit code 2."""
+    run_command(app, "asca")
+
+
+@app.callback(invoke_without_command=True)
+def _version(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+) -> None:
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+if __name__ == "__main__":
+    main()

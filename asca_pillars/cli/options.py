@@ -1,0 +1,168 @@
+"""Options that several commands share, declared once. Nothing heavy is imported here: `asca --help` is instant."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+
+from asca_pillars.base.errors import ConfigError
+
+ScansArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Scans (.bin .npy .pcd .ply .feather) and folders of them, searched to any depth. Default: the sample "
+        "that comes with asca."
+    ),
+]
+BundleOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--bundle",
+        "-b",
+        help="Model bundle: a folder, or the name of one that comes with asca: asca_sim, asca_small_sparse_sim (half "
+        "as wide: faster), asca_refine_sim (asca_sim and a second stage) or asca_small_sim (a dense neck, for "
+        "providers that need one), each also with _int8, and pvrcnn_small_sim (PV-RCNN). Default: asca_sim_int8.",
+    ),
+]
+ScoreOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--score",
+        help="VALUE or CLASS=VALUE: report detections, or those of a class, from this score on. Repeatable for "
+        "classes. Default: the model's, per class.",
+    ),
+]
+Scores: TypeAlias = float | Mapping[str, float]
+"""What `--score` says: one score for every class, or scores of some classes by name."""
+MIN_SCORE = 0.05  # of `asca eval --min-score`
+
+ProviderOption = Annotated[
+    str, typer.Option("--provider", help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")
+]
+PrecisionOption = Annotated[
+    str | None,
+    typer.Option(
+        "--precision",
+        help="float32, or reduced: bfloat16, TF32 or float16 where the provider has it. "
+        "Default: float32; with --provider auto either.",
+    ),
+]
+ThreadsOption = Annotated[
+    int | None, typer.Option("--threads", help="CPU threads. Default: the physical cores granted to the process.")
+]
+DataOption = Annotated[
+    Path,
+    typer.Option("--data", "-d", help="Folder of a dataset: KITTI's layout, or with a dataset.yaml (docs/DATA.md)."),
+]
+ConfigArgument = Annotated[
+    Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")
+]
+OverridesOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20"),
+]
+InitOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--init",
+        help="Weights that a new run starts from: a checkpoint, or a bundle that holds its own (folder, or name of one "
+        "that ships). Where model.train_first_stage is false, its first stage alone is taken.",
+    ),
+]
+JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write everything measured to this file.")]
+
+
+SensorHeightOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensor-height",
+        help="Metres of the scans' origin above the ground (0 where z = 0 is the ground), or auto: estimated from the "
+        "scans. Default: as in training.",
+    ),
+]
+AxesOption = Annotated[
+    str,
+    typer.Option(
+        "--axes",
+        help="x-forward, y-forward (x to the right), or where forward, left and up are found in the scan, such as "
+        "-y,x,z or, with z down, x,-y,-z.",
+    ),
+]
+PoseOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--pose",
+        help="Text file with a 4x4 matrix, 16 numbers row by row, from the scan to a level frame, x forward, y left, "
+        "z up, in metres; instead of --axes.",
+    ),
+]
+ReflectanceScaleOption = Annotated[
+    str,
+    typer.Option(
+        "--reflectance-scale",
+        help="Stored value that is a reflectance of 1: 1, 100, 255, 65535. Default: by the files, once for a folder.",
+    ),
+]
+ColumnsOption = Annotated[
+    int | None,
+    typer.Option("--columns", help="Values of a point in a .bin file. Default: 4, or 5 where the fifth counts rings."),
+]
+AroundOption = Annotated[
+    bool,
+    typer.Option("--around", help="Look in every direction: turned passes, merged. Costs a pass for each of them."),
+]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        help="Work on a Ray cluster: its address (HOST:PORT), auto, or local for all cores of this machine. "
+        "Needs the extra cluster, which `asca doctor` says how to install; docs/CLUSTER.md.",
+    ),
+]
+
+
+def read_scores(texts: Sequence[str] | None) -> Scores | None:
+    """`--score` as typed; None if it was not given.
+
+    Raises:
+        ConfigError: one is no score, or a score for every class stands beside others.
+    """
+    scores: dict[str, float] = {}
+    for text in texts or ():
+        name, equals, value = text.rpartition("=")
+        try:
+            scores[name] = float(value)
+        except ValueError:
+            name, equals = "", "="
+        if equals and not name:
+            raise ConfigError(f"--score {text}: give a score, or a class and its score, such as Car=0.35")
+    if "" not in scores:
+        return scores or None
+    if len(texts or ()) > 1:
+        raise ConfigError(f"--score {scores['']:g} is for every class; give it alone, or CLASS=VALUE for each")
+    return scores[""]
+
+
+def scores_by_class(stated: Scores | None, defaults: Mapping[str, float]) -> dict[str, float]:
+    """The score of each class of `defaults`: as stated, else that one.
+
+    Raises:
+        ConfigError: a stated class is none of them.
+    """
+    if not isinstance(stated, Mapping):
+        return dict(defaults) if stated is None else dict.fromkeys(defaults, stated)
+    if unknown := [name for name in stated if name not in defaults]:
+        raise ConfigError(f"--score {unknown[0]}: no such class; there are {', '.join(defaults)}")
+    return dict(defaults) | dict(stated)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuntimeOptions:
+    """Which model runs, and how. The arguments of `asca_deploy.Detector` by the same names."""
+
+    bundle: Path | None = None
+    provider: str = "cpu"
+    precision: str | None = None
+    threads: int | None = None

@@ -1,0 +1,67 @@
+"""`asca prepare`: what insertion needs of a dataset, computed before training instead of during its first epoch."""
+
+from typing import Annotated
+
+import typer
+
+from asca_pillars.cli.extras import require
+from asca_pillars.cli.options import ConfigArgument, DataOption, OverridesOption
+
+
+def prepare(
+    config: ConfigArgument,
+    *,
+    data: DataOption,
+    override: OverridesOption = None,
+    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
+    kitti_split: Annotated[
+        bool,
+        typer.Option(
+            "--kitti-split",
+            help="Before that, write ImageSets/train.txt and val.txt with the 3,712 and 3,769 frames that papers train "
+            "and validate on (Chen et al., 2015), for KITTI's 7,481 scans.",
+        ),
+    ] = False,
+) -> None:
+    """Compute once what training needs of a dataset.
+
+    For GT-Aug and RS-Aug the object database and the maps of free ground, for a second stage the proposals of its
+    first. Training does the same on first use; what is there and unchanged is used again. Without an insertion method
+    in the config, what RS-Aug needs is prepared.
+    """
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from asca_pillars.config.tree import load_config
+
+    settings = load_config(config, override or ())
+    console = Console(markup=False)
+    if kitti_split:
+        from asca_pillars.data.kitti.train_val_split import write_train_val_lists
+
+        for path in write_train_val_lists(data):
+            console.print(f"written: {path}", soft_wrap=True, highlight=False)
+    require("train")
+    from asca_pillars.data.insertion.free_maps import prepare_free_spaces
+    from asca_pillars.data.insertion.insert_objects import prepare_inserter
+    from asca_pillars.data.open_split import open_split
+
+    if settings.model.kind == "pillar_refine":
+        from asca_pillars.models.build import build_preparation
+
+        for name in (settings.data.train_set, settings.data.val_set):
+            build_preparation(settings.model, open_split(data, name), replace(settings.data, workers=workers))
+        return
+    # A config that is not decided yet gets what either method needs.
+    insert = settings.augment.insert
+    insert = insert if insert.method != "none" else replace(insert, method="rs_aug")
+    spec = settings.model.spec
+    split = open_split(data, settings.data.train_set)
+    inserter = prepare_inserter(split, spec, replace(settings.data, workers=workers), insert)
+    if insert.method == "rs_aug":
+        prepare_free_spaces(split, inserter.prepared, camera_view=inserter.camera_view, workers=workers)
+    lines = [f"{inserter.database.path}: {len(inserter.database)} objects of {len(split.frame_ids)} frames"]
+    for name, objects, share in zip(spec.class_names, inserter.candidates, inserter.shares, strict=True):
+        lines.append(f"  {name}: {len(objects)} with {insert.min_points} or more points, drawn {share:.0%} of the time")
+    console.print("\n".join(lines), soft_wrap=True, highlight=False)

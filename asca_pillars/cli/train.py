@@ -1,0 +1,49 @@
+"""`asca train`: a YAML and a dataset in, a run's folder out."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from asca_pillars.cli.extras import require
+from asca_pillars.cli.options import ConfigArgument, DataOption, InitOption, OverridesOption
+
+INTERRUPTED = 130  # what a shell says of a command that Ctrl-C ended
+
+
+def train(
+    config: ConfigArgument,
+    *,
+    data: DataOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an interrupted run there is resumed.")],
+    override: OverridesOption = None,
+    devices: Annotated[str, typer.Option("--devices", help="Devices on this machine: a number or auto.")] = "auto",
+    num_nodes: Annotated[
+        int, typer.Option("--num-nodes", min=1, help="Machines that train together (torchrun or SLURM starts each).")
+    ] = 1,
+    init: InitOption = None,
+) -> None:
+    """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder.
+
+    After Ctrl-C or a kill the same command goes on exactly where the last checkpoint was written.
+
+    Example: asca train asca_small_sim --data data/sim --out runs/small -s train.batch_size=4
+    """
+    from rich.console import Console
+
+    from asca_pillars.config.tree import load_config
+    from asca_pillars.training.run_files import require_own_run
+
+    settings = load_config(config, override or ())
+    require("train")
+    require_own_run(out, init)
+    console = Console(markup=False)
+    with console.status("Loading PyTorch"):
+        from asca_pillars.training.callbacks import TrainingInterruptedError
+        from asca_pillars.training.loop import train as run_training
+    try:
+        last = run_training(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)
+    except TrainingInterruptedError as stop:
+        console.print(str(stop))
+        raise typer.Exit(INTERRUPTED) from None
+    console.print(f"Trained: {last}\nNext: asca export {last} -o {out / 'bundle'}")

@@ -1,0 +1,1 @@
+"""The configuration: one typed tree, one section for each family of detectors."""

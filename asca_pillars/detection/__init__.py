@@ -1,0 +1,1 @@
+"""Anchors, target assignment, decoding with NMS, and the detections of a scan, in NumPy."""

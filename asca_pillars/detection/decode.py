@@ -1,0 +1,267 @@
+"""Head maps -> Detections: threshold, decode, non-maximum suppression. The last stop of every runtime."""
+
+import math
+import reprlib
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.kernels import load_kernels
+from asca_pillars.base.strict import Strict
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
+from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes
+from asca_pillars.geometry.overlap import bev_iou
+
+KERNELS = "asca_pillars.geometry.nms_kernels"
+
+# Candidates that suppression looks at together: enough to keep NumPy busy, few enough that the pairs inside a
+# block, some of them needless, stay cheap.
+_NMS_BLOCK = 64
+
+
+LEAST_LOGIT = -1e3
+"""Of anything that can be reported: a score of 0 in every type. Cells that a masked neck never looks at lie below."""
+
+MOST = 2**31 - 1
+"""Of anything that is counted in settings: what an index of 32 bits can name."""
+
+
+@dataclass(frozen=True)
+class PostProcess(Strict):
+    """How head maps become detections."""
+
+    nms_iou: float = 0.01
+    """Of two boxes of a class whose footprints overlap more than this, the better one stays."""
+    candidates: int = 1000
+    """Best boxes of each class that enter the suppression."""
+    max_detections: int = 100
+    """Best boxes of a scan that are reported."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.nms_iou <= 1:
+            raise ConfigError(f"nms_iou {self.nms_iou:g} must lie between 0 and 1")
+        for name in ("candidates", "max_detections"):
+            if not 1 <= getattr(self, name) <= MOST:
+                raise ConfigError(f"{name} {reprlib.repr(getattr(self, name))} must lie between 1 and {MOST}")
+
+
+Map = TypeVar("Map")
+
+
+class HeadMaps(NamedTuple, Generic[Map]):
+    """What the head says of one scan (NumPy arrays) or of a batch of them (tensors, with a leading axis B).
+
+    Channels are anchor-major, A anchors as in `make_anchors`. Where the head computes at active cells alone, there
+    are rows (M, channels) instead of maps (channels, H, W), one for each of these cells.
+    """
+
+    scores: Map
+    """(A, H, W) logits: an anchor belongs to one class, so it has one. Where it has one for each of C classes,
+    (A * C, H, W), those of an anchor side by side."""
+    boxes: Map
+    """(7A, H, W) residuals; those of anchor a are channels 7a..7a+6."""
+    directions: Map
+    """(2A, H, W) logits of the direction bins; those of anchor a are channels 2a and 2a+1."""
+
+
+class Candidates(NamedTuple):
+    """Decoded boxes that enter suppression, class by class, the best of each class first."""
+
+    boxes: NDArray[np.float32]
+    """(n, 7), LiDAR frame."""
+    logits: NDArray[np.float32]
+    """(n,)"""
+    labels: NDArray[np.int64]
+    """(n,) indices into the classes."""
+    non_finite: int
+    """Anchors that were left out because their numbers are not finite."""
+
+
+def decode(
+    maps: HeadMaps[NDArray[np.float32]],
+    anchors: NDArray[np.float32],
+    classes: tuple[ClassSpec, ...],
+    post: PostProcess,
+    cells: NDArray[np.integer[Any]] | None = None,
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
+) -> Detections:
+    """Detections of one scan, best first.
+
+    Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
+    rotated NMS seen from above. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
+    from a network that overflowed, are left out and counted (`Detections.non_finite`).
+
+    Args:
+        maps: logits and residuals on the head's map.
+        anchors: (H, W, A, 7) from `make_anchors` for the same grid and classes.
+        cells: (M,) flat index of the head cell of each of the maps' rows, ascending; None if they are maps.
+        direction_offset_rad: where direction bin 0 begins, see `DetectorSpec`.
+
+    Raises:
+        ValueError: if maps, anchors and classes do not belong together.
+    """
+    return suppress(decode_candidates(maps, anchors, classes, post, cells, direction_offset_rad), classes, post)
+
+
+def decode_candidates(
+    maps: HeadMaps[NDArray[np.float32]],
+    anchors: NDArray[np.float32],
+    classes: tuple[ClassSpec, ...],
+    post: PostProcess,
+    cells: NDArray[np.integer[Any]] | None = None,
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
+) -> Candidates:
+    """The first half of `decode`: what reaches its class's threshold, (n, 7) boxes in the LiDAR frame.
+
+    Raises:
+        ValueError: if maps, anchors and classes do not belong together.
+    """
+    height, width, count, _ = anchors.shape
+    per_anchor = len(classes) if maps.scores.shape[0 if cells is None else 1] > count else 1
+    expected = tuple(
+        (channels * count, height, width) if cells is None else (len(cells), channels * count)
+        for channels in (per_anchor, 7, 2)
+    )
+    if tuple(m.shape for m in maps) != expected or count != len(classes) * len(ANCHOR_YAWS_RAD):
+        raise ValueError(
+            f"head maps of {len(classes)} classes on anchors {anchors.shape} must have shapes {expected}, "
+            f"not {tuple(m.shape for m in maps)}"
+        )
+    rows = maps if cells is not None else HeadMaps(*(part.reshape(len(part), -1).T for part in maps))
+    scores, labels = rows.scores, None
+    if per_anchor > 1:
+        every = scores.reshape(-1, count, per_anchor)
+        scores, labels = every.max(axis=2), every.argmax(axis=2)  # one that is not a number stays so
+    anchor, row = _candidates(scores, labels, classes, post.candidates)
+    cell = row if cells is None else cells[row]
+    logits = scores[row, anchor]
+    residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
+    directions = rows.directions.reshape(-1, count, 2)[row, anchor]
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
+        own = anchors.reshape(-1, count, 7)[cell, anchor]
+        boxes = decode_boxes(residuals, directions.argmax(axis=-1), own, direction_offset_rad)
+    usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)
+    dropped = np.count_nonzero(~usable & np.isfinite(logits))
+    return Candidates(
+        boxes[usable],
+        logits[usable],
+        _labels(anchor, row, labels)[usable],
+        int(maps.scores.size - np.count_nonzero(np.isfinite(maps.scores)) + dropped),
+    )
+
+
+def suppress(
+    candidates: Candidates, classes: tuple[ClassSpec, ...], post: PostProcess, most: int | None = None
+) -> Detections:
+    """The second half of `decode`: (n, 7) candidates -> those that the rotated NMS of their class keeps, best first.
+
+    Of each class no more than `most`.
+    """
+    boxes, logits, labels, non_finite = candidates
+    limit = post.max_detections if most is None else min(most, post.max_detections)
+    survivors = nms_by_class(boxes, logits, labels, post.nms_iou, limit)
+    best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
+    return Detections(
+        boxes[best],
+        sigmoid(logits[best]),
+        labels[best],
+        tuple(spec.name for spec in classes),
+        non_finite=non_finite,
+    )
+
+
+def nms_by_class(
+    boxes: NDArray[np.floating[Any]],
+    scores: NDArray[np.floating[Any]],
+    labels: NDArray[np.int64],
+    iou_threshold: float,
+    limit: int | None = None,
+) -> NDArray[np.int64]:
+    """`rotated_nms` within each class: (N, 7), (N,), (N,) -> indices of the kept boxes, class after class."""
+    kept = [np.empty(0, np.int64)]
+    for label in np.unique(labels):
+        own = np.flatnonzero(labels == label)
+        kept.append(own[rotated_nms(boxes[own], scores[own], iou_threshold, limit)])
+    return np.concatenate(kept)
+
+
+def rotated_nms(
+    boxes: NDArray[np.floating[Any]], scores: NDArray[np.floating[Any]], iou_threshold: float, limit: int | None = None
+) -> NDArray[np.int64]:
+    """Greedy suppression by `bev_iou`: indices of the kept boxes, by descending score; of the first `limit` of them.
+
+    A box is dropped if a kept, better one overlaps it by more than `iou_threshold`. Of equal scores the
+    earlier goes first.
+
+    Args:
+        boxes: (N, 7), LiDAR frame; N may be 0.
+        scores: (N,), any monotonic measure.
+    """
+    order = np.argsort(-scores, kind="stable")
+    kernels = load_kernels(KERNELS)
+    nms = _nms if kernels is None else kernels.nms
+    return order[nms(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)]
+
+
+def _nms(boxes: NDArray[np.float64], iou_threshold: float, limit: int) -> NDArray[np.int64]:
+    """`rotated_nms` of boxes that come best first."""
+    waiting = np.arange(len(boxes))
+    kept = [waiting[:0]]
+    while len(waiting) and sum(map(len, kept)) < limit:
+        block, waiting = waiting[:_NMS_BLOCK], waiting[_NMS_BLOCK:]
+        clashes = bev_iou(boxes[block], boxes[block]) > iou_threshold
+        alive = np.ones(len(block), bool)
+        for index, row in enumerate(clashes):
+            if alive[index]:
+                alive[index + 1 :] &= ~row[index + 1 :]
+        kept.append(block[alive])
+        clashes = bev_iou(boxes[block[alive]], boxes[waiting]) > iou_threshold
+        waiting = waiting[~clashes.any(axis=0)]
+    return np.concatenate(kept)[:limit]
+
+
+def _candidates(
+    scores: NDArray[np.float32], labels: NDArray[np.int64] | None, classes: tuple[ClassSpec, ...], limit: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
+
+    `labels` (M, A) are the classes that the scores are for; None: each anchor's own.
+
+    Of equal scores that of the earlier anchor goes first, and among those that of the earlier row.
+    """
+    count = scores.shape[1]
+    # The backbone's maps lie in memory with the channels last: no copy, and one look at every logit. Logits are
+    # compared rather than scores: the sigmoid is monotonic, and few anchors ever need it.
+    logits = scores.reshape(-1)
+    floors = [_logit(spec.score_threshold) for spec in classes]
+    above = np.flatnonzero(logits >= min(floors))
+    logits = logits[above]
+    row, anchor = np.divmod(above, count)
+    own_class, chosen = _labels(anchor, row, labels), []
+    for label, floor in enumerate(floors):
+        own = np.flatnonzero((own_class == label) & (logits >= floor))
+        if len(own) > limit:
+            own = own[logits[own] >= np.partition(logits[own], -limit)[-limit]]
+        chosen.append(own[np.lexsort((row[own], anchor[own], -logits[own]))[:limit]])
+    best = np.concatenate(chosen)
+    return anchor[best], row[best]
+
+
+def _labels(anchor: NDArray[np.int64], row: NDArray[np.int64], labels: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    """Classes (n,) of what anchors (n,) in rows (n,) of `labels` (M, A) say, see `_candidates`."""
+    return anchor // len(ANCHOR_YAWS_RAD) if labels is None else labels[row, anchor]
+
+
+def _logit(probability: float) -> float:
+    if probability <= 0:
+        return LEAST_LOGIT
+    return math.inf if probability >= 1 else math.log(probability / (1 - probability))
+
+
+def sigmoid(logits: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Scores in [0, 1], any shape."""
+    return np.exp(-np.logaddexp(0.0, -logits.astype(np.float64))).astype(np.float32)

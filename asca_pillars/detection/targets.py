@@ -1,0 +1,212 @@
+"""Target assignment: which anchors should find which labelled box (PointPillars, arXiv 1812.05784, section 4.2).
+
+NumPy, because it runs in the loader's processes beside pillarize and shares the geometry with it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, IGNORED, ClassSpec
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, encode_boxes, points_in_boxes
+from asca_pillars.geometry.overlap import aligned_bev_iou
+
+Assigner = Literal["overlap", "atss"]
+"""What makes an anchor positive, see `assign_targets`."""
+
+_NEAREST = 9  # k of ATSS, which its authors found to matter little
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What the head should say of one frame's anchors.
+
+    Attributes:
+        state: (H, W, A) int8: 1 positive, 0 negative, -1 takes no part in the loss.
+        positives: (n,) flat indices into (H, W, A) of the positive anchors, ascending.
+        anchors: (n, 7) float32 the positive anchors themselves, LiDAR frame.
+        residuals: (n, 7) float32 box residuals of the positive anchors.
+        directions: (n,) int64 direction bin of the positive anchors.
+        matched: (n,) int64 the box, by its row, that each positive anchor is to find.
+    """
+
+    state: NDArray[np.int8]
+    positives: NDArray[np.int64]
+    anchors: NDArray[np.float32]
+    residuals: NDArray[np.float32]
+    directions: NDArray[np.int64]
+    matched: NDArray[np.int64]
+
+
+def assign_targets(
+    anchors: NDArray[np.float32],
+    classes: Sequence[ClassSpec],
+    boxes: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    assigner: Assigner = "overlap",
+    direction_offset_rad: float = DIRECTION_OFFSET_RAD,
+) -> Targets:
+    """Match anchors with boxes by the overlap of their axis-aligned bird's-eye footprints.
+
+    `overlap`: an anchor is positive when it overlaps a box of its own class by at least `positive_iou`, or when no
+    anchor overlaps that box more, so that a small one is not missed (of two boxes with the same best anchor the later
+    has it); negative below `negative_iou` with all of them; ignored in between.
+
+    `atss` (arXiv 1912.02424, algorithm 1): of each yaw the 9 anchors of the box's class whose centers are nearest are
+    its candidates. Those are positive whose center lies inside the box and whose overlap with it is at least mean plus
+    standard deviation of all its candidates' overlaps. The best candidate is positive wherever its center lies: a
+    pedestrian may stand between the centers. An anchor that two boxes claim goes to the one whose best it is, otherwise
+    to the one that it overlaps more. All others are negative.
+
+    Either way an anchor that overlaps an IGNORED box by `negative_iou` without being positive is ignored.
+
+    Args:
+        anchors: (H, W, A, 7), class-major along A, see `detection.anchors.make_anchors`.
+        classes: what anchor 2c and 2c + 1 look for.
+        boxes: (N, 7) labelled boxes.
+        labels: (N,) index into `classes`, or IGNORED.
+        assigner: which of both.
+        direction_offset_rad: where direction bin 0 begins, see `DetectorSpec`.
+    """
+    wanted = np.flatnonzero(labels != IGNORED)
+    if assigner == "overlap":
+        state, positives, matched = _match_by_overlap(anchors, classes, boxes, labels, wanted)
+    else:
+        state, positives, matched = _match_nearest(anchors, boxes, labels, wanted)
+    state[_ignored(anchors, classes, boxes[labels == IGNORED]) & (state == 0)] = -1
+    found = anchors.reshape(-1, 7)[positives]
+    residuals, directions = encode_boxes(boxes[matched], found, direction_offset_rad)
+    return Targets(state, positives, found, residuals, directions, matched)
+
+
+class _Matches(NamedTuple):
+    """`state` without regard to IGNORED boxes, `positives` and `matched` of `Targets`."""
+
+    state: NDArray[np.int8]
+    positives: NDArray[np.int64]
+    matched: NDArray[np.int64]
+
+
+def _match_by_overlap(
+    anchors: NDArray[np.float32],
+    classes: Sequence[ClassSpec],
+    boxes: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    wanted: NDArray[np.int64],
+) -> _Matches:
+    shape = anchors.shape[:3]
+    best_iou, best_box = np.zeros(shape), np.full(shape, -1)
+    forced: list[tuple[NDArray[np.int64], int]] = []
+    for box_index in wanted:
+        label = labels[box_index]
+        window, iou = _overlaps_nearby(anchors, boxes[box_index], classes[label], label)
+        closer = iou > best_iou[window]
+        best_iou[window] = np.where(closer, iou, best_iou[window])
+        best_box[window] = np.where(closer, box_index, best_box[window])
+        if iou.size and iou.max() > 0:
+            offset = [part.start for part in window]
+            forced.append((np.argwhere(iou == iou.max()) + offset, box_index))
+    positive_iou, negative_iou = (
+        np.repeat([getattr(spec, name) for spec in classes], len(ANCHOR_YAWS_RAD))
+        for name in ("positive_iou", "negative_iou")
+    )
+    state = -(best_iou >= negative_iou).astype(np.int8)
+    state[best_iou >= positive_iou] = 1
+    for places, box_index in forced:
+        state[tuple(places.T)] = 1
+        best_box[tuple(places.T)] = box_index
+    positives = np.flatnonzero(state == 1)
+    return _Matches(state, positives, best_box.reshape(-1)[positives])
+
+
+def _match_nearest(
+    anchors: NDArray[np.float32], boxes: NDArray[np.float32], labels: NDArray[np.int64], wanted: NDArray[np.int64]
+) -> _Matches:
+    claims = [_Claims(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
+    claims += [_claims(anchors, boxes[row], labels[row], row) for row in wanted]
+    places, claimants, weights = (np.concatenate(parts) for parts in zip(*claims, strict=True))
+    order = np.lexsort((weights, places))
+    places, claimants = places[order], claimants[order]
+    strongest = np.diff(places, append=-1) != 0  # the last one at each place
+    positives, matched = places[strongest], claimants[strongest]
+    state = np.zeros(anchors.shape[:3], np.int8)
+    state.reshape(-1)[positives] = 1
+    return _Matches(state, positives, matched)
+
+
+class _Claims(NamedTuple):
+    """Anchors that are to find a box, by ATSS."""
+
+    places: NDArray[np.int64]
+    """(n,) flat indices into (H, W, A)."""
+    claimants: NDArray[np.int64]
+    """(n,) row of the box."""
+    weights: NDArray[np.float64]
+    """(n,) of several boxes that claim an anchor the one with the greatest weight has it."""
+
+
+def _claims(anchors: NDArray[np.float32], box: NDArray[np.float32], label: int, box_index: int) -> _Claims:
+    row, column = _nearest_cells(anchors, box)
+    near = anchors[row, column, _anchors_of(label)]  # (9, 2, 7)
+    iou = aligned_bev_iou(near.reshape(-1, 7), box[None]).reshape(near.shape[:2]).astype(np.float64)
+    centers = np.column_stack([near[:, 0, :2], np.full(len(near), box[2])])
+    inside = points_in_boxes(centers, box[None])
+    best = iou == iou.max()
+    cell, yaw = np.nonzero((iou > 0) & (best | (inside & (iou >= iou.mean() + iou.std()))))
+    anchor = _anchors_of(label).start + yaw
+    places = np.ravel_multi_index((row[cell], column[cell], anchor), anchors.shape[:3])
+    return _Claims(places, np.full(len(places), box_index), iou[cell, yaw] + best[cell, yaw])
+
+
+def _nearest_cells(
+    anchors: NDArray[np.float32], box: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of the cells whose centers are nearest to that of `box`, (9,) each; of equally near the first."""
+    dx, dy = (
+        np.abs(places.astype(np.float64) - center)
+        for places, center in ((anchors[0, :, 0, 0], box[0]), (anchors[:, 0, 0, 1], box[1]))
+    )
+    # The nearest cells lie in the nearest columns and rows.
+    columns, rows = (np.sort(np.argsort(apart, kind="stable")[:_NEAREST]) for apart in (dx, dy))
+    squared = np.square(dx[columns])[None] + np.square(dy[rows])[:, None]
+    nearest = np.argsort(squared, axis=None, kind="stable")[:_NEAREST]
+    return rows[nearest // len(columns)], columns[nearest % len(columns)]
+
+
+def _ignored(
+    anchors: NDArray[np.float32], classes: Sequence[ClassSpec], boxes: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Where anchors (H, W, A) overlap one of `boxes`, which are IGNORED, by the `negative_iou` of their class."""
+    ignored = np.zeros(anchors.shape[:3], dtype=bool)
+    for box in boxes:
+        for class_index, spec in enumerate(classes):
+            window, iou = _overlaps_nearby(anchors, box, spec, class_index)
+            ignored[window] |= iou >= spec.negative_iou
+    return ignored
+
+
+def _overlaps_nearby(
+    anchors: NDArray[np.float32], box: NDArray[np.float32], spec: ClassSpec, class_index: int
+) -> tuple[tuple[slice, slice, slice], NDArray[np.float32]]:
+    """The part of the anchor map that `_window` names, and how much its anchors overlap `box`."""
+    window = _window(anchors, box, spec, class_index)
+    near = anchors[window]
+    return window, aligned_bev_iou(near.reshape(-1, 7), box[None]).reshape(near.shape[:3])
+
+
+def _anchors_of(class_index: int) -> slice:
+    yaws = len(ANCHOR_YAWS_RAD)
+    return slice(class_index * yaws, (class_index + 1) * yaws)
+
+
+def _window(
+    anchors: NDArray[np.float32], box: NDArray[np.float32], spec: ClassSpec, class_index: int
+) -> tuple[slice, slice, slice]:
+    """The part of the anchor map that can overlap `box` at all; the rest would only cost time."""
+    reach = (max(box[3], box[4]) + max(spec.length_m, spec.width_m)) / 2
+    columns = np.searchsorted(anchors[0, :, 0, 0], (box[0] - reach, box[0] + reach))
+    rows = np.searchsorted(anchors[:, 0, 0, 1], (box[1] - reach, box[1] + reach))
+    return slice(*rows), slice(*columns), _anchors_of(class_index)

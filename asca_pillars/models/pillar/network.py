@@ -1,0 +1,183 @@
+"""The whole network between pillars and head maps, and its side of training (`models.trainable.Trainable`)."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from asca_pillars.config.pillar import LossConfig, PillarModel
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.models.map_layers import as_map
+from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
+from asca_pillars.models.pillar.head import SSDHead
+from asca_pillars.models.pillar.loss import detection_loss, targets_at
+from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
+from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, PillarPreparation
+from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from asca_pillars.ops.pillar.spec import PillarSpec
+
+
+class PillarOutputs(NamedTuple):
+    """What the network says of B frames.
+
+    Attributes:
+        maps: head maps, or rows of the active head cells of a sparse neck, see `SSDHead`.
+        neck: the tables that say which cells those are; None for maps.
+    """
+
+    maps: HeadMaps[Tensor]
+    neck: NeckTables[Tensor] | None
+
+
+class PillarDetector(nn.Module):
+    """ASCA-PointPillars (figure 1 of the paper); PointPillars with K = 1, V_max = 0.16 m and no CPA.
+
+    Args:
+        spec: grid, limits and classes that its parts were made for.
+        loss_weights: what training weighs its terms with.
+        encode: points of pillars to pillar features (section 3.2).
+        neck: pseudo-image, or pillars and tables, to features (section 3.3).
+        head: features to head maps.
+    """
+
+    def __init__(
+        self,
+        spec: PillarSpec,
+        loss_weights: LossConfig,
+        encode: PillarEncoder,
+        neck: RPNNeck | SparseRPNNeck,
+        head: SSDHead,
+    ) -> None:
+        super().__init__()
+        self.grid = spec.grid
+        rule = neck.rule if isinstance(neck, SparseRPNNeck) else None
+        self.preparation = PillarPreparation(spec, rule, loss_weights.assigner)
+        self.loss_weights = loss_weights
+        self.encode = encode
+        self.neck = neck
+        self.head = head
+
+    def forward(self, batch: PillarBatch) -> HeadMaps[Tensor]:
+        """Pillars of B frames -> head maps (B, channels, H, W) of logits and residuals.
+
+        With a sparse neck: rows (M, channels) of the active head cells, see `SSDHead`.
+
+        Raises:
+            ValueError: the batch was made without the placements of `self.preparation`, which this detector needs.
+        """
+        return self.read_head(self.head_input(batch), batch)
+
+    def head_input(self, batch: PillarBatch) -> Tensor:
+        """What the neck hands to the head: unitless (B, C, H, W), with a sparse neck (M, C) at active head cells."""
+        pillar_features = self.encode(
+            batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
+        )  # (P, C)
+        features, cells, frame_cells = self.pool(pillar_features, batch)
+        if batch.neck is not None and not features.is_cuda:
+            return self.neck(features, batch.neck)  # type: ignore[no-any-return]
+        canvas = self.scatter(features, cells, frame_cells)  # (B, C, rows, columns)
+        if batch.neck is not None:  # where a dense convolution costs less than gathering
+            assert isinstance(self.neck, SparseRPNNeck)
+            return self.neck.forward_dense(canvas, batch.neck)
+        return self.neck(canvas)  # type: ignore[no-any-return]
+
+    def read_head(self, features: Tensor, batch: PillarBatch) -> HeadMaps[Tensor]:
+        """Head maps of what `head_input` gave for that batch, or rows of them, see `forward`."""
+        if batch.neck is not None:
+            return self.head.at_cells(features)
+        maps: HeadMaps[Tensor] = self.head(features)
+        return maps
+
+    def predict(self, batch: LabeledPillars) -> PillarOutputs:
+        """Head maps (B, channels, H, W) of logits and residuals of B labelled frames, and their cells.
+
+        Where some normalization would see a single point or cell, those of the training so far are used instead.
+        """
+        pillars, neck = batch.pillars, batch.pillars.neck
+        rows = [len(pillars.features)]
+        if neck is not None:
+            rows += [len(cells) for level in neck.levels for cells in (level.strided_cells, level.cells)]
+        with _running_statistics(self) if self.training and 1 in rows else nullcontext():
+            return PillarOutputs(self(pillars), neck)
+
+    def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
+        """The terms of eq. (15) by name, unitless scalars, from head maps (B, channels, H, W), see `detection_loss`.
+
+        Anchors at inactive head cells take no part.
+        """
+        neck, targets = outputs.neck, batch.targets
+        seen = targets if neck is None else targets_at(targets, neck.head_cells)
+        return detection_loss(outputs.maps, seen, self.loss_weights)._asdict()
+
+    def detect(self, outputs: PillarOutputs, spec: DetectorSpec) -> list[Detections]:
+        """Boxes in head maps (B, channels, H, W) for each frame, LiDAR frame, with the thresholds of `spec`."""
+        arrays = [part.float().cpu().numpy() for part in outputs.maps]
+        neck = outputs.neck
+        if neck is None:
+            return [spec.decode(HeadMaps(*frame)) for frame in zip(*arrays, strict=True)]
+        cells, map_cells, first, found = neck.head_cells.cpu().numpy(), math.prod(neck.map_shape), 0, []
+        for frame, rows in enumerate(neck.frame_rows):
+            own = slice(first, first + rows)
+            maps = HeadMaps(*(part[own] for part in arrays))
+            found.append(spec.decode(maps, cells[own] - frame * map_cells))
+            first += rows
+        return found
+
+    def pool(self, pillar_features: Tensor, batch: PillarBatch) -> tuple[Tensor, Tensor, Sequence[int]]:
+        """Pillar features (P, C) -> features (M, C) and cells (M,) of the map, and how many each frame has.
+
+        See `ops.pillar.map_pooling`; without a pooled map pillars and cells are the same.
+        """
+        if self.grid.pools != (batch.pooling is not None) or isinstance(self.neck, RPNNeck) != (batch.neck is None):
+            raise ValueError("the batch was placed for another map or neck; use `preparation.place` of this detector")
+        if batch.pooling is None:
+            return pillar_features, batch.cells, batch.frame_pillars
+        cells, pillars, counts = batch.pooling
+        cell_index = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+        return pillar_max(pillar_features[pillars], cell_index, counts), cells, batch.frame_cells
+
+    def scatter(self, features: Tensor, cells: Tensor, frame_cells: Sequence[int]) -> Tensor:
+        """Put features at their cells of an empty pseudo-image: (M, C) -> (B, C, rows, columns)."""
+        rows, columns = self.grid.map_shape
+        frames, channels = len(frame_cells), features.shape[1]
+        frame_starts = cells.new_tensor([frame * rows * columns for frame in range(frames)])
+        row = cells + frame_starts.repeat_interleave(cells.new_tensor(frame_cells))
+        canvas = features.new_zeros(frames * rows * columns, channels).index_put((row,), features)
+        return as_map(canvas.view(frames, rows, columns, channels))
+
+
+@contextmanager
+def _running_statistics(module: nn.Module) -> Iterator[None]:
+    """Normalize by the statistics of the training so far: a single value per channel has none of its own.
+
+    `SyncBatchNorm` stays as it is: other devices wait for it, and it has their values, too.
+    """
+    norms = [part for part in module.modules() if isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d)]
+    training = [norm for norm in norms if norm.training]
+    for norm in training:
+        norm.eval()
+    try:
+        yield
+    finally:
+        for norm in training:
+            norm.train()
+
+
+def build_pillar_detector(model: PillarModel) -> PillarDetector:
+    """The network that `model` describes, with fresh random weights."""
+    network, spec = model.network, model.spec
+    widths = network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels
+    neck: RPNNeck | SparseRPNNeck
+    neck = RPNNeck(*widths) if network.neck == "dense" else SparseRPNNeck(*widths, rule=network.active_cells)
+    return PillarDetector(
+        spec=spec,
+        loss_weights=model.loss,
+        encode=PillarEncoder(network.pillar_channels, network.cpa, spec.limits, empty_slots=network.empty_slots),
+        neck=neck,
+        head=SSDHead(neck.out_channels, spec.anchors.shape[2], spec.scores_per_anchor),
+    )

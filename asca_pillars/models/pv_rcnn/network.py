@@ -1,0 +1,181 @@
+"""PV-RCNN's side of training (`models.trainable.Trainable`): both stages in one step, as in the paper (section 3.4)."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from asca_pillars.config.pillar import LossConfig
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.models.pillar.loss import detection_loss
+from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, VoxelBatch
+from asca_pillars.models.pv_rcnn.layers import FirstStageOutputs, PvRcnn, build_pv_rcnn
+from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
+from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
+from asca_pillars.models.two_stage.pillar_refiner import Refinements, zero_of_weights
+from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals, propose_anchors
+from asca_pillars.ops.sparse.batching import stack_rows
+from asca_pillars.ops.two_stage.decode import reported_frames
+from asca_pillars.ops.two_stage.prepare import grid_neighbors
+from asca_pillars.ops.two_stage.roi_targets import match_proposals, roi_targets, sample_rois
+
+_DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
+
+
+class PvRcnnOutputs(NamedTuple):
+    """What both stages say of B frames."""
+
+    maps: HeadMaps[Tensor]
+    """Of the first stage."""
+    found: Refinements
+    """Of the second, about `proposals`."""
+    proposals: tuple[Detections, ...]
+    """Of each frame: in training those drawn, otherwise all."""
+
+
+class PvRcnnDetector(nn.Module):
+    """PV-RCNN with its proposals, targets and loss.
+
+    Args:
+        model: its section of the configuration.
+        network: made for it.
+    """
+
+    def __init__(self, model: PvRcnnModel, network: PvRcnn) -> None:
+        super().__init__()
+        self.model = model
+        self.network = network
+        self.preparation = VoxelPreparation(model.spec, model.settings)
+        self.loss_weights = LossConfig()
+        self._kept = () if model.train_first_stage else tuple(getattr(network, name) for name in model.FIRST_STAGE)
+        for part in self._kept:
+            part.requires_grad_(requires_grad=False)
+        self.train()  # Lightning gives back the modes that it found
+
+    def train(self, mode: bool = True) -> "PvRcnnDetector":
+        """As of `torch.nn.Module`; a first stage that is not trained keeps its statistics."""
+        super().train(mode)
+        for part in self._kept:
+            part.eval()
+        return self
+
+    def predict(self, batch: LabeledVoxels) -> PvRcnnOutputs:
+        """Head maps, proposals and their refinements; training draws the proposals that it learns from."""
+        scans = batch.scans
+        if self.training and min(len(scans.keypoints), *(len(level.cells) for level in scans.levels)) < 2:
+            return self._silence(scans)  # no statistics of a batch
+        first = self.network.propose(scans)
+        proposals = self._proposals(first.maps, batch)
+        with torch.autocast(first.canvas.device.type, enabled=False):  # positions need float32, `SetAbstraction`
+            found = self._refine(scans, first, proposals)
+        return PvRcnnOutputs(first.maps, found, proposals)
+
+    def loss(self, outputs: PvRcnnOutputs, batch: LabeledVoxels) -> Mapping[str, Tensor]:
+        """The terms of what is trained by name, see `detection_loss` and `refine_loss`, all of weight 1."""
+        device = outputs.found.confidence.device
+        first = {} if self._kept else detection_loss(outputs.maps, batch.anchors, self.loss_weights)._asdict()
+        targets, learnt = _roi_targets(outputs.proposals, batch)
+        counted = torch.from_numpy(learnt).to(device)
+        found = outputs.found
+        confidence, positive, residuals, sizes = (torch.from_numpy(part[learnt]).to(device) for part in targets)
+        wanted = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
+        kept = Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits)
+        terms = first | refine_loss(kept, wanted)._asdict()
+        if self.model.box_loss == "va":
+            boxes = (kept.residuals[positive].float(), residuals[positive], sizes[positive])
+            distance_iou = distance_iou_loss(*boxes).sum() / max(len(boxes[0]), 1)
+            terms["distance_iou"] = _DISTANCE_IOU_WEIGHT * distance_iou
+        return terms
+
+    def detect(self, outputs: PvRcnnOutputs, spec: DetectorSpec) -> list[Detections]:
+        """Refined boxes of each frame, with the thresholds of `spec`."""
+        confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
+        return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.scores)
+
+    def _proposals(self, maps: HeadMaps[Tensor], batch: LabeledVoxels) -> tuple[Detections, ...]:
+        arrays = [part.detach().float().cpu().numpy() for part in maps]
+        settings = self.model.training_proposals if self.training else self.model.settings.proposals
+        # From torch's generator, which training sets at every step: a resumed run draws what an unbroken one would.
+        rng = np.random.default_rng(int(torch.randint(1 << 62, ()))) if self.training else None
+        frames = zip(zip(*arrays, strict=True), batch.scans.frame_keypoints, batch.boxes, batch.labels, strict=True)
+        return tuple(
+            self._frame_proposals(HeadMaps(*frame), keypoints, settings, boxes, labels, rng)
+            for frame, keypoints, boxes, labels in frames
+        )
+
+    def _frame_proposals(
+        self,
+        maps: HeadMaps[NDArray[np.float32]],
+        keypoints: int,
+        settings: AnchorProposals,
+        boxes: NDArray[np.float32],
+        labels: NDArray[np.int64],
+        rng: np.random.Generator | None,
+    ) -> Detections:
+        if not keypoints:  # nothing to see, and nothing to judge proposals by
+            return Detections.empty(self.model.spec.class_names)
+        found = propose_anchors(maps, self.model.spec, settings)
+        if rng is None:
+            return found
+        return found[sample_rois(match_proposals(found, boxes, labels), self.model.rois, rng)]
+
+    def _refine(
+        self, scans: VoxelBatch[Tensor], first: FirstStageOutputs, proposals: Sequence[Detections]
+    ) -> Refinements:
+        levels, canvas = [level.float() for level in first.levels], first.canvas.float()
+        features, keypoint_logits = self.network.describe(scans, levels, canvas)
+        if self.training and not sum(map(len, proposals)):
+            nothing = zero_of_weights(self.network.refine)
+            return Refinements(
+                features.new_zeros(0) + nothing, features.new_zeros(0, 7) + nothing, keypoint_logits + nothing
+            )
+        settings, device = self.model.settings, features.device
+        per_frame = np.split(scans.keypoints.cpu().numpy(), np.cumsum(scans.frame_keypoints)[:-1])
+        grids = [
+            grid_neighbors(keypoints, frame.boxes, settings, settings.vector_cells)
+            for keypoints, frame in zip(per_frame, proposals, strict=True)
+        ]
+        points = torch.from_numpy(np.concatenate([grid.points for grid in grids])).to(device)
+        indices = [
+            torch.from_numpy(stack_rows([grid.indices[ball] for grid in grids], scans.frame_keypoints)).to(device)
+            for ball in range(len(settings.grid_radii_m))
+        ]
+        confidence, residuals = self.network.refine(scans.keypoints, features, points, indices)
+        return Refinements(confidence, residuals, keypoint_logits)
+
+    def _silence(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
+        """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
+        nothing, frames = zero_of_weights(self), len(scans.frame_keypoints)
+        height, width, anchors, _ = self.model.spec.anchors.shape
+        classes = len(self.model.spec.classes)
+        maps = (nothing.new_zeros(frames, anchors * size, height, width) + nothing for size in (classes, 7, 2))
+        found = Refinements(
+            nothing.new_zeros(0) + nothing,
+            nothing.new_zeros(0, 7) + nothing,
+            nothing.new_zeros(len(scans.keypoints)) + nothing,
+        )
+        return PvRcnnOutputs(HeadMaps(*maps), found, (Detections.empty(self.model.spec.class_names),) * frames)
+
+
+def _roi_targets(
+    proposals: Sequence[Detections], batch: LabeledVoxels
+) -> tuple[tuple[NDArray[np.generic], ...], NDArray[np.bool_]]:
+    """Confidence, positive, residuals and sizes (R, ...) of all proposals, and which of them are learnt from (R,)."""
+    parts, learnt = [], []
+    for frame, boxes, labels in zip(proposals, batch.boxes, batch.labels, strict=True):
+        overlaps = match_proposals(frame, boxes, labels)
+        targets = roi_targets(frame, boxes, overlaps, np.arange(len(frame)))
+        parts.append((targets.confidence, targets.positive, targets.residuals, frame.boxes[:, 3:6]))
+        learnt.append(~overlaps.ignored)
+    return tuple(np.concatenate(part) for part in zip(*parts, strict=True)), np.concatenate(learnt)
+
+
+def build_pv_rcnn_detector(model: PvRcnnModel) -> PvRcnnDetector:
+    """The detector that `model` describes, with fresh random weights."""
+    return PvRcnnDetector(model, build_pv_rcnn(model))

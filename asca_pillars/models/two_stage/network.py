@@ -1,0 +1,123 @@
+"""The second stage's side of training (`models.trainable.Trainable`); the first stage stands outside it, frozen."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.config.two_stage import RefineConfig, RefineModel
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.models.two_stage.keypoint_encoder import BallSource, KeypointEncoder
+from asca_pillars.models.two_stage.loss import RefineTargets, refine_loss
+from asca_pillars.models.two_stage.pillar_refiner import PillarRefiner, RefineInputs, Refinements, zero_of_weights
+from asca_pillars.models.two_stage.preparation import LabeledProposals, RefinePreparation, live_preparation
+from asca_pillars.models.two_stage.roi_head import RoiHead
+from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
+from asca_pillars.ops.two_stage.decode import reported_frames
+from asca_pillars.ops.two_stage.prepare import ROI_FEATURES
+
+POINT_CHANNELS = 1  # reflectance
+
+
+class RefineOutputs(NamedTuple):
+    """What the second stage says of the proposals of B frames."""
+
+    found: Refinements
+    proposals: tuple[Detections, ...]
+    """Of each frame, which `found` is about."""
+
+
+class RefineDetector(nn.Module):
+    """A second stage on the proposals of the first stage that `model` names.
+
+    Args:
+        model: its section of the configuration.
+        refiner: the network.
+    """
+
+    def __init__(self, model: RefineModel, refiner: PillarRefiner) -> None:
+        super().__init__()
+        self.model = model
+        self.refiner = refiner
+
+    @cached_property
+    def preparation(self) -> RefinePreparation:
+        """Runs the first stage on each frame; training reads cached proposals instead (`models.build`).
+
+        Raises:
+            AscaError: the first stage cannot be opened, or is not the one of the training.
+        """
+        return live_preparation(self.model)
+
+    def predict(self, batch: LabeledProposals) -> RefineOutputs:
+        """Confidence and residuals of the proposals of a batch."""
+        inputs = batch.inputs
+        rows = min(len(inputs.points), len(inputs.keypoints), len(inputs.roi_features))
+        if self.training and rows < 2:  # no statistics of a batch, and nothing to learn
+            return RefineOutputs(self._silence(inputs), batch.proposals)
+        with torch.autocast(inputs.points.device.type, enabled=False):  # positions need float32, `SetAbstraction`
+            found: Refinements = self.refiner(inputs)
+        return RefineOutputs(found, batch.proposals)
+
+    def loss(self, outputs: RefineOutputs, batch: LabeledProposals) -> Mapping[str, Tensor]:
+        """The terms by name, see `refine_loss`; proposals of IGNORED boxes take no part."""
+        found, targets, learnt = outputs.found, batch.targets, batch.learnt
+        counted = Refinements(found.confidence[learnt], found.residuals[learnt], found.keypoint_logits)
+        wanted = RefineTargets(
+            targets.confidence[learnt],
+            targets.positive[learnt],
+            targets.residuals[learnt],
+            targets.sizes[learnt],
+            targets.keypoint_states,
+        )
+        return refine_loss(counted, wanted)._asdict()
+
+    def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
+        """Refined boxes of each frame, with the thresholds of `spec`."""
+        confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
+        return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.refine.scores)
+
+    def _silence(self, inputs: RefineInputs) -> Refinements:
+        """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
+        nothing = zero_of_weights(self)
+        rois, keypoints = len(inputs.roi_features), len(inputs.keypoints)
+        zeros = inputs.points.new_zeros
+        return Refinements(zeros(rois) + nothing, zeros(rois, 7) + nothing, zeros(keypoints) + nothing)
+
+
+def build_refine_detector(model: RefineModel) -> RefineDetector:
+    """The network that `model` describes, with fresh random weights.
+
+    Raises:
+        ConfigError: it does not say how many channels the first stage's map has.
+    """
+    if not model.bev_channels:
+        raise ConfigError(
+            f"model.bev_channels = 0: not yet read from {model.first_stage}; `asca train` does, "
+            "`models.two_stage.open_first_stage.with_first_stage` elsewhere"
+        )
+    return RefineDetector(model, build_refiner(model.bev_channels, len(model.spec.classes), model.refine))
+
+
+def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> PillarRefiner:
+    """A second stage with fresh random weights."""
+    network, neighbors = refine.network, refine.neighbors
+    return PillarRefiner(
+        KeypointEncoder(
+            [BallSource(POINT_CHANNELS, len(neighbors.ball_radii_m), network.ball_widths)],
+            bev_channels,
+            network.keypoint_channels,
+            weighting_channels=network.keypoint_channels,
+        ),
+        RoiHead(
+            [SetAbstraction(network.keypoint_channels, network.grid_widths) for _ in neighbors.grid_radii_m],
+            neighbors.grid_size,
+            roi_channels=classes + ROI_FEATURES,
+            hidden=network.hidden,
+            dropout=network.dropout,
+        ),
+    )

@@ -1,0 +1,142 @@
+"""Labelled frames to batches of the second stage."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import Tensor
+from torch.utils._pytree import tree_map_only
+
+from asca_pillars.config.tree import DataConfig
+from asca_pillars.config.two_stage import RefineConfig, RefineModel
+from asca_pillars.data.augment import move_scene
+from asca_pillars.data.frames import LabeledFrame, Motion
+from asca_pillars.data.insertion.prepared import prepared_folder
+from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.detection.detections import Detections
+from asca_pillars.models.two_stage.loss import RefineTargets
+from asca_pillars.models.two_stage.open_first_stage import open_first_stage, with_first_stage
+from asca_pillars.models.two_stage.pillar_refiner import RefineInputs
+from asca_pillars.models.two_stage.proposal_cache import ProposalCache, ProposalFiles
+from asca_pillars.models.two_stage.samples import RefineSample, collate_samples, sample_of
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
+from asca_pillars.ops.two_stage.roi_targets import match_proposals, sample_rois
+
+
+class PreparedRefinement(NamedTuple):
+    """One frame for the second stage."""
+
+    sample: RefineSample
+    proposals: Detections
+    """Those of the sample, in its order."""
+    learnt: NDArray[np.bool_]
+    """(S,) those that the loss counts."""
+
+
+class LabeledProposals(NamedTuple):
+    """Proposals of B frames with their neighbours and targets."""
+
+    inputs: RefineInputs
+    targets: RefineTargets
+    learnt: Tensor
+    """(R,) bool, the proposals that the loss counts."""
+    proposals: tuple[Detections, ...]
+    """Of each frame."""
+
+    def to(self, device: Any) -> "LabeledProposals":
+        """The same with its tensors on `device`."""
+        moved: LabeledProposals = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
+        return moved
+
+
+class ProposalSource(Protocol):
+    """Where a frame's proposals come from."""
+
+    def __call__(self, frame: LabeledFrame) -> Proposed:
+        """What the first stage says of the frame as it is now."""
+        ...
+
+
+@dataclass(frozen=True)
+class CachedProposals:
+    """Proposals from the files of a `ProposalCache`, moved as augmentation moved the frame."""
+
+    files: ProposalFiles
+
+    def __call__(self, frame: LabeledFrame) -> Proposed:
+        """See `ProposalSource`."""
+        return move_proposed(self.files.read(frame.frame_id), frame.motion)
+
+
+@dataclass(frozen=True)
+class LiveProposals:
+    """Proposals of a first stage that is run; for whoever prepares in the process itself."""
+
+    stage: FirstStage
+    settings: FirstStageSettings
+
+    def __call__(self, frame: LabeledFrame) -> Proposed:
+        """See `ProposalSource`."""
+        return propose_on(self.stage, frame.points, self.settings)
+
+
+@dataclass(frozen=True)
+class RefinePreparation:
+    """The `Preparation` of the second stage."""
+
+    refine: RefineConfig
+    source: ProposalSource
+
+    def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedRefinement:
+        """Neighbours and targets of proposals: drawn ones for training, without `rng` all of them."""
+        points = frame.points[np.isfinite(frame.points).all(axis=1)]
+        frame = replace(frame, points=points)
+        proposed = self.source(frame)
+        overlaps = match_proposals(proposed.proposals, frame.boxes, frame.labels)
+        every = np.arange(len(proposed.proposals))
+        rows = every if rng is None else sample_rois(overlaps, self.refine.rois, rng)
+        sample = sample_of(frame, proposed, overlaps, rows, self.refine.neighbors)
+        return PreparedRefinement(sample, proposed.proposals[rows], ~overlaps.ignored[rows])
+
+    def collate(self, frames: Sequence[PreparedRefinement]) -> LabeledProposals:
+        """Frames as one batch."""
+        batch = collate_samples([frame.sample for frame in frames])
+        learnt = torch.from_numpy(np.concatenate([frame.learnt for frame in frames]))
+        return LabeledProposals(*batch, learnt, tuple(frame.proposals for frame in frames))
+
+
+def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig) -> RefinePreparation:
+    """For the frames of `split`, whose proposals are computed where they are not yet on disk.
+
+    Raises:
+        AscaError: the first stage cannot be opened, a frame not be read, or a file not be written.
+    """
+    model = with_first_stage(model)
+    stage = open_first_stage(model.first_stage)
+    folder = prepared_folder(split.root, data)
+    view = data.camera_view and split.has_camera
+    cache = ProposalCache(folder, split.pool, stage, model.refine.seen, camera_view=view)
+    cache.fill(split, workers=max(data.workers, 1), console=Console(stderr=True))
+    return RefinePreparation(model.refine, CachedProposals(cache.files))
+
+
+def live_preparation(model: RefineModel) -> RefinePreparation:
+    """For scans of which nothing is on disk: the first stage runs on each.
+
+    Raises:
+        AscaError: the first stage cannot be opened, or is not the one of the training.
+    """
+    model = with_first_stage(model)
+    return RefinePreparation(model.refine, LiveProposals(open_first_stage(model.first_stage), model.refine.seen))
+
+
+def move_proposed(proposed: Proposed, motion: Motion) -> Proposed:
+    """Proposals and keypoints in the scene that moved; what the map says of a keypoint stays."""
+    proposals = proposed.proposals
+    moved = LabeledFrame("", proposed.keypoints.copy(), proposals.boxes.copy(), proposals.labels)
+    move_scene(moved, motion)
+    return replace(proposed, proposals=replace(proposals, boxes=moved.boxes), keypoints=moved.points)

@@ -1,0 +1,1 @@
+"""Point operations: farthest points, ball queries, interpolation."""

@@ -1,0 +1,1 @@
+"""Voxels, their rulebooks and the scan as PV-RCNN's network reads it."""

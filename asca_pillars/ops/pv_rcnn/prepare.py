@@ -1,0 +1,230 @@
+"""What the host computes for PV-RCNN of one scan: voxels, tables, keypoints and their neighbors (sections 3.1, 3.2)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.strict import Strict
+from asca_pillars.detection.report import ScanCounts
+from asca_pillars.ops.points.ball_query import ball_query, three_nearest
+from asca_pillars.ops.points.bilinear import bilinear_cells
+from asca_pillars.ops.points.farthest_points import farthest_points
+from asca_pillars.ops.points.point_scales import PointScale, point_scales
+from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals
+from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, VoxelTableBuilder
+from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
+from asca_pillars.ops.pv_rcnn.voxels import voxelize
+
+Deform = Literal["none", "paper", "authors", "authors_frozen"]
+Source = Literal["points", "conv1", "conv2", "conv3", "conv4"]
+LEVEL_SOURCES: tuple[Source, ...] = ("conv1", "conv2", "conv3", "conv4")
+MOST_VECTOR_CELLS = 7
+"""Along an axis of a cube: more are more weights than keypoints to teach them."""
+
+
+def _are_radii(radii_m: Sequence[float]) -> bool:
+    return all(0 < radius < math.inf for radius in radii_m)
+
+
+@dataclass(frozen=True)
+class SourceBalls(Strict):
+    """What voxel set abstraction aggregates of one source around a keypoint.
+
+    Attributes:
+        source: raw points, or the voxels of a level of the backbone.
+        radii_m: of the balls.
+        samples: of each ball at most.
+    """
+
+    source: Source
+    radii_m: tuple[float, ...]
+    samples: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if not self.radii_m or len(self.radii_m) != len(self.samples):
+            raise ConfigError(f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must go in pairs")
+        if not _are_radii(self.radii_m) or min(self.samples) < 1:
+            raise ConfigError(
+                f"{self.source}: radii_m {self.radii_m} and samples {self.samples} must be positive and finite"
+            )
+
+
+@dataclass(frozen=True)
+class VoxelSetSettings(Strict):
+    """Keypoints, proposals and neighbors of PV-RCNN; the defaults are the published ones on KITTI.
+
+    Attributes:
+        keypoints: of a scan, at most.
+        sources: what keypoints aggregate beside the map seen from above.
+        scale_radii_m: of groups of raw points at scales that have all keypoints, a quarter of them, a sixteenth, ...,
+            the finest first (AFE-RCNN's adaptive features); none without.
+        scale_samples: of each of these groups at most.
+        deform: where keypoints look for voxels. `none`: around themselves. `paper`: around a place learnt from their
+            surroundings, one for each level (Deformable PV-RCNN). `authors`: one for each level and radius, as in that
+            paper's code. `authors_frozen`: likewise, learning nothing through the place, as that code does.
+        proposals: which of the first stage's boxes are refined.
+        grid_size: grid points along each axis of a proposal.
+        grid_radii_m: around grid points, in which keypoints are aggregated.
+        grid_samples: of each of these balls at most.
+        vector_cells: 0, or along each axis of a cube around a grid point, with `grid_radii_m` as half its length:
+            VectorPool interpolates the keypoints nearest to each cell instead of aggregating balls (AV PV-RCNN).
+    """
+
+    keypoints: int = 2048
+    sources: tuple[SourceBalls, ...] = (
+        SourceBalls("points", (0.4, 0.8), (16, 16)),
+        SourceBalls("conv1", (0.4, 0.8), (16, 16)),
+        SourceBalls("conv2", (0.8, 1.2), (16, 32)),
+        SourceBalls("conv3", (1.2, 2.4), (16, 32)),
+        SourceBalls("conv4", (2.4, 4.8), (16, 32)),
+    )
+    scale_radii_m: tuple[float, ...] = ()
+    scale_samples: int = 16
+    deform: Deform = "none"
+    proposals: AnchorProposals = field(default_factory=AnchorProposals)
+    grid_size: int = 6
+    grid_radii_m: tuple[float, ...] = (0.8, 1.6)
+    grid_samples: int = 16
+    vector_cells: int = 0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name in ("keypoints", "grid_size", "grid_samples") and value < 1:
+                raise ConfigError(f"{item.name} {value} must be at least 1")
+        if not self.grid_radii_m or not _are_radii(self.grid_radii_m):
+            raise ConfigError(f"grid_radii_m {list(self.grid_radii_m)} must be positive and finite, one at least")
+        if not 0 <= self.vector_cells <= MOST_VECTOR_CELLS:
+            raise ConfigError(f"vector_cells {self.vector_cells} must lie between 0 and {MOST_VECTOR_CELLS}")
+        if not _are_radii(self.scale_radii_m) or self.scale_samples < 2:
+            raise ConfigError(
+                f"scale_radii_m {list(self.scale_radii_m)} must be positive and finite, "
+                f"scale_samples {self.scale_samples} at least 2"
+            )
+        names = [each.source for each in self.sources]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"sources {', '.join(names)} must be different ones")
+        if self.deform != "none" and not self.deformed:
+            raise ConfigError(f"deform {self.deform} shifts where voxels are looked for; add a level to sources")
+
+    @property
+    def deformed(self) -> tuple[SourceBalls, ...]:
+        """The sources around whose shifted places keypoints look: the levels, if any."""
+        return tuple(each for each in self.sources if self.deform != "none" and each.source != "points")
+
+    @property
+    def nearest_wanted(self) -> bool:
+        """Whether the three nearest voxels of a keypoint are asked for."""
+        return self.deform == "paper"
+
+    def places(self, each: SourceBalls) -> int:
+        """How many places around which this source is looked at; 0: the keypoint itself."""
+        if each not in self.deformed:
+            return 0
+        return 1 if self.deform == "paper" else len(each.radii_m)
+
+
+class VoxelScan(NamedTuple):
+    """One scan as PV-RCNN takes it."""
+
+    features: NDArray[np.float32]
+    """(N, 4) of the voxels, see `Voxels`."""
+    levels: tuple[VoxelLevel[NDArray[Any]], ...]
+    """conv1 to conv4 and conv_out."""
+    points: NDArray[np.float32]
+    """(P, 4) x, y, z in metres, LiDAR frame, and reflectance, of the points in the ranges."""
+    keypoints: NDArray[np.float32]
+    """(K, 3), metres, LiDAR frame."""
+    positions: tuple[NDArray[np.float32], ...]
+    """Of each source, the (N, 3) that its indices count: points, or centers of voxels; metres."""
+    ball_indices: tuple[tuple[NDArray[np.int32], ...], ...]
+    """Of each source and radius (K, samples)."""
+    nearest: tuple[NDArray[np.int32], ...]
+    """Of each source (K, 3) voxels, see `three_nearest`; (0, 3) where they are not asked for."""
+    nearest_weights: tuple[NDArray[np.float32], ...]
+    bev_cells: NDArray[np.int32]
+    """(K, 4) flat indices into the map seen from above, see `bilinear_cells`."""
+    bev_weights: NDArray[np.float32]
+    """(K, 4)."""
+    scales: tuple[PointScale[NDArray[Any]], ...]
+    """Of raw points around keypoints, the finest first; none where they are not asked for."""
+    counts: ScanCounts
+
+
+def voxel_scan(
+    points: NDArray[np.float32], spec: VoxelSpec, settings: VoxelSetSettings, builder: VoxelTableBuilder
+) -> VoxelScan:
+    """Voxels, tables, keypoints and their neighbors of the finite points (N, 4) of one scan.
+
+    Args:
+        points: x, y, z in metres, LiDAR frame, and reflectance.
+        spec: the detector's.
+        settings: likewise.
+        builder: of `spec`; its memory is written over by the next scan, what is returned is not.
+    """
+    return with_neighbors(points, voxel_levels(points, spec, builder), spec, settings)
+
+
+class VoxelizedScan(NamedTuple):
+    """The part of a scan that the sparse backbone reads."""
+
+    features: NDArray[np.float32]
+    """(N, 4)."""
+    levels: tuple[VoxelLevel[NDArray[Any]], ...]
+    counts: ScanCounts
+
+
+def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelTableBuilder) -> VoxelizedScan:
+    """Voxels and tables of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
+    voxels = voxelize(points, spec.grid, builder.maps[0])
+    counts = ScanCounts(len(points), voxels.points_outside, 0)
+    return VoxelizedScan(voxels.features, tuple(builder.build()), counts)
+
+
+def with_neighbors(
+    points: NDArray[np.float32], voxelized: VoxelizedScan, spec: VoxelSpec, settings: VoxelSetSettings
+) -> VoxelScan:
+    """Keypoints among the points (N, 4), metres, LiDAR frame, and what lies around them, see `voxel_scan`."""
+    features, levels, counts = voxelized
+    inside = np.ascontiguousarray(points[spec.grid.inside(points)])
+    keypoints = np.ascontiguousarray(inside[farthest_points(inside, settings.keypoints), :3])
+    positions = tuple(_positions(each.source, inside, levels, spec) for each in settings.sources)
+    balls = tuple(
+        tuple(
+            ball_query(where, keypoints, radius, count)
+            for radius, count in zip(each.radii_m, each.samples, strict=True)
+        )
+        for each, where in zip(settings.sources, positions, strict=True)
+    )
+    asked = settings.deformed if settings.nearest_wanted else ()
+    nearest = [
+        three_nearest(where, keypoints if each in asked else keypoints[:0])
+        for each, where in zip(settings.sources, positions, strict=True)
+    ]
+    return VoxelScan(
+        features,
+        levels,
+        inside,
+        keypoints,
+        positions,
+        balls,
+        tuple(indices for indices, _ in nearest),
+        tuple(weights for _, weights in nearest),
+        *bilinear_cells(keypoints, *spec.map_places_m()),
+        point_scales(inside, keypoints, settings.scale_radii_m, settings.scale_samples),
+        counts,
+    )
+
+
+def _positions(
+    source: Source, points: NDArray[np.float32], levels: tuple[VoxelLevel[NDArray[Any]], ...], spec: VoxelSpec
+) -> NDArray[np.float32]:
+    if source == "points":
+        return np.ascontiguousarray(points[:, :3])
+    number = LEVEL_SOURCES.index(source)
+    return spec.grid.centers_m(levels[number].cells, spec.level_shapes[number], spec.level_strides[number])

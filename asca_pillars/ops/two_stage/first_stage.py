@@ -1,0 +1,121 @@
+"""What the second stage asks of the first: proposals, keypoints and what the first stage's map says there."""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.strict import Strict
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.ops.points.bilinear import bilinear_cells, read_map
+from asca_pillars.ops.points.farthest_points import farthest_points, points_near_boxes
+from asca_pillars.ops.two_stage.proposals import ProposalSettings, propose
+
+
+class FirstPass(NamedTuple):
+    """What a first stage computes of one scan."""
+
+    maps: HeadMaps[NDArray[np.float32]]
+    """On the head's map, or in rows of its active cells."""
+    neck: NDArray[Any]
+    """(H, W, C) the head's input on its map, or (M, C) at M active cells; beside these the map is zero. float32,
+    or the uint8 steps of an 8-bit bundle."""
+    cells: NDArray[np.int32] | None = None
+    """(M,) flat index of the head cell of each row; None of maps."""
+
+
+class FirstStage(Protocol):
+    """A trained one-stage detector that hands out its neck's map: a bundle or a checkpoint."""
+
+    @property
+    def spec(self) -> DetectorSpec:
+        """Grid and classes."""
+
+    @property
+    def identity(self) -> str:
+        """Of its trained weights, whichever file they come from; differs for different ones."""
+
+    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+        """Run on one scan (N, 4)."""
+
+
+@dataclass(frozen=True)
+class KeypointSettings(Strict):
+    """Which points of a scan become keypoints."""
+
+    count: int = 768
+    margin_m: float = 2.0
+    """They stand within this distance of the circles around the proposals; others would say nothing about them."""
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or not self.margin_m >= 0:
+            raise ConfigError(
+                f"keypoints: count {self.count} must be at least 1, margin_m {self.margin_m:g} at least 0"
+            )
+
+
+@dataclass(frozen=True)
+class FirstStageSettings(Strict):
+    """All that decides what the second stage sees of the first."""
+
+    proposals: ProposalSettings = field(default_factory=ProposalSettings)
+    keypoints: KeypointSettings = field(default_factory=KeypointSettings)
+
+
+@dataclass(frozen=True)
+class Proposed:
+    """What the second stage sees of the first's work on one scan."""
+
+    proposals: Detections
+    """R of them."""
+    keypoints: NDArray[np.float32]
+    """(K, 3) positions in metres, LiDAR frame."""
+    bev: NDArray[np.float32]
+    """(K, C) the neck's map at the keypoints."""
+
+
+def require_pillar_kind(source: object, kind: str) -> None:
+    """Refuse a detector of another family than the pillar detector's.
+
+    Args:
+        source: bundle or checkpoint, to be named to the user.
+        kind: family of the detector.
+
+    Raises:
+        ConfigError: the detector cannot be a first stage.
+    """
+    if kind != "pillar":
+        raise ConfigError(f"{source}: model.kind {kind}; a first stage is of kind pillar")
+
+
+def propose_on(stage: FirstStage, points: NDArray[np.float32], settings: FirstStageSettings) -> Proposed:
+    """Run the first stage on the finite points (N, 4) of one scan."""
+    return proposed_from(stage(points), points, stage.spec, settings)
+
+
+def proposed_from(
+    found: FirstPass, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
+) -> Proposed:
+    """What the second stage sees of `found`, the first stage's answer to the finite points (N, 4) of one scan."""
+    proposals = propose(found.maps, spec, settings.proposals, found.cells)
+    near = points_near_boxes(points, proposals.boxes, settings.keypoints.margin_m)
+    keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
+    return Proposed(proposals, keypoints, _read_neck(found, keypoints, spec))
+
+
+def _read_neck(found: FirstPass, keypoints: NDArray[np.float32], spec: DetectorSpec) -> NDArray[np.float32]:
+    x_m, y_m = spec.head_centers_m()
+    cells, weights = bilinear_cells(keypoints, x_m, y_m)
+    rows = found.neck.reshape(-1, found.neck.shape[-1])
+    if found.cells is not None:
+        if not len(rows):
+            return np.zeros((len(keypoints), rows.shape[1]), np.float32)
+        row_of_cell = np.full(len(x_m) * len(y_m), -1, np.int32)
+        row_of_cell[found.cells] = np.arange(len(rows))
+        cells = row_of_cell[cells]
+        weights, cells = np.where(cells < 0, np.float32(0), weights), np.maximum(cells, 0)
+    return read_map(rows, cells, weights)

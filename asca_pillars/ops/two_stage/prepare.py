@@ -1,0 +1,154 @@
+"""What the host computes for the second stage of one scan: neighbours of keypoints and of the grids of proposals."""
+
+import math
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.strict import Strict
+from asca_pillars.detection.detections import Detections
+from asca_pillars.ops.points.ball_query import ball_query
+from asca_pillars.ops.points.cube_neighbors import nearest_in_cubes
+from asca_pillars.ops.points.farthest_points import points_near_boxes
+from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.roi_grid import roi_grid_points
+
+ROI_FEATURES = 4
+"""Columns of `roi_features` beside one for each class."""
+
+
+@dataclass(frozen=True)
+class RefineSettings(Strict):
+    """Balls and grids of the second stage."""
+
+    ball_radii_m: tuple[float, ...] = (0.4, 0.8)
+    """Around keypoints, in which raw points are aggregated."""
+    ball_samples: int = 16
+    grid_size: int = 4
+    """Grid points along each axis of a proposal."""
+    grid_radii_m: tuple[float, ...] = (0.8, 1.6)
+    """Around grid points, in which keypoints are aggregated."""
+    grid_samples: int = 16
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            values = value if isinstance(value, tuple) else (value,)
+            if not values or not all(0 < each < math.inf for each in values):
+                raise ConfigError(f"{field.name} {value} of the second stage must be positive and finite")
+
+
+class GridSettings(Protocol):
+    """The part of a second stage's settings that RoI-grid pooling reads, see `RefineSettings`."""
+
+    @property
+    def grid_size(self) -> int:
+        """Grid points along each axis of a proposal."""
+
+    @property
+    def grid_radii_m(self) -> tuple[float, ...]:
+        """Around grid points."""
+
+    @property
+    def grid_samples(self) -> int:
+        """Keypoints of each ball."""
+
+
+class GridNeighbors(NamedTuple):
+    """The grid points of R proposals and the keypoints around them."""
+
+    points: NDArray[np.float32]
+    """(R * cells, 3), metres, LiDAR frame."""
+    indices: tuple[NDArray[np.int32], ...]
+    """Of each radius (R * cells, samples), or of each cell of a cube the nearest (R * cells, T, 3); the number of
+    keypoints stands for nothing."""
+
+
+@dataclass(frozen=True)
+class RefineScan:
+    """One scan as the second stage takes it; `models.two_stage.pillar_refiner.RefineInputs` says what each array is."""
+
+    points: NDArray[np.float32]
+    keypoints: NDArray[np.float32]
+    bev: NDArray[np.float32]
+    ball_indices: tuple[NDArray[np.int32], ...]
+    grid_points: NDArray[np.float32]
+    grid_indices: tuple[NDArray[np.int32], ...]
+    roi_features: NDArray[np.float32]
+
+
+def refine_scan(
+    points: NDArray[np.float32],
+    proposed: Proposed,
+    proposals: Detections,
+    settings: RefineSettings,
+    executor: Executor | None = None,
+) -> RefineScan:
+    """Neighbours for some proposals of a scan, in their order.
+
+    Args:
+        points: (N, 4) of the scan.
+        proposed: what the first stage says of it.
+        proposals: those of them to be refined.
+        executor: of a thread for the grids' neighbours, while those of the keypoints are sought in this one.
+    """
+    keypoints = proposed.keypoints
+    pending = None if executor is None else executor.submit(grid_neighbors, keypoints, proposals.boxes, settings)
+    # Points that no ball around a keypoint can reach are not worth sorting.
+    all_boxes = proposed.proposals.boxes
+    margin_m = max(settings.ball_radii_m) + _keypoint_margin_m(keypoints, all_boxes)
+    near = points_near_boxes(points, all_boxes, margin_m)
+    balls = tuple(ball_query(near, keypoints, radius_m, settings.ball_samples) for radius_m in settings.ball_radii_m)
+    grid = grid_neighbors(keypoints, proposals.boxes, settings) if pending is None else pending.result()
+    return RefineScan(
+        points=near,
+        keypoints=keypoints,
+        bev=proposed.bev,
+        ball_indices=balls,
+        grid_points=grid.points,
+        grid_indices=grid.indices,
+        roi_features=roi_features(proposals),
+    )
+
+
+def grid_neighbors(
+    keypoints: NDArray[np.float32], boxes: NDArray[np.float32], settings: GridSettings, vector_cells: int = 0
+) -> GridNeighbors:
+    """What RoI-grid pooling aggregates (PV-RCNN, section 3.3), for boxes (R, 7) among keypoints (K, 3), metres.
+
+    Balls, or with `vector_cells` along each axis the cells of cubes whose half length is the radius.
+    """
+    points = np.ascontiguousarray(roi_grid_points(boxes, settings.grid_size).reshape(-1, 3), np.float32)
+    return GridNeighbors(
+        points,
+        tuple(
+            nearest_in_cubes(keypoints, points, radius_m, vector_cells)
+            if vector_cells
+            else ball_query(keypoints, points, radius_m, settings.grid_samples)
+            for radius_m in settings.grid_radii_m
+        ),
+    )
+
+
+def roi_features(proposals: Detections) -> NDArray[np.float32]:
+    """What pooling does not tell of a proposal: class (one of them 1), logit of its score, length, width, height.
+
+    (R, classes + ROI_FEATURES). One head serves all classes, which differ in what a good box looks like.
+    """
+    classes = np.eye(len(proposals.class_names), dtype=np.float32)[proposals.labels]
+    score = np.clip(proposals.scores, 1e-4, 1 - 1e-4)[:, None]
+    return np.concatenate([classes, np.log(score / (1 - score)), proposals.boxes[:, 3:6]], axis=1, dtype=np.float32)
+
+
+def _keypoint_margin_m(keypoints: NDArray[np.float32], boxes: NDArray[np.float32]) -> float:
+    """How far a keypoint stands from the circle around the nearest box, at most."""
+    if not len(keypoints) or not len(boxes):
+        return 0.0
+    reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
+    dx, dy = (keypoints[:, None, axis] - boxes[None, :, axis] for axis in range(2))
+    away = np.sqrt(dx * dx + dy * dy) - reach  # several times as fast as hypot
+    return max(float(away.min(axis=1).max()), 0.0)

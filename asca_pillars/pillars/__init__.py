@@ -1,1 +1,0 @@
-"""What the pillar family adds to `geometry`, in NumPy: grid, pillarize, `PillarSpec`."""

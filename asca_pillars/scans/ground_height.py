@@ -1,0 +1,167 @@
+"""How high the sensor sits above the ground, estimated from scans: `--sensor-height auto`."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.geometry.common_plane import most_common_plane, plane_heights
+from asca_pillars.scans.mounting import Mounting
+
+NEAR_M = (3.0, 20.0)  # beyond the vehicle itself, before the beams become sparse
+CELL_M = 1.0
+BAND_M = 0.12
+"""Half the thickness of what counts as the plane: camber and kerbs within it."""
+MIN_CELLS = 40
+MIN_SHARE = 0.3
+"""Of the cells whose low point must lie on the plane."""
+MAX_SHARE_BELOW = 0.3
+MAX_TILT_DEG = 5.0
+MAX_SPREAD_M = 0.3
+_BY_HAND = "give the height in metres (--sensor-height 1.8, or sensor_height_m of the mounting)"
+
+
+class GroundPlane(NamedTuple):
+    """The ground near one sensor, level frame."""
+
+    height_m: float
+    """Of the origin above it."""
+    tilt_deg: float
+    """Between its normal and z."""
+    share: float
+    """Of the cells of 1 m whose low point lies within BAND_M of the plane."""
+    share_below: float
+    """Of the cells whose low point lies further below it: a plane above others is no ground."""
+    cells: int
+    normal: tuple[float, float, float]
+    """Of length 1, upwards."""
+
+    @property
+    def doubt(self) -> str | None:
+        """Why this may not be the ground; None if it is."""
+        if self.share < MIN_SHARE or self.share_below > MAX_SHARE_BELOW:
+            return f"only {self.share:.0%} of the low points lie on a plane, {self.share_below:.0%} below it"
+        if self.tilt_deg > MAX_TILT_DEG:
+            return f"the ground is tilted by {self.tilt_deg:.0f} degrees; give the pose of the sensor"
+        return None
+
+
+class NamedPoints(NamedTuple):
+    """Points (N, >=3) of a scan, metres, and what to call it."""
+
+    name: str
+    points: NDArray[Any]
+
+
+class HeightEstimate(NamedTuple):
+    """The sensor's height over several scans."""
+
+    height_m: float
+    """Median."""
+    spread_m: float
+    """Between the lowest and the highest scan."""
+    share: float
+    """Smallest `GroundPlane.share`."""
+    scans: int
+    left_out: tuple[str, ...] = ()
+    """Scans that show no clear ground, each with the reason."""
+
+    def __str__(self) -> str:
+        agree = "" if self.scans == 1 else f", which agree within {self.spread_m:.2f} m"
+        return (
+            f"{self.height_m:.2f} m above the ground, estimated from {self.scans} scan{'s' * (self.scans > 1)}{agree}: "
+            f"{self.share:.0%} of the low points near the sensor lie on the plane"
+            + (f"; left out: {_first_of(self.left_out)}" if self.left_out else "")
+        )
+
+
+def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = None) -> HeightEstimate:
+    """How high the origin of a mounting's level frame is above the ground, from scans of one sensor.
+
+    Args:
+        scans: (N, >=3) finite x, y, z in metres, as they come.
+        mounting: axes or pose; its height does not matter. None: x forward, y left, z up.
+
+    Raises:
+        ScanError: no scan shows a clear ground, or the scans contradict each other; says how.
+    """
+    return estimate_named_height((NamedPoints(f"scan {n}", one) for n, one in enumerate(scans, start=1)), mounting)
+
+
+def estimate_named_height(
+    scans: Iterable[NamedPoints], mounting: Mounting | None = None, enough: int | None = None
+) -> HeightEstimate:
+    """As `estimate_height`, of scans with names, of which those after `enough` that show the ground are not read.
+
+    Raises:
+        ScanError: no scan shows a clear ground, or the scans contradict each other; names one.
+    """
+    level = (mounting or Mounting()).level
+    heights: dict[str, float] = {}
+    shares, left_out = [], []
+    for name, points in scans:
+        plane = fit_ground_plane(level.points(points))
+        doubt = "too few points near the sensor, or all on one line" if plane is None else plane.doubt
+        if plane is None or doubt:
+            left_out.append(f"{name}: {doubt}")
+            continue
+        heights[name] = plane.height_m
+        shares.append(plane.share)
+        if len(heights) == enough:
+            break
+    if not heights:
+        why = f"from {_first_of(left_out)}" if left_out else "without a scan"
+        raise ScanError(f"the sensor's height cannot be estimated {why}; {_BY_HAND}")
+    low, high = min(heights, key=heights.__getitem__), max(heights, key=heights.__getitem__)
+    spread = heights[high] - heights[low]
+    if spread > MAX_SPREAD_M:
+        raise ScanError(
+            f"{len(heights)} scans disagree by {spread:.2f} m on the sensor's height: {heights[low]:.2f} m in {low}, "
+            f"{heights[high]:.2f} m in {high}; {_BY_HAND}"
+        )
+    return HeightEstimate(float(np.median([*heights.values()])), spread, min(shares), len(heights), tuple(left_out))
+
+
+def _first_of(left_out: Sequence[str]) -> str:
+    return left_out[0] + (f" (and {len(left_out) - 1} more)" if left_out[1:] else "")
+
+
+def measured_mounting(
+    scans: Iterable[NDArray[Any]], mounting: Mounting | None = None
+) -> tuple[Mounting, HeightEstimate]:
+    """The mounting with the height in metres that its scans (N, >=3) show, see `estimate_height`."""
+    estimate = estimate_height(scans, mounting)
+    return replace(mounting or Mounting(), sensor_height_m=estimate.height_m), estimate
+
+
+def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
+    """The plane through most low points near the sensor: (N, >=3) level frame, metres; None: too few, or on a line.
+
+    One low point per square metre has a say, so that the dense rings near the sensor do not outvote the rest. The
+    draws are seeded: the same points give the same plane.
+    """
+    low = _low_points(points)
+    if len(low) < MIN_CELLS:
+        return None
+    if (plane := most_common_plane(low, BAND_M)) is None:
+        return None
+    above = low[:, 2] - plane_heights(plane, low)
+    tilt = float(np.degrees(np.arctan(np.hypot(*plane[:2]))))
+    share, below = float((np.abs(above) < BAND_M).mean()), float((above < -2 * BAND_M).mean())
+    x, y, z = (np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(1 + np.square(plane[:2]).sum())).tolist()
+    return GroundPlane(float(-plane[2]), tilt, share, below, len(low), (x, y, z))
+
+
+def _low_points(points: NDArray[Any]) -> NDArray[np.float64]:
+    """(C, 3) of each square metre near the sensor the point below which a tenth of its points lie."""
+    xyz = points[:, :3].astype(np.float64)
+    squared = np.square(xyz[:, :2]).sum(axis=1)
+    near = xyz[(squared > NEAR_M[0] ** 2) & (squared < NEAR_M[1] ** 2)]
+    column, row = np.floor(near[:, :2] / CELL_M).astype(np.int64).T
+    cells = 1000 * column + row
+    order = np.lexsort((near[:, 2], cells))
+    _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+    return near[order[(first + count // 10)[count >= 3]]]

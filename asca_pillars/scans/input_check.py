@@ -1,0 +1,306 @@
+"""How far a scan is from those of the training, and whether its axes lie as they should, with the option that mends it.
+
+A wrong reflectance scale, sensor height or axis ruins detection without any error; here it becomes a sentence.
+"""
+
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.detection.report import ScanCounts
+from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.mounting import Mounting
+
+_Floats: TypeAlias = NDArray[np.floating[Any]]
+
+OUTSIDE_SHARE = 0.95
+FAR_M, FAR_SHARE = 1000.0, 0.05
+"""A distance, metres, and the share of a LiDAR's points that may lie further away."""
+BEHIND_SHARE = 0.2
+"""Of the points beyond BODY_M: a revolution has about half of them behind its sensor, a view of 200 degrees a tenth."""
+BODY_M = 3.0
+"""Nearer returns are mostly those of the vehicle itself."""
+SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
+_FRAME_STEP = 2  # of the sample; angles and ranges take longer
+
+TOLERANCE_M = 0.5
+"""A ground further than this from where a detector expects it is another sensor height, not another road."""
+
+_SCALES = (100.0, 255.0, 65535.0)
+
+
+class InputWarning(NamedTuple):
+    """One way in which a scan is far from the training scans; `about` names the way, `text` is for people."""
+
+    about: str
+    text: str
+
+
+def check_input(
+    points: NDArray[np.float32],
+    counts: ScanCounts,
+    expected: ExpectedInput,
+    mounting: Mounting | None = None,
+    looks_in: Ranges | None = None,
+) -> list[InputWarning]:
+    """Compare a scan with the training scans, and with where the detector looks.
+
+    Args:
+        points: (N, 4) finite x, y, z in metres, model's frame, and reflectance.
+        counts: what became of them on the detector's grid.
+        expected: of the training scans.
+        mounting: by which they came into that frame.
+        looks_in: the detector's ranges; None: it looks in every direction.
+    """
+    mounting = mounting or Mounting()
+    fewest, most = expected.points_per_scan
+    if len(points) < fewest / 10:
+        text = f"{len(points)} points, the training scans had {fewest} to {most}"
+        return [InputWarning("points", text)]  # too few to say anything else
+    # Column by column in memory, which is how it is read: NumPy is slow along rows of four.
+    sample = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLE_POINTS)].T).T
+    if far := _far_warning(sample):
+        return [far]  # what the others would say follows from it
+    ground = ground_z_m(sample)
+    doubt = doubt_frame(sample[::_FRAME_STEP], ground)
+    warnings = [_reflectance_warning(sample[:, 3], expected)]
+    if doubt is not None:
+        warnings.append(InputWarning(doubt.about, f"{doubt.text}: {_axes_remedy(doubt.axes, mounting)}"))
+    if doubt is None or doubt.about not in ("upside down", "tilt"):  # then the height means nothing
+        warnings.append(_height_warning(ground, expected, mounting))
+    if counts.points_outside > OUTSIDE_SHARE * counts.points and doubt is None:
+        share = 100 * counts.points_outside / counts.points
+        text = (
+            f"{share:.1f} % of the points lie outside the grid, where x is forward, y left, z up, in metres: "
+            "state other axes (--axes)"
+        )
+        warnings.append(InputWarning("range", text))
+    elif looks_in is not None:
+        warnings.append(_behind_warning(sample[::_FRAME_STEP], looks_in))
+    return [warning for warning in warnings if warning]
+
+
+def _far_warning(sample: NDArray[np.float32]) -> InputWarning | None:
+    """Points that no LiDAR sees: their unit is not metres, or they lie in a map's frame."""
+    sideways = sample[:, :2]
+    share = np.count_nonzero((np.abs(sideways) > FAR_M).any(axis=1)) / len(sample)
+    if share <= FAR_SHARE:
+        return None
+    low, middle, high = np.percentile(sideways.astype(np.float64), (5, 50, 95), axis=0)
+    begins = f"{100 * share:.0f} % of the points lie more than {FAR_M / 1000:g} km away"
+    if np.abs(middle).max() > (high - low).max():
+        text = (
+            f"{begins}, around x = {middle[0]:.0f}, y = {middle[1]:.0f}: coordinates have to be those of the sensor's "
+            "frame, not of a map: subtract the sensor's position before they are stored as float32"
+        )
+    else:
+        text = f"{begins}: coordinates have to be in metres: divide millimetres by 1000, centimetres by 100"
+    return InputWarning("range", text)
+
+
+def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:
+    low, high = expected.reflectance_mean
+    largest, mean = float(reflectance.max()), float(reflectance.mean(dtype=np.float64))
+    if largest > 1.5:
+        scale = next((scale for scale in _SCALES if largest <= scale), _SCALES[-1])
+        text = (
+            f"reflectance reaches {largest:.4g}, the model was trained on 0..1: divide it by {scale:g} "
+            f"(--reflectance-scale {scale:g} for files)"
+        )
+        return InputWarning("reflectance", text)
+    if largest == 0 < low:
+        text = "the scan has no reflectance, all are 0: the model was trained with it, so export it with intensity"
+        return InputWarning("reflectance", text)
+    if not low / 3 <= mean <= high * 3:
+        text = (
+            f"mean reflectance is {mean:.3g}, in training it was {low:.3g} to {high:.3g}: rescale it to 0..1 "
+            "(--reflectance-scale for files)"
+        )
+        return InputWarning("reflectance", text)
+    return None
+
+
+def _height_warning(ground: float | None, expected: ExpectedInput, mounting: Mounting) -> InputWarning | None:
+    if ground is None or expected.ground_z_m is None:
+        return None
+    low, high = expected.ground_z_m
+    if low - TOLERANCE_M <= ground <= high + TOLERANCE_M:
+        return None
+    lifted_m = 0.0
+    if mounting.sensor_height_m is not None and expected.sensor_height_m is not None:
+        lifted_m = mounting.sensor_height_m - expected.sensor_height_m
+    height_m = lifted_m - ground + 0.0  # no -0
+    text = (
+        f"the ground near the sensor lies at z = {ground:.2f} m, in training at {low:.2f} to {high:.2f} m: "
+        f"state the height above the ground (--sensor-height {height_m:.2f} or auto)"
+    )
+    return InputWarning("height", text)
+
+
+def _behind_warning(points: NDArray[np.float32], looks_in: Ranges) -> InputWarning | None:
+    away = points[np.abs(points[:, :2]).max(axis=1) > BODY_M]
+    share = looks_in.behind(away).mean() if len(away) else 0.0
+    if share < BEHIND_SHARE or np.hypot(*_mean_direction(*away[:, :2].T)) >= _SECTOR_LENGTH:
+        return None
+    text = f"{share:.0%} of the points lie behind the sensor, where the model does not look: look around (--around)"
+    return InputWarning("view", text)
+
+
+def _axes_remedy(axes: str | None, mounting: Mounting) -> str:
+    if axes is None:
+        return "state how the sensor is tilted (--pose)"
+    if not mounting.level.is_identity:
+        return "check the axes or the pose that were given"
+    return f"if so, state the axes (--axes {axes})"
+
+
+_AXES = ("x,y,z", "y,-x,z", "-x,-y,z", "-y,x,z")
+"""Where forward and left are found in a scan whose own forward direction is that of the quadrant."""
+
+_EDGE_PERCENTILES = (5, 20, 80, 95)
+_SHARP_M = 0.5
+"""Between the outer two percentiles where the ground is: nothing lies beyond it. Walls and trees end gradually."""
+_GROUND_ABOVE_M = 1.0
+
+_SECTOR_LENGTH = 0.6
+"""Mean of the unit vectors towards the points: 0 for a whole revolution, 0.92 for a camera's view."""
+_MAX_OFF_AHEAD_DEG = 45.0
+
+_REACH_M = (3.0, 60.0)
+_GROUND_BAND_M = 0.75
+_HALF_WIDTH_DEG = 25.0
+_MIN_POINTS = 20
+_MIN_ALONG = 0.85
+"""Median range of the ground ahead and behind over that to the sides: one sees further along a street than across.
+None of 200 simulated whole revolutions falls below; turned by a quarter, 90 % of them do."""
+
+_MAX_TILT_DEG = 6.0
+_RING_M = (4.0, 20.0)
+"""Beyond the vehicle's own roof, before the beams become sparse."""
+_LOW_PERCENTILE = 10.0
+"""Below it lie ditches and reflections."""
+_MIN_GROUND_POINTS = 50
+
+
+class FrameDoubt(NamedTuple):
+    """What is odd about the axes: `about` names the kind, `axes` those that would mend it, if any would."""
+
+    about: str
+    text: str
+    axes: str | None
+
+
+def ground_z_m(points: NDArray[np.float32]) -> float | None:
+    """Height of the ground around the sensor, metres: a low percentile of z in a near ring of the points.
+
+    Takes finite points (N, >=3) in the LiDAR frame; None if the ring holds too few of them to tell.
+    """
+    x, y = points[:, 0], points[:, 1]
+    with np.errstate(over="ignore"):  # infinitely far is not near
+        squared_range = x * x + y * y
+    ring = np.flatnonzero((squared_range > _RING_M[0] ** 2) & (squared_range < _RING_M[1] ** 2))
+    near_z = points[:, 2].take(ring)
+    return _percentile(np.sort(near_z), _LOW_PERCENTILE) if len(near_z) >= _MIN_GROUND_POINTS else None
+
+
+def doubt_frame(points: NDArray[np.float32], ground_z_m: float | None) -> FrameDoubt | None:
+    """The first thing that is odd about the axes of a scan: z points down, turned axes, a tilt; None if nothing is.
+
+    What cannot be seen: a scan that is turned by half, a mirror image, and a quarter turn on a square or a crossing.
+
+    Args:
+        points: (N, >=3) finite x, y, z in metres, in what should be the LiDAR frame; some thousands are enough.
+        ground_z_m: height of the ground near the sensor, if it is seen.
+    """
+    x, y, z = points[:, :3].T
+    with np.errstate(over="ignore"):  # infinitely far is not near
+        radius = np.hypot(x, y)
+    near = (radius > _RING_M[0]) & (radius < _RING_M[1])
+    if doubt := _upside_down(z[near]):
+        return doubt
+    if doubt := _sector(x, y, radius):
+        return doubt
+    if ground_z_m is None:
+        return None
+    ground = (z < ground_z_m + _GROUND_BAND_M) & (radius > _REACH_M[0]) & (radius < _REACH_M[1])
+    if doubt := _across(radius[ground], _quadrants(x[ground], y[ground], _HALF_WIDTH_DEG)):
+        return doubt
+    return _tilted(z[near], radius[near], _quadrants(x[near], y[near], 45.0))
+
+
+def _upside_down(z: _Floats) -> FrameDoubt | None:
+    """The points end sharply above the sensor, as they do at the ground, and gradually below it."""
+    if len(z) < _MIN_POINTS:
+        return None
+    ordered = np.sort(z)
+    lowest, low, high, highest = (_percentile(ordered, percent) for percent in _EDGE_PERCENTILES)
+    if highest < _GROUND_ABOVE_M or highest - high > min(_SHARP_M, low - lowest):
+        return None
+    text = f"the points near the sensor end at z = {highest:.1f} m as at the ground: z may point down"
+    return FrameDoubt("upside down", text, "x,-y,-z")
+
+
+def _sector(x: _Floats, y: _Floats, radius: _Floats) -> FrameDoubt | None:
+    """The points fill a sector that is not ahead."""
+    away = radius > 0
+    if not away.any():
+        return None
+    mean_x, mean_y = _mean_direction(x[away], y[away])
+    middle_deg = float(np.degrees(np.arctan2(mean_y, mean_x)))
+    if np.hypot(mean_x, mean_y) < _SECTOR_LENGTH or abs(middle_deg) < _MAX_OFF_AHEAD_DEG:
+        return None
+    quadrant = round(middle_deg / 90) % 4
+    text = f"the points fill a sector about {middle_deg:+.0f} degrees, and ahead is 0: x may not be forward"
+    return FrameDoubt("axes", text, _AXES[quadrant])
+
+
+def _mean_direction(x: _Floats, y: _Floats) -> tuple[float, float]:
+    """Mean of the unit vectors towards points, (N,) each, none of them at the origin."""
+    with np.errstate(over="ignore"):  # infinitely far has no direction
+        radius = np.hypot(x, y)
+    return float((x / radius).mean()), float((y / radius).mean())
+
+
+def _across(radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> FrameDoubt | None:
+    """The ground is seen further to the sides than ahead and behind."""
+    reach = []
+    for quadrant in quadrants:
+        if np.count_nonzero(quadrant) < _MIN_POINTS:
+            return None
+        reach.append(_percentile(np.sort(radius[quadrant]), 50.0))
+    along, across = reach[0] + reach[2], reach[1] + reach[3]
+    if along >= _MIN_ALONG * across:
+        return None
+    text = f"the ground is seen {across / along:.1f} times as far to the sides as ahead and behind: y may be forward"
+    return FrameDoubt("axes", text, "y-forward")
+
+
+def _tilted(z: _Floats, radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> FrameDoubt | None:
+    """The ground falls from one side to the other by more than streets do."""
+    low = []
+    for quadrant in quadrants:
+        if np.count_nonzero(quadrant) < _MIN_POINTS:
+            return None
+        height = _percentile(np.sort(z[quadrant]), _LOW_PERCENTILE)
+        low.append((height, _percentile(np.sort(radius[quadrant & (z <= height)]), 50.0)))
+    along, across = ((low[a][0] - low[b][0]) / (low[a][1] + low[b][1]) for a, b in ((0, 2), (1, 3)))
+    tilt_deg = float(np.degrees(np.arctan(np.hypot(along, across))))
+    if tilt_deg < _MAX_TILT_DEG:
+        return None
+    return FrameDoubt("tilt", f"the ground near the sensor is tilted by {tilt_deg:.0f} degrees", None)
+
+
+def _quadrants(x: _Floats, y: _Floats, half_width_deg: float) -> list[NDArray[np.bool_]]:
+    """Which points lie within so many degrees, at most 45, of straight ahead, left, behind and right."""
+    slope = float(np.tan(np.radians(half_width_deg)))
+    along_x, along_y = np.abs(y) < slope * np.abs(x), np.abs(x) < slope * np.abs(y)
+    return [along_x & (x > 0), along_y & (y > 0), along_x & (x < 0), along_y & (y < 0)]
+
+
+def _percentile(ordered: _Floats, percent: float) -> float:
+    """`np.percentile` of ascending values (n,), n at least 1, which takes ten times as long for a thousand of them."""
+    place, part = divmod(percent / 100 * (len(ordered) - 1), 1)
+    low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])
+    return low + part * (high - low)

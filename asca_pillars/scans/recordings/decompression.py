@@ -1,0 +1,158 @@
+"""Decompression of recordings and of their chunks and messages, to no more than they state and than a limit.
+
+A few kilobytes can decompress to more than memory holds. The limit grows with the compressed size.
+"""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from rich.progress import Progress
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.recordings.recording import reason
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+ZSTD_SUFFIXES = (".zstd", ".zst")
+MAX_BYTES, MAX_RATIO = 2**27, 32
+"""A message or a chunk of messages unpacks to the larger one of so many bytes and so many times its own length."""
+MAX_FILE_BYTES, MAX_FILE_RATIO = 2**28, 100
+_BLOCK_BYTES = 2**20
+_SHOWN_BYTES = 2**28  # compressed files from this size on show their progress
+
+
+def decompress_file(source: Path) -> Path:
+    """Decompress a file of zstd into a temporary folder of its own, which the caller removes.
+
+    Returns:
+        path of the copy, which has the name of the file without its last suffix.
+
+    Raises:
+        ScanError: the file is damaged at its start, unpacks to too much, or the disk is full.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="asca-unpacked-"))
+    try:
+        _decompress_file(source, folder / source.stem)
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, ScanError) or not isinstance(error, Exception):
+            raise
+        if isinstance(error, OSError):
+            raise ScanError(
+                f"{source}: cannot be unpacked to {folder.parent} ({error.strerror}); set TMPDIR to a folder with room"
+            ) from None
+        raise ScanError(f"{source}: no readable file of zstd ({reason(error)}); copy or record it again") from None
+    return folder / source.stem
+
+
+def decompress_zstd(data: bytes, size: int | None = None) -> bytes:
+    """Decompress a frame of zstd.
+
+    Args:
+        data: the frame.
+        size: bytes that it must unpack to; None: as many as the frame says.
+
+    Raises:
+        ValueError: it says or unpacks to another size, or to too much.
+        Exception: it is damaged; zstandard has errors of its own.
+    """
+    from zstandard import ZstdDecompressor, frame_content_size
+
+    stated = frame_content_size(data)  # -1: unknown
+    expected = _checked(size if stated < 0 else stated, size, len(data))
+    if expected is not None:
+        return _whole(ZstdDecompressor().decompress(data, max_output_size=expected), expected)
+    with ZstdDecompressor().stream_reader(data) as stream:
+        return _within_limit(stream.read(_limit(len(data)) + 1), len(data))
+
+
+def decompress_lz4(data: bytes, size: int | None = None) -> bytes:
+    """Decompress a frame of LZ4; arguments and errors as `decompress_zstd`."""
+    from lz4.frame import LZ4FrameDecompressor
+
+    expected = _checked(size, size, len(data))
+    unpacker = LZ4FrameDecompressor()
+    return _ended(unpacker, unpacker.decompress(data, (expected or _limit(len(data))) + 1), expected, len(data))
+
+
+def decompress_bz2(data: bytes) -> bytes:
+    """Decompress a stream of bzip2; errors as `decompress_zstd`."""
+    from bz2 import BZ2Decompressor
+
+    unpacker = BZ2Decompressor()
+    return _ended(unpacker, unpacker.decompress(data, _limit(len(data)) + 1), None, len(data))
+
+
+def _ended(unpacker: object, unpacked: bytes, expected: int | None, packed_bytes: int) -> bytes:
+    _within_limit(unpacked, packed_bytes)
+    if expected is not None:
+        _whole(unpacked, expected)
+    if not getattr(unpacker, "eof", False):
+        raise ValueError("the end is missing")
+    return unpacked
+
+
+def _limit(packed_bytes: int) -> int:
+    return max(MAX_BYTES, MAX_RATIO * packed_bytes)
+
+
+def _checked(stated: int | None, size: int | None, packed_bytes: int) -> int | None:
+    """The stated size; ValueError if it is not that, or too much."""
+    if size is not None and stated != size:
+        raise ValueError(f"{stated} bytes where {size} are stated")
+    if stated is not None and stated > _limit(packed_bytes):
+        raise ValueError(f"{packed_bytes} bytes state that they unpack to {stated}, at most {_limit(packed_bytes)} are")
+    return stated
+
+
+def _whole(unpacked: bytes, expected: int) -> bytes:
+    if len(unpacked) != expected:
+        raise ValueError(f"{len(unpacked)} bytes or more where {expected} are stated")
+    return unpacked
+
+
+def _within_limit(unpacked: bytes, packed_bytes: int) -> bytes:
+    if len(unpacked) > _limit(packed_bytes):
+        raise ValueError(f"{packed_bytes} bytes unpack to more than {_limit(packed_bytes)}")
+    return unpacked
+
+
+def _decompress_file(source: Path, target: Path) -> None:
+    """Decompress as much as is whole: whoever reads the copy says what is missing from its end."""
+    from zstandard import ZstdDecompressor, ZstdError, frame_content_size
+
+    packed_bytes = source.stat().st_size
+    limit = max(MAX_FILE_BYTES, MAX_FILE_RATIO * packed_bytes)
+    with source.open("rb") as packed, target.open("wb") as unpacked:
+        stated = frame_content_size(packed.read(18))  # the longest header of a frame
+        _refuse_file(source, stated, limit)
+        room = shutil.disk_usage(target.parent).free
+        if stated > room:
+            raise ScanError(
+                f"{source}: unpacks to {stated} bytes, and {target.parents[1]} has room for {room}; "
+                "set TMPDIR to a folder with more"
+            )
+        packed.seek(0)
+        written = 0
+        with (
+            Progress(transient=True, disable=packed_bytes < _SHOWN_BYTES) as progress,
+            ZstdDecompressor().stream_reader(packed, read_across_frames=True, closefd=False) as stream,
+        ):
+            task = progress.add_task(f"Unpacking {source.name}", total=packed_bytes)
+            try:
+                while block := stream.read(_BLOCK_BYTES):
+                    written += len(block)
+                    _refuse_file(source, written, limit)
+                    unpacked.write(block)
+                    progress.update(task, completed=packed.tell())
+            except ZstdError:
+                if not written:
+                    raise
+
+
+def _refuse_file(source: Path, size: int, limit: int) -> None:
+    if size > limit:
+        raise ScanError(
+            f"{source}: unpacks to more than {limit} bytes, {MAX_FILE_RATIO} times its size or more; if that is right, "
+            "unpack it yourself (zstd -d) and give the result"
+        )

@@ -1,0 +1,38 @@
+"""Messages of standard ROS types as objects, by the library rosbags."""
+
+from functools import cache
+from typing import Any
+
+from asca_pillars.scans.recordings.decompression import ZSTD_MAGIC, decompress_zstd
+from asca_pillars.scans.recordings.recording import Encoding, Message
+
+
+def decoded(message: Message, kind: str) -> Any:
+    """A stored message of a type such as sensor_msgs/msg/PointCloud2, by ROS' own definitions.
+
+    Raises:
+        Exception: it is damaged; the library lets struct's and NumPy's errors pass.
+    """
+    store = _typestore(message.encoding)
+    if message.encoding == "ros1":
+        return store.deserialize_ros1(message.data, kind)
+    # No CDR begins so. rosbag2 says in its metadata.yaml alone that it compressed the messages.
+    is_compressed = message.data.startswith(ZSTD_MAGIC)
+    return store.deserialize_cdr(decompress_zstd(message.data) if is_compressed else message.data, kind)
+
+
+def time_of(header: Any, message: Message) -> int | None:
+    """When a message was measured, nanoseconds: by its header, or where that says 0 or less when it was recorded.
+
+    None if neither is known.
+    """
+    time_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    return time_ns if time_ns > 0 else message.recorded_ns
+
+
+@cache
+def _typestore(encoding: Encoding) -> Any:
+    """The standard definitions; those types that are read here have not changed since ROS 1."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)

@@ -1,0 +1,85 @@
+"""Where the car was at a time: the poses of a recording's nav_msgs/Odometry."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.geometry.rotations import of_quaternions
+from asca_pillars.scans.recordings.messages import decoded, time_of
+from asca_pillars.scans.recordings.recording import Recording, reason
+
+_Doubles = NDArray[np.float64]
+
+ODOMETRY_TYPES = ("nav_msgs/msg/Odometry", "nav_msgs/Odometry")
+
+_TOO_LARGE = 1e9  # of any number, metres: no map is a million kilometres wide
+
+BEYOND_NS = 200_000_000
+"""How long before the first and after the last pose a scan may be: as long as two at 10 Hz."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """N poses in the order of their times: of the odometry's child frame in a frame that stands still."""
+
+    times_ns: NDArray[np.int64]
+    """(N,) ascending."""
+    positions_m: _Doubles
+    """(N, 3)."""
+    quaternions: _Doubles
+    """(N, 4) w, x, y, z of length 1, each the nearer one of two to that before."""
+
+    def covers(self, time_ns: int) -> bool:
+        """Whether a time lies between the first and the last pose, or hardly beyond."""
+        return bool(self.times_ns[0] - BEYOND_NS <= time_ns <= self.times_ns[-1] + BEYOND_NS)
+
+    def at(self, time_ns: int) -> _Doubles:
+        """The (4, 4) matrix, metres, at a time: between two poses by their shares, before and after all the nearest."""
+        after = int(np.clip(np.searchsorted(self.times_ns, time_ns), 1, max(len(self.times_ns) - 1, 1)))
+        before = min(after - 1, len(self.times_ns) - 1)
+        after = min(after, len(self.times_ns) - 1)
+        span = int(self.times_ns[after] - self.times_ns[before])
+        share = float(np.clip((time_ns - int(self.times_ns[before])) / span, 0.0, 1.0)) if span else 0.0
+        matrix = np.eye(4)
+        matrix[:3, 3] = (1 - share) * self.positions_m[before] + share * self.positions_m[after]
+        turn = (1 - share) * self.quaternions[before] + share * self.quaternions[after]
+        matrix[:3, :3] = of_quaternions(turn)
+        return matrix
+
+
+def read_poses(recording: Recording, topic: str) -> Poses:
+    """All poses of a topic.
+
+    Raises:
+        ScanError: there is no such topic, it holds something else, or none of its poses can be used.
+    """
+    kinds = {one.name: one.type for one in recording.topics}
+    if kinds.get(topic) not in ODOMETRY_TYPES:
+        there = ", ".join(name for name, kind in kinds.items() if kind in ODOMETRY_TYPES) or "no such topic"
+        raise ScanError(f"{recording.path}: {topic[:80]} holds no nav_msgs/msg/Odometry; there is {there}")
+    rows, trouble = [], "no message"
+    for message in recording.messages(topic):
+        try:
+            odometry = decoded(message, ODOMETRY_TYPES[0])
+        except Exception as error:  # the library lets struct's errors pass
+            trouble = reason(error)
+            continue
+        pose, time_ns = odometry.pose.pose, time_of(odometry.header, message)
+        place, turn = pose.position, pose.orientation
+        row = [place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]
+        if time_ns is None:
+            trouble = "no usable time stamp"
+        elif (np.abs(row) < _TOO_LARGE).all() and np.linalg.norm(row[3:]) > 0.5:  # not of NaN
+            rows.append((time_ns, row))
+        else:
+            trouble = "a pose that is not finite or too far away, or no rotation"
+    if not rows:
+        raise ScanError(f"{recording.path}, {topic}: no pose can be used ({trouble}); leave --odometry out")
+    rows.sort(key=lambda row: row[0])
+    values = np.array([row for _, row in rows])
+    turns = values[:, 3:] / np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    flips = np.cumprod(np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0, -1.0, 1.0))
+    turns[1:] *= flips[:, None]
+    return Poses(np.array([time for time, _ in rows]), values[:, :3], turns)

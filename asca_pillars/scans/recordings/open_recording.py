@@ -1,0 +1,119 @@
+"""Which paths are recordings, and opening them."""
+
+import shutil
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.base.input_files import require_content
+from asca_pillars.scans.find_scans import is_scan, natural_order, visible_files
+from asca_pillars.scans.recordings.decompression import ZSTD_SUFFIXES, decompress_file
+from asca_pillars.scans.recordings.mcap_files import McapRecording
+from asca_pillars.scans.recordings.recording import Recording
+from asca_pillars.scans.recordings.ros_bags import RosBag
+from asca_pillars.scans.recordings.rosbag2 import METADATA_FILE, BagMetadata, SplitRecording, read_metadata
+from asca_pillars.scans.recordings.sqlite_files import SqliteRecording
+
+_READERS: dict[str, Callable[[Path, Path | None], Recording]] = {
+    ".mcap": McapRecording,
+    ".db3": SqliteRecording,
+    ".bag": RosBag,
+}
+RECORDING_SUFFIXES = tuple(_READERS)
+_ROSBAG2_SUFFIXES = (".mcap", ".db3")
+
+
+def is_recording(path: Path) -> bool:
+    """Whether it is a recording by its name: a file, or a folder with the metadata.yaml or the files of rosbag2."""
+    if path.is_dir():
+        return read_metadata(path) is not None or bool(_files(path))
+    return _recorded_suffix(path) in RECORDING_SUFFIXES
+
+
+def recording_files(path: Path) -> list[Path]:
+    """The files that a recording consists of, sorted; a folder may hold others, such as results."""
+    if not path.is_dir():
+        return [path]
+    names = METADATA_FILE, *(f"*{suffix}*" for suffix in _ROSBAG2_SUFFIXES)  # compressed ones have two suffixes
+    return sorted(file for name in names for file in visible_files(path, name) if file.is_file())
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a recording.
+
+    Raises:
+        ScanError: nothing is there, it cannot be read, or it lies among scans.
+    """
+    if not path.exists():
+        raise ScanError(f"{path}: no such file or folder; check the path")
+    if not path.is_dir():
+        return _open_file(path)
+    files, metadata = _files(path), read_metadata(path)
+    if metadata is not None:
+        return _open_rosbag2(path, files, metadata)
+    if scan := next((file for file in sorted(path.iterdir()) if is_scan(Path(file.name))), None):
+        raise ScanError(f"{path}: holds {files[0].name} and scans such as {scan.name}; give one or the other")
+    if len(files) > 1:
+        raise ScanError(
+            f"{path}: {len(files)} recordings, and no {METADATA_FILE} that would make one of them; give one of them"
+        )
+    return _open_file(files[0])
+
+
+def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata) -> Recording:
+    """The files that are listed, or all if none of them is there; what is wrong with some does not lose the others."""
+    by_name = {_unpacked_name(path.name): path for path in there}
+    listed = {name: by_name.get(_unpacked_name(name)) for name in metadata.files}
+    troubles = [f"{folder}: {name} is missing" for name, file in listed.items() if file is None]
+    if len(troubles) == len(listed):
+        troubles, listed = [], {file.name: file for file in there}
+    recordings = []
+    for file in filter(None, listed.values()):
+        try:
+            recordings.append(_open_file(file))
+        except ScanError as error:
+            troubles.append(str(error))
+    if not recordings:
+        missing = f"{folder}: none of its recording's files is there ({', '.join(metadata.files)[:80]})"
+        raise ScanError(troubles[0] if troubles else f"{missing}; copy the whole folder")
+    return SplitRecording(folder, recordings, metadata.counts, troubles[0] if troubles else None)
+
+
+def _open_file(path: Path) -> Recording:
+    require_content(path, ScanError)
+    try:
+        if path.stat().st_size == 0:
+            raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
+        reader = _READERS[_recorded_suffix(path)]
+        if path.suffix.lower() not in ZSTD_SUFFIXES:
+            return reader(path, None)
+        copy = decompress_file(path)
+        try:
+            recording = reader(path, copy)
+        except BaseException:
+            shutil.rmtree(copy.parent, ignore_errors=True)
+            raise
+    except OSError as error:
+        raise ScanError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
+    weakref.finalize(recording, shutil.rmtree, copy.parent, ignore_errors=True)
+    return recording
+
+
+def _recorded_suffix(path: Path) -> str:
+    """The suffix of a file, or if it is compressed the one before."""
+    return Path(_unpacked_name(path.name)).suffix.lower()
+
+
+def _unpacked_name(name: str) -> str:
+    """The name of a file without the suffix of its compression."""
+    return Path(name).stem if Path(name).suffix.lower() in ZSTD_SUFFIXES else name
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of rosbag2 in a folder, in natural order; of a compressed one and its unpacked copy the latter."""
+    found = [file for suffix in _ROSBAG2_SUFFIXES for file in visible_files(folder, f"*{suffix}*")]
+    found = [file for file in found if _recorded_suffix(file) in _ROSBAG2_SUFFIXES and not file.is_dir()]
+    plain = {file.name for file in found if file.name == _unpacked_name(file.name)}
+    chosen = {file for file in found if file.name in plain or _unpacked_name(file.name) not in plain}
+    return sorted(chosen, key=lambda file: natural_order(Path(file.name)))

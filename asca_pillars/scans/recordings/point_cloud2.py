@@ -1,0 +1,84 @@
+"""ROS' sensor_msgs/PointCloud2: points of any field layout, byte order and padding."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.recordings.messages import decoded, time_of
+from asca_pillars.scans.recordings.recording import Message, reason
+from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, wanted_fields
+
+# sensor_msgs/PointField: datatype 1 to 8.
+_DATATYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+
+
+class PointCloud(NamedTuple):
+    """The points of a message, when they were measured, and in which frame."""
+
+    points: StoredPoints
+    time_ns: int
+    """The header's time, or if that is 0 or less the recording's; 0, with a remark, if neither is usable."""
+    frame_id: str
+
+
+def read_point_cloud(message: Message, source: str) -> PointCloud:
+    """The points of a stored message.
+
+    Args:
+        message: of a topic of this type.
+        source: names it in errors.
+
+    Raises:
+        ScanError: the message is damaged or contradicts itself, or has no x, y and z.
+    """
+    if not message.data:
+        raise ScanError(f"{source}: the message has no data; record it again")
+    try:
+        cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
+    except Exception as error:  # the library lets struct's and NumPy's errors pass
+        raise ScanError(f"{source}: no readable PointCloud2 ({reason(error)}); record it again") from None
+    points, time_ns = _points(cloud, source), time_of(cloud.header, message)
+    if time_ns is None:
+        said = "neither the header nor the recording has a usable time stamp, it was taken as 0"
+        points, time_ns = points._replace(remarks=(*points.remarks, said)), 0
+    return PointCloud(points, time_ns, str(cloud.header.frame_id))
+
+
+def _points(cloud: Any, source: str) -> StoredPoints:
+    height, width, step, row_step = int(cloud.height), int(cloud.width), int(cloud.point_step), int(cloud.row_step)
+    count, data = height * width, np.asarray(cloud.data, np.uint8)
+    if count > MAX_POINTS:
+        raise ScanError(f"{source}: {count} points are more than {MAX_POINTS}; record single scans")
+    fields, offsets = [], []
+    for field in cloud.fields:
+        if not 1 <= field.datatype <= len(_DATATYPES):
+            raise ScanError(f"{source}: field {field.name[:40]} has datatype {field.datatype}; there are 1 to 8")
+        order = ">" if cloud.is_bigendian else "<"
+        # Some drivers write a count of 0 for single values.
+        fields.append(
+            Field(str(field.name), np.dtype(order + _DATATYPES[field.datatype - 1]), max(int(field.count), 1))
+        )
+        offsets.append(int(field.offset))
+    wanted = wanted_fields(source, fields)
+    for index in wanted:
+        if offsets[index] + fields[index].size_bytes > step:
+            raise ScanError(
+                f"{source}: field {fields[index].name} at byte {offsets[index]} lies beyond the points' {step} bytes"
+            )
+    chosen = [fields[index] for index in wanted]
+    if not count:
+        return assemble_points(0, [np.zeros(0, field.dtype) for field in chosen], chosen)
+    if height == 1 or len(data) == count * step:
+        row_step = width * step  # there is no padding, whatever drivers write here: the whole cloud, the width, 0
+    # The last row may come without its padding.
+    if row_step < width * step or len(data) < (height - 1) * row_step + width * step:
+        raise ScanError(
+            f"{source}: {len(data)} bytes where {height} x {width} points of {step} bytes in rows of {row_step} "
+            "need more; record it again"
+        )
+    columns = []
+    for index in wanted:
+        view = np.ndarray((height, width), fields[index].dtype, data, offsets[index], (row_step, step))
+        columns.append(view.reshape(-1))
+    return assemble_points(count, columns, chosen)

@@ -1,0 +1,123 @@
+"""What all kinds of recordings have in common: topics, and the messages of one of them."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.recordings.scan_types import conversion_of
+
+Encoding = Literal["cdr", "ros1"]
+"""How a message's fields are written: ROS 2's CDR or ROS 1's own."""
+
+
+UNKNOWN_TYPE = "unknown"
+"""The type of a topic without a schema."""
+SEVERAL_TYPES = "several types"
+LAST_NS = 2**63 - 1
+"""The latest time that is usable: in 2262."""
+
+
+class Topic(NamedTuple):
+    """A topic, the type of its messages as ROS writes it, and how many there are."""
+
+    name: str
+    type: str
+    messages: int
+
+    @property
+    def is_point_cloud(self) -> bool:
+        """Whether it holds scans: `sensor_msgs/msg/PointCloud2`, or as ROS 1 writes it."""
+        return self.type in ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
+
+
+class Message(NamedTuple):
+    """A message as it is stored, and when it was recorded, nanoseconds; None where no usable time is stored."""
+
+    recorded_ns: int | None
+    data: bytes
+    encoding: Encoding
+
+
+class Recording(ABC):
+    """One recording. It is read from the start each time.
+
+    Attributes:
+        path: the file or folder.
+        topics: all of them, by name.
+        damage: what the last call of `messages` lacked, or before the first one the list of topics, and where; None:
+            nothing.
+    """
+
+    path: Path
+    topics: Sequence[Topic]
+    damage: str | None = None
+
+    @abstractmethod
+    def messages(self, topic: str) -> Iterator[Message]:
+        """The messages of a topic in the order of their times; a damaged recording ends early (`damage`)."""
+
+    def point_cloud_topic(self, wanted: str | None = None) -> Topic:
+        """The topic of that name, or the only one that holds scans.
+
+        Raises:
+            ScanError: there is none, it holds something else, or there are several; names all that are there.
+        """
+        clouds = [topic for topic in self.topics if topic.is_point_cloud]
+        if wanted is not None:
+            named = [topic for topic in self.topics if topic.name == wanted]
+            if not named:
+                lost = f"; {self.damage}" if self.damage else ""
+                raise ScanError(f"{self.path}: no topic {wanted[:80]}; there are {listed(self.topics)}{lost}")
+            if not named[0].is_point_cloud and named[0].type != UNKNOWN_TYPE:
+                held = f"{self.path}: {wanted} holds {named[0].type}"
+                if conversion := conversion_of(named[0].type):
+                    raise ScanError(f"{held}, a type of scans that is not read: {conversion}")
+                remedy = f"choose one of {listed(clouds)}" if clouds else self._remedy(self.topics)
+                raise ScanError(f"{held}, not scans (sensor_msgs/msg/PointCloud2); {remedy}")
+            return named[0]
+        filled = [topic for topic in clouds if topic.messages] or clouds
+        if not filled:
+            none = f"no topic of type sensor_msgs/msg/PointCloud2; there are {listed(self.topics)}"
+            if self.damage:
+                raise ScanError(f"{self.damage}; in what can be read {none}: copy or record it again")
+            raise ScanError(f"{self.path}: {none}: {self._remedy(self.topics)}")
+        if len(filled) > 1:
+            raise ScanError(f"{self.path}: several topics hold scans, give --topic: {listed(filled)}")
+        return filled[0]
+
+    def _remedy(self, topics: Sequence[Topic]) -> str:
+        """The advice where none of these topics is read."""
+        for topic in topics:
+            if conversion := conversion_of(topic.type):
+                return f"the scans are recorded as {topic.type}, which is not read: {conversion}"
+        if unknown := [topic for topic in topics if topic.type == UNKNOWN_TYPE]:
+            return f"if one of unknown type holds PointCloud2, name it (--topic {unknown[0].name})"
+        return "record the scans, too"
+
+
+def listed(topics: Sequence[Topic]) -> str:
+    """The topics with their types and counts, in one line."""
+    return ", ".join(f"{topic.name} ({topic.type}, {topic.messages})" for topic in topics) or "none"
+
+
+def merged(topics: Iterable[Topic]) -> list[Topic]:
+    """Topics by name, those of one name as one with all their messages."""
+    by_name: dict[str, list[Topic]] = {}
+    for topic in topics:
+        by_name.setdefault(topic.name, []).append(topic)
+    return [
+        Topic(name, _common_type(same), sum(topic.messages for topic in same)) for name, same in sorted(by_name.items())
+    ]
+
+
+def _common_type(topics: Sequence[Topic]) -> str:
+    types = {topic.type for topic in topics} - {UNKNOWN_TYPE}
+    return SEVERAL_TYPES if len(types) > 1 else next(iter(types), UNKNOWN_TYPE)
+
+
+def reason(error: Exception) -> str:
+    """An error of a library in one short line."""
+    name = "" if type(error) is ValueError else type(error).__name__
+    return " ".join(f"{name} {error}".split())[:100]

@@ -1,0 +1,127 @@
+"""Point records with named fields, which the PCD and PLY formats share once their headers are read."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ScanError
+
+AGAIN = "the file is damaged or incomplete: copy or export it again"
+MAX_HEADER_BYTES = 65_536
+MAX_POINTS = 50_000_000
+"""Points that a file may hold; ten times what the densest sensors give in a second."""
+
+_REFLECTANCE = ("intensity", "reflectance", "reflectivity", "i")
+_DIGITS = re.compile(r"[0-9]{1,18}")
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of one point: `count` values of `dtype`, in the file's byte order and without padding."""
+
+    name: str
+    dtype: np.dtype[np.generic]
+    count: int = 1
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the whole field in one point."""
+        return self.dtype.itemsize * self.count
+
+
+class StoredPoints(NamedTuple):
+    """What a file holds: `xyz` (N, 3) float32 in m, `reflectance` (N,) of any scale, or None if there is none.
+
+    `dtype` is the type that the file declares for the reflectance, and `remarks` say what the reader had to decide.
+    """
+
+    xyz: NDArray[np.float32]
+    reflectance: NDArray[np.generic] | None
+    dtype: np.dtype[np.generic] | None
+    remarks: tuple[str, ...] = ()
+
+
+def whole_number(word: str) -> int | None:
+    """The number that a word writes in decimal digits; None if it is anything else, or absurdly long."""
+    return int(word) if _DIGITS.fullmatch(word) else None
+
+
+def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field], count: int) -> StoredPoints:
+    """The `count` points of the lines of an ASCII body: one point a line, `fields` after `fields`.
+
+    Raises:
+        ScanError: lines are missing, not as long as the fields, or not of numbers; or there is no x, y and z.
+    """
+    wanted, width = wanted_fields(source, fields), sum(field.count for field in fields)
+    if len(lines) < count:
+        raise ScanError(f"{source}: {len(lines)} lines where {count} points need {count}; {AGAIN}")
+    rows = [line.split() for line in lines[:count]]
+    # Joined without a look at the lines, one value too few would shift all later ones into other columns.
+    for number, row in enumerate(rows):
+        if len(row) != width:
+            raise ScanError(f"{source}: point {number} has {len(row)} values where the fields need {width}; {AGAIN}")
+    if any(b"_" in line for line in lines[:count]):  # Python takes 1_000 for a number
+        raise ScanError(f"{source}: a point has a word with _ in it, no number; {AGAIN}")
+    try:
+        table = np.array(rows, dtype=np.float64).reshape(count, width)
+    except ValueError as error:
+        raise ScanError(f"{source}: {error}; {AGAIN}") from error
+    starts = np.cumsum([0] + [field.count for field in fields])
+    return assemble_points(count, [table[:, starts[index]] for index in wanted], [fields[index] for index in wanted])
+
+
+def points_from_bytes(
+    source: str, data: bytes | bytearray, fields: Sequence[Field], count: int, *, by_field: bool = False
+) -> StoredPoints:
+    """The `count` points of a binary body: point after point, or (`by_field`) field after field.
+
+    Raises:
+        ScanError: the body is shorter than `count` points, or the fields hold no x, y and z.
+    """
+    wanted, size = wanted_fields(source, fields), sum(field.size_bytes for field in fields)
+    if len(data) < count * size:
+        raise ScanError(f"{source}: {len(data)} bytes where {count} points need {count * size}; {AGAIN}")
+    raw = np.frombuffer(data, dtype=np.uint8, count=count * size)
+    columns = []
+    for index in wanted:
+        start, field = sum(f.size_bytes for f in fields[:index]), fields[index]
+        if by_field:
+            column = raw[start * count : (start + field.size_bytes) * count]
+        else:
+            column = np.ascontiguousarray(raw.reshape(count, size)[:, start : start + field.size_bytes])
+        columns.append(column.reshape(-1).view(field.dtype))
+    return assemble_points(count, columns, [fields[index] for index in wanted])
+
+
+def wanted_fields(source: str, fields: Sequence[Field]) -> list[int]:
+    """Indices of x, y, z and, where there is one, the reflectance. CloudCompare writes scalar_Intensity.
+
+    Raises:
+        ScanError: a coordinate is missing, or one of them is there twice or has several values per point.
+    """
+    names = [field.name.lower().removeprefix("scalar_") for field in fields]
+    if missing := [name for name in "xyz" if name not in names]:
+        raise ScanError(
+            f"{source}: no field {', '.join(missing)} among {', '.join(names) or 'none'}; export x, y and z"
+        )
+    wanted = [names.index(name) for name in "xyz"]
+    wanted += [names.index(name) for name in _REFLECTANCE if name in names][:1]
+    for index in wanted:
+        if fields[index].count != 1:
+            raise ScanError(f"{source}: {names[index]} has {fields[index].count} values per point; export one")
+        if names.count(names[index]) > 1:
+            raise ScanError(f"{source}: there are {names.count(names[index])} fields {names[index]}; export one")
+    return wanted
+
+
+def assemble_points(count: int, columns: Sequence[NDArray[np.generic]], fields: Sequence[Field]) -> StoredPoints:
+    """Points of columns (N,) x, y, z in metres and perhaps reflectances, with the field of each."""
+    xyz = np.zeros((count, 3), dtype=np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis, column in enumerate(columns[:3]):
+            xyz[:, axis] = column
+    return StoredPoints(xyz, columns[3], fields[3].dtype) if len(columns) > 3 else StoredPoints(xyz, None, None)

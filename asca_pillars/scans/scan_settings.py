@@ -1,0 +1,105 @@
+"""How scan files are read and where their sensor sat: the options of commands and the keys of a dataset.yaml, alike."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError, ScanError
+from asca_pillars.base.strict import Strict
+from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints, estimate_named_height
+from asca_pillars.scans.mounting import Mounting, read_pose, refuse_axes_beside_pose
+from asca_pillars.scans.scan_reader import ReflectanceScale
+
+FEWEST_COLUMNS = 3
+SAMPLE_SCANS = 8  # that show the ground: a height of "auto" is their median
+SEARCHED_SCANS = 32  # that are looked at for them
+
+
+@dataclass(frozen=True)
+class ScanSettings(Strict):
+    """What a scan file does not say of itself.
+
+    Attributes:
+        sensor_height: metres above the ground of the scans' origin, after `axes` or `pose`; "auto": estimated from the
+            scans. None: as high as in the training.
+        axes: as `Mounting.axes`.
+        pose: file with a 4x4 matrix, instead of axes (`mounting.read_pose`).
+        reflectance_scale: the stored value that is a reflectance of 1; "auto": by the values.
+        columns: float32 values per point of a .bin; None: four or five, by the values.
+
+    Raises:
+        ConfigError: a value that cannot be used.
+    """
+
+    sensor_height: float | Literal["auto"] | None = None
+    axes: str = "x-forward"
+    pose: str | None = None
+    reflectance_scale: ReflectanceScale = "auto"
+    columns: int | None = None
+
+    def __post_init__(self) -> None:
+        Mounting(self._stated_height_m, self.axes)  # refuses what it cannot use
+        if self.pose is not None:
+            refuse_axes_beside_pose(self.axes)
+        if self.columns is not None and self.columns < FEWEST_COLUMNS:
+            raise ConfigError(f"columns {self.columns}: a .bin has at least x, y and z; give {FEWEST_COLUMNS} or more")
+        if self.reflectance_scale != "auto" and not 0 < self.reflectance_scale < inf:
+            raise ConfigError(f"reflectance_scale {self.reflectance_scale:g}: must be positive, such as 255, or auto")
+
+    def stated_mounting(self, folder: Path | None = None) -> Mounting:
+        """The mounting as far as it is stated: an "auto" height is left open.
+
+        Args:
+            folder: that a relative `pose` is looked for in; None: the working directory.
+
+        Raises:
+            ConfigError: the pose cannot be read, or does not go with the axes.
+        """
+        pose = None if self.pose is None else read_pose((folder or Path()) / self.pose)
+        return Mounting(self._stated_height_m, self.axes, pose)
+
+    def mounting(
+        self, samples: Iterable[NamedPoints], folder: Path | None = None
+    ) -> tuple[Mounting, HeightEstimate | None]:
+        """The mounting, and how a height of "auto" was estimated; None if it was stated.
+
+        Args:
+            samples: some scans; only looked at where the height is "auto", and then until enough show the ground.
+            folder: as for `stated_mounting`.
+
+        Raises:
+            ConfigError: as `stated_mounting`.
+            ScanError: the height cannot be estimated.
+        """
+        stated = self.stated_mounting(folder)
+        if self.sensor_height != "auto":
+            return stated, None
+        estimate = estimate_named_height(samples, stated, SAMPLE_SCANS)
+        return replace(stated, sensor_height_m=estimate.height_m), estimate
+
+    @property
+    def _stated_height_m(self) -> float | None:
+        return None if self.sensor_height == "auto" else self.sensor_height
+
+
+def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NamedPoints]:
+    """Up to SEARCHED_SCANS scans but those unreadable or empty: SAMPLE_SCANS evenly spaced ones, then those between.
+
+    Args:
+        paths: of all scans.
+        read: points (N, >=3), metres, of one of them; ScanError if it cannot be read.
+    """
+    step = max(-(-len(paths) // SAMPLE_SCANS), 1)
+    order = [path for first in range(step) for path in paths[first::step]]
+    for path in order[:SEARCHED_SCANS]:
+        try:
+            points = read(path)
+        except ScanError:
+            continue  # named when its turn comes
+        if len(points):
+            yield NamedPoints(str(path), points)

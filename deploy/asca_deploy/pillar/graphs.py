@@ -1,0 +1,85 @@
+"""The graphs of a pillar bundle: what they take and give, by name, and how they are opened."""
+
+from pathlib import Path
+
+from asca_deploy import providers
+from asca_deploy.bundle import ENCODER, NECK, PillarBundle
+from asca_deploy.graph import Interface, Session, Tensor, check_interface
+from asca_pillars.base.errors import ProviderError
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.ops.pillar.neck_rulebooks import LEVELS, SAME
+from asca_pillars.ops.pillar.prepare import FEATURES
+
+PILLAR_FEATURES = "pillar_features"
+"""What encoder.onnx gives; the backbone of a sparse neck takes it under the same name."""
+
+_NO_SPARSE_NECK = {
+    "openvino": "it needs outputs of fixed shapes",
+    "tensorrt": "it would build another engine for every number of pillars",
+}
+_DENSE_FORMS = {
+    "pillar": ", or what `asca export SOURCE --dense-neck` writes of the checkpoint, or of asca_sim",
+    "pillar_refine": "",
+}
+"""Of each kind, which bundles besides."""
+
+
+def encoder_interface(bundle: PillarBundle) -> Interface:
+    """Of encoder.onnx: features of M points in P pillars -> features of the pillars."""
+    inputs = {
+        "features": Tensor("float32", (None, len(FEATURES))),
+        "pillar_index": Tensor("int64", (None,)),
+        "point_counts": Tensor("int64", (None,)),
+    }
+    return inputs, {PILLAR_FEATURES: Tensor(bundle.pillar.canvas.type, (None, bundle.pillar.channels))}
+
+
+def output_channels(bundle: PillarBundle, neck_channels: int = 0) -> dict[str, int]:
+    """Of backbone.onnx; with `neck_channels` also those of NECK."""
+    anchors = bundle.spec.anchors.shape[2]
+    counts = (bundle.spec.scores_per_anchor * anchors, 7 * anchors, 2 * anchors)
+    channels = dict(zip(HeadMaps._fields, counts, strict=True))
+    return {**channels, NECK: neck_channels} if neck_channels else channels
+
+
+def backbone_interface(bundle: PillarBundle, neck_channels: int = 0, neck_type: str = "float32") -> Interface:
+    """Of backbone.onnx: a pseudo-image -> maps, channels last; with a sparse neck rows and tables -> rows.
+
+    NECK is float32, or the uint8 steps of an 8-bit neck, which refine.onnx scales: `neck_type`.
+    """
+    section, channels = bundle.pillar, output_channels(bundle, neck_channels)
+    types = dict.fromkeys(channels, "float32") | {NECK: neck_type}
+    if section.neck == "dense":
+        rows, columns = bundle.spec.grid.map_shape
+        canvas = Tensor(section.canvas.type, (1, rows + 1, columns + 1, section.channels))
+        height, width = bundle.spec.grid.head_shape
+        outputs = {name: Tensor(types[name], (1, height, width, count)) for name, count in channels.items()}
+        return {"canvas": canvas}, outputs
+    inputs = {PILLAR_FEATURES: Tensor(section.canvas.type, (None, section.channels))}
+    for level in range(LEVELS):
+        inputs |= {f"{kind}_{level}": Tensor("int32", (None, SAME.taps)) for kind in ("strided", "first", "same")}
+        inputs[f"places_{level}"] = Tensor("int32", (None,))
+    return inputs, {name: Tensor(types[name], (None, count)) for name, count in channels.items()}
+
+
+def open_encoder(folder: Path, bundle: PillarBundle) -> Session:
+    """Open encoder.onnx of the bundle in this folder, on the CPU.
+
+    Raises:
+        BundleError: the graph cannot be run or is not what the manifest says.
+    """
+    # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
+    # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is
+    # still the fastest form, ten times faster than ScatterElements.
+    path = folder / bundle.graphs[ENCODER].file
+    session = providers.open_session(path, "cpu", "float32", threads=1)
+    return check_interface(path, session, *encoder_interface(bundle))
+
+
+def check_neck(bundle: PillarBundle, provider: str) -> None:
+    """Raise ProviderError, which says what to choose, if this provider cannot run the bundle's neck."""
+    if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
+        raise ProviderError(
+            f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
+            f"choose provider cpu, or a bundle with a dense neck: asca_small_sim{_DENSE_FORMS[bundle.kind]}"
+        )

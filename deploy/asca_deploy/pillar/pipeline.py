@@ -1,0 +1,287 @@
+"""The pillar family's pipeline: pillarize, encode, scatter or tables, neck and head, decode (paper section 3)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy import providers
+from asca_deploy.bundle import BACKBONE, NECK, CanvasFormat, PillarBundle
+from asca_deploy.graph import Session, check_interface
+from asca_deploy.pillar.backbone import HeadAnswer, Maps, PillarBackbone
+from asca_deploy.pillar.graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
+from asca_deploy.pipeline import Laps, Pipeline
+from asca_pillars.base.kernels import load_kernels
+from asca_pillars.detection.decode import HeadMaps, decode
+from asca_pillars.detection.detections import Detections
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.map_pooling import pool_pillars
+from asca_pillars.ops.pillar.neck_rulebooks import NeckTableBuilder, NeckTables, table_inputs
+from asca_pillars.ops.pillar.prepare import KERNELS, PillarCounts, Pillars, pillarize
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.ops.two_stage.first_stage import FirstPass
+
+T = TypeVar("T")
+
+
+class PreparedPillars(NamedTuple):
+    """A scan's pillars, encoded and placed for the backbone."""
+
+    placed: Any
+    counts: PillarCounts
+
+
+class PillarPipeline:
+    """See `pipeline.Pipeline`. The encoder always runs on onnxruntime's CPU provider.
+
+    Args:
+        folder: of the bundle.
+        bundle: its manifest, verified by `load_pillar_bundle`.
+        provider, precision, threads: of the backbone.
+
+    Raises:
+        BundleError: a graph cannot be run or is not what the manifest says.
+        ProviderError: the provider does not start, or cannot run this backbone.
+    """
+
+    network_stages = ("encode", "neck+head")
+
+    def __init__(
+        self,
+        folder: Path,
+        bundle: PillarBundle,
+        provider: providers.Provider = "cpu",
+        precision: providers.Precision = "float32",
+        threads: int = 1,
+    ) -> None:
+        load_kernels(KERNELS)  # here rather than in the first scan
+        self.bundle = bundle
+        self.spec: PillarSpec = bundle.spec
+        self._encoder = open_encoder(folder, bundle)
+        path, neck = folder / bundle.graphs[BACKBONE].file, 0 if bundle.refine is None else bundle.refine.bev_channels
+        self.backbone = open_backbone(path, bundle, provider, precision, threads, neck)
+        self.stages = ("pillarize", "encode", self.backbone.stage, "neck+head", "decode")
+        self._anchors = self.spec.anchors
+
+    def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedPillars:
+        """Points (N, 4), metres, LiDAR frame, and reflectance -> the input of the backbone."""
+        pillars = self.pillarize(points)
+        laps.append(("pillarize", perf_counter()))
+        features = self.encode(pillars)
+        laps.append(("encode", perf_counter()))
+        placed = self.backbone.place(features, pillars.cells)
+        laps.append((self.backbone.stage, perf_counter()))
+        return PreparedPillars(placed, pillars.stats)
+
+    def infer(self, prepared: PreparedPillars, laps: Laps) -> HeadAnswer:
+        """The placed pillars -> head maps (channels, H, W) of logits and residuals, or rows of the active cells."""
+        answer = self.backbone.run(prepared.placed)
+        laps.append(("neck+head", perf_counter()))
+        return answer
+
+    def finish(self, raw: HeadAnswer, laps: Laps) -> Detections:
+        """Head maps (channels, H, W) -> boxes, LiDAR frame, above the score threshold that the rotated NMS keeps."""
+        spec = self.spec
+        detections = decode(raw.maps, self._anchors, spec.classes, spec.post, raw.cells, spec.direction_offset_rad)
+        laps.append(("decode", perf_counter()))
+        return detections
+
+    def pillarize(self, points: NDArray[np.float32]) -> Pillars:
+        """Finite points (N, 4), metres, LiDAR frame -> the features of M points in P pillars. Paper section 3.2."""
+        return pillarize(points, self.spec.grid, self.spec.limits)
+
+    def encode(self, pillars: Pillars) -> NDArray[Any]:
+        """Features (M, 9) -> unitless pillar features (P, C), of the canvas's type. Paper section 3.2."""
+        if not len(pillars.cells):
+            return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
+        values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three
+        return self._encoder.run((PILLAR_FEATURES,), values)[0]
+
+
+def open_backbone(
+    path: Path,
+    bundle: PillarBundle,
+    provider: providers.Provider,
+    precision: providers.Precision,
+    threads: int,
+    neck_channels: int = 0,
+) -> PillarBackbone:
+    """Open backbone.onnx of a dense or of a sparse neck; with `neck_channels` it has the output NECK.
+
+    Raises:
+        BundleError: the graph cannot be run or is not what the manifest says.
+        ProviderError: the provider does not start, or cannot run a sparse neck.
+    """
+    check_neck(bundle, provider)
+    session = providers.open_session(path, provider, precision, threads)
+    in_steps = NECK in session.outputs and session.outputs[NECK].type == "uint8"
+    check_interface(path, session, *backbone_interface(bundle, neck_channels, "uint8" if in_steps else "float32"))
+    return (
+        CanvasBackbone(session, bundle)
+        if bundle.pillar.neck == "dense"
+        else TableBackbone(session, bundle, neck_channels)
+    )
+
+
+class Canvas:
+    """The pseudo-image (1, rows + 1, columns + 1, C), channels last, allocated once and kept from frame to frame.
+
+    Its first row and column are the padding of the network's first convolution, so that they can hold whatever stands
+    for zero. Channels last, a pillar is one run of memory. A frame fills a few percent of the cells: clearing only the
+    cells of the frame before is many times faster than a new image, 64 MB for the paper's grid.
+    """
+
+    def __init__(self, channels: int, grid: PillarGrid, stored_as: CanvasFormat | None = None) -> None:
+        stored_as = stored_as or CanvasFormat()
+        rows, columns = grid.map_shape
+        self.image: NDArray[Any] = np.empty((1, rows + 1, columns + 1, channels), stored_as.type)
+        self._empty = np.array(stored_as.empty or [0] * channels, stored_as.type)
+        self._cells = self.image.reshape(-1, channels)
+        self._cells[:] = self._empty
+        self._nx = columns
+        self.occupied: NDArray[np.int64] = np.empty(0, np.int64)
+        """(n,) rows of `image.reshape(-1, C)` that hold a pillar."""
+
+    def scatter(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> NDArray[Any]:
+        """Write each pillar's features into its cell; every other cell is empty.
+
+        Args:
+            pillar_features: (P, C), of the format's type.
+            cells: (P,) flat indices row * columns + column on the map, each at most once.
+
+        Returns:
+            The pseudo-image (1, ny + 1, nx + 1, C). It is this object's own memory: valid until the next call.
+        """
+        self._cells[self.occupied] = self._empty
+        rows, columns = np.divmod(cells, self._nx)
+        self.occupied = (rows + 1) * (self._nx + 1) + columns + 1
+        self._cells[self.occupied] = pillar_features
+        return self.image
+
+
+class CanvasBackbone:
+    """backbone.onnx of a dense neck, see `pillar.backbone.PillarBackbone`.
+
+    Every scan between `place` and `run` has a canvas of its own, taken from those that are free. There are as many
+    as there ever were such scans at once: one in single calls, two in a stream, one per thread with several threads;
+    each takes (nx + 1)(ny + 1) C values, 5 MiB in asca_small_sim_int8 and 20 MiB in its float form.
+
+    Args:
+        session: that has opened it, see `open_backbone`.
+        bundle: the manifest.
+    """
+
+    stage = "scatter"
+
+    def __init__(self, session: Session, bundle: PillarBundle) -> None:
+        self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
+        self._free = [self.new_canvas()]
+
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
+        """Pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
+        canvas = take_free(self._free, self.new_canvas)
+        if self._pools:
+            pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
+        canvas.scatter(pillar_features, cells)
+        return canvas
+
+    def run(self, placed: Canvas) -> HeadAnswer:
+        """The canvas -> logits and residuals on the head's map."""
+        maps = self.neck_and_head(placed.image)
+        self._free.append(placed)
+        return HeadAnswer(maps, None)
+
+    def infer_with_neck(self, placed: Canvas) -> FirstPass:
+        """As `run`, and the neck's map (H, W, C), which a second stage reads; for graphs with the output NECK."""
+        *maps, neck = self._session.run((*HeadMaps._fields, NECK), {"canvas": placed.image})
+        self._free.append(placed)
+        return FirstPass(channels_first(maps), neck[0])
+
+    def new_canvas(self) -> Canvas:
+        """An empty canvas of this bundle's format."""
+        return Canvas(self._bundle.pillar.channels, self._bundle.spec.grid, self._bundle.pillar.canvas)
+
+    def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
+        """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
+        return channels_first(self._session.run(HeadMaps._fields, {"canvas": canvas}))
+
+
+class PlacedPillars(NamedTuple):
+    """What the graph reads of one scan."""
+
+    features: NDArray[Any]
+    """(P, C), of a pooled map (cells, C)"""
+    tables: NeckTables[NDArray[np.int32]]
+
+
+class TableBackbone:
+    """backbone.onnx of a sparse neck, see `pillar.backbone.PillarBackbone`.
+
+    Tables are built in memory that is kept from scan to scan, as many builders as threads ever built at once; the
+    tables themselves belong to their scan.
+
+    Args:
+        session: that has opened it, see `open_backbone`.
+        bundle: the manifest.
+        neck_channels: of the graph's output NECK, if it has one.
+    """
+
+    stage = "tables"
+
+    def __init__(self, session: Session, bundle: PillarBundle, neck_channels: int = 0) -> None:
+        self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
+        self._channels = output_channels(bundle, neck_channels)
+        self._free = [self._new_builder()]
+
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
+        """Pillar features (P, C) with the tables that their cells, flat indices (P,), make."""
+        builder = take_free(self._free, self._new_builder)
+        if self._pools:
+            pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
+        tables = builder.build(cells)
+        self._free.append(builder)
+        return PlacedPillars(pillar_features, tables)
+
+    def run(self, placed: PlacedPillars) -> HeadAnswer:
+        """Scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
+        return HeadAnswer(HeadMaps(*self._rows(placed, HeadMaps._fields)), placed.tables.head_cells)
+
+    def infer_with_neck(self, placed: PlacedPillars) -> FirstPass:
+        """As `run`, and the head's input (M, C), which a second stage reads; for graphs with the output NECK."""
+        *maps, neck = self._rows(placed, (*HeadMaps._fields, NECK))
+        return FirstPass(HeadMaps(*maps), neck, placed.tables.head_cells)
+
+    def _rows(self, placed: PlacedPillars, names: Sequence[str]) -> list[NDArray[np.float32]]:
+        if not len(placed.tables.head_cells):
+            return [np.empty((0, self._channels[name]), np.float32) for name in names]
+        given = {PILLAR_FEATURES: placed.features, **table_inputs(placed.tables)}
+        return run_graph(self._session, names, given)
+
+    def _new_builder(self) -> NeckTableBuilder:
+        rule = self._bundle.pillar.active_cells
+        assert rule is not None
+        return NeckTableBuilder(*self._bundle.spec.grid.map_shape, rule)
+
+
+def run_graph(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+    """The outputs of these names; of what is given the graph takes the inputs that it has."""
+    return session.run(outputs, {name: given[name] for name in session.inputs})
+
+
+def take_free(free: list[T], make: Callable[[], T]) -> T:
+    """One that is free, or a new one; appending it to `free` gives it back."""
+    try:
+        return free.pop()  # atomic, as append is: two threads never get the same one
+    except IndexError:
+        return make()
+
+
+def channels_first(channels_last: Sequence[NDArray[Any]]) -> HeadMaps[NDArray[np.float32]]:
+    """Head maps of one scan as a graph gives them, (1, H, W, C) each, as decoding reads them, (C, H, W) each."""
+    return HeadMaps(*(maps[0].transpose(2, 0, 1) for maps in channels_last))
+
+
+_: type[Pipeline[PreparedPillars, HeadAnswer]] = PillarPipeline  # mypy compares them

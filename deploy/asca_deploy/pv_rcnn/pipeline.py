@@ -1,0 +1,240 @@
+"""The pipeline of kind pv_rcnn: voxels propose, keypoints refine (PV-RCNN, section 3)."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy import providers
+from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
+from asca_deploy.graph import Interface, Session, check_interface
+from asca_deploy.pillar.pipeline import channels_first, run_graph, take_free
+from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pv_rcnn.canvas import VoxelCanvas
+from asca_deploy.pv_rcnn.graphs import (
+    OUT,
+    backbone_interface,
+    balls_around,
+    deform_inputs,
+    deform_interface,
+    keeps_memory,
+    keypoint_inputs,
+    keypoints_interface,
+    map_channels,
+    map_type,
+    refine_interface,
+    voxel_inputs,
+    voxels_interface,
+)
+from asca_deploy.two_stage.pipeline import OUTPUTS
+from asca_pillars.base.kernels import load_kernels
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.report import ScanCounts
+from asca_pillars.ops.points import ball_query, columns
+from asca_pillars.ops.points.bilinear import read_map
+from asca_pillars.ops.pv_rcnn import voxels
+from asca_pillars.ops.pv_rcnn.prepare import VoxelizedScan, VoxelScan, voxel_levels, with_neighbors
+from asca_pillars.ops.pv_rcnn.proposals import propose_anchors
+from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
+from asca_pillars.ops.sparse import rulebook as cell_map
+from asca_pillars.ops.two_stage.decode import reported_detections
+from asca_pillars.ops.two_stage.prepare import GridNeighbors, grid_neighbors
+
+
+class PreparedVoxels(NamedTuple):
+    """A scan whose voxels are encoded and scattered."""
+
+    scan: VoxelScan
+    levels: dict[str, NDArray[np.float32]]
+    """Features (N, C) of the voxels of each level that keypoints aggregate, by the names of sources."""
+    canvas: VoxelCanvas | None
+    """None of a scan without voxels."""
+
+    @property
+    def counts(self) -> ScanCounts:
+        """What became of its points."""
+        return self.scan.counts
+
+
+class VoxelAnswer(NamedTuple):
+    """What the first stage says of a scan."""
+
+    scan: VoxelScan
+    levels: dict[str, NDArray[np.float32]]
+    bev: NDArray[np.float32]
+    """(K, C) the map seen from above at the keypoints, in steps where the map is."""
+    maps: HeadMaps[NDArray[np.float32]] | None
+    """(channels, H, W); None of a scan without voxels."""
+
+
+class PvRcnnPipeline:
+    """See `pipeline.Pipeline`.
+
+    `provider` and `precision` are the map backbone's; the other graphs have rows of any number or take positions in
+    metres, so they run on onnxruntime's CPU provider, the sparse backbone of an 8-bit bundle in 8 bits. Tables and
+    canvases are built in memory that is kept from scan to scan, as much as threads ever used at once.
+
+    Args:
+        folder: of the bundle.
+        bundle: its manifest, verified by `load_bundle`.
+        provider, precision, threads: of the backbone; the other graphs have as many threads.
+
+    Raises:
+        BundleError: a graph cannot be run or is not what the manifest says.
+        ProviderError: the provider does not start.
+    """
+
+    stages = ("voxelize", "neighbors", "voxels", "scatter", "neck+head", "propose", "keypoints", "refine", "decode")
+    network_stages = ("voxels", "neck+head", "keypoints", "refine")
+
+    def __init__(
+        self,
+        folder: Path,
+        bundle: PvRcnnBundle,
+        provider: providers.Provider = "cpu",
+        precision: providers.Precision = "float32",
+        threads: int = 1,
+    ) -> None:
+        for kernels in (ball_query.KERNELS, columns.KERNELS, cell_map.KERNELS, voxels.KERNELS):
+            load_kernels(kernels)  # here rather than in the first scan
+        self.spec: VoxelSpec = bundle.spec
+        self.settings, self.scores = bundle.pv_rcnn.settings, bundle.pv_rcnn.scores
+
+        def opened(
+            name: str,
+            interface: Interface,
+            where: providers.Provider = "cpu",
+            digits: providers.Precision = "float32",
+        ) -> Session:
+            path = folder / bundle.graphs[name].file
+            session = providers.open_session(path, where, digits, threads, keep_memory=keeps_memory(bundle.pv_rcnn))
+            return check_interface(path, session, *interface)
+
+        self._voxels = opened(VOXELS, voxels_interface(bundle))
+        self._backbone = opened(BACKBONE, backbone_interface(bundle), provider, precision)
+        self._keypoints = opened(KEYPOINTS, keypoints_interface(bundle))
+        self._refine = opened(REFINE, refine_interface(bundle))
+        self._deform = opened(DEFORM, deform_interface(bundle)) if self.settings.deformed else None
+        self._map_channels, self._map_type = map_channels(bundle), map_type(bundle)
+        self._canvases = [self._new_canvas()]
+        self._builders = [self.spec.table_builder()]
+
+    def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedVoxels:
+        """Points (N, 4), metres, LiDAR frame, and reflectance -> the map seen from above."""
+        voxelized = self.voxelize(points)
+        laps.append(("voxelize", perf_counter()))
+        scan = with_neighbors(points, voxelized, self.spec, self.settings)
+        laps.append(("neighbors", perf_counter()))
+        if not len(scan.features):
+            return PreparedVoxels(scan, {}, None)
+        levels = self.encode(scan)
+        laps.append(("voxels", perf_counter()))
+        canvas = take_free(self._canvases, self._new_canvas)
+        canvas.scatter(levels.pop(OUT), scan.levels[-1].cells)
+        laps.append(("scatter", perf_counter()))
+        return PreparedVoxels(scan, levels, canvas)
+
+    def infer(self, prepared: PreparedVoxels, laps: Laps) -> VoxelAnswer:
+        """The map seen from above -> head maps, and what it says at the keypoints."""
+        scan, levels, canvas = prepared
+        if canvas is None:
+            return VoxelAnswer(scan, levels, np.empty((0, self._map_channels), np.float32), None)
+        maps = self.neck_and_head(canvas.image)
+        laps.append(("neck+head", perf_counter()))
+        bev = read_map(canvas.rows, scan.bev_cells, scan.bev_weights)
+        self._canvases.append(canvas)
+        laps.append(("keypoints", perf_counter()))
+        return VoxelAnswer(scan, levels, bev, maps)
+
+    def finish(self, raw: VoxelAnswer, laps: Laps) -> Detections:
+        """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
+        if raw.maps is None:
+            return Detections.empty(self.spec.class_names)
+        detections = reported_detections(*self.judge(raw.maps, raw, laps), self.spec, self.scores)
+        laps.append(("decode", perf_counter()))
+        return detections
+
+    def judge(
+        self, maps: HeadMaps[NDArray[np.float32]], raw: VoxelAnswer, laps: Laps
+    ) -> tuple[Detections, NDArray[np.float32], NDArray[np.float32]]:
+        """The R proposals of head maps, and what the second stage says of them: logits (R,), residuals (R, 7)."""
+        proposals = propose_anchors(maps, self.spec, self.settings.proposals)
+        laps.append(("propose", perf_counter()))
+        places = self.deform(raw.scan, raw.levels)
+        laps.append(("keypoints", perf_counter()))
+        balls = balls_around(raw.scan, self.settings, places)
+        laps.append(("neighbors", perf_counter()))
+        features = self.describe(raw.scan, raw.levels, raw.bev, places, balls)
+        laps.append(("keypoints", perf_counter()))
+        grid = grid_neighbors(raw.scan.keypoints, proposals.boxes, self.settings, self.settings.vector_cells)
+        laps.append(("neighbors", perf_counter()))
+        confidence, residuals = self.refine(raw.scan.keypoints, features, grid)
+        laps.append(("refine", perf_counter()))
+        return proposals, confidence, residuals
+
+    def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
+        """Points (N, 4), metres, LiDAR frame, and reflectance -> what voxels.onnx reads."""
+        builder = take_free(self._builders, self.spec.table_builder)
+        voxelized = voxel_levels(points, self.spec, builder)
+        self._builders.append(builder)
+        return voxelized
+
+    def encode(self, scan: VoxelScan | VoxelizedScan) -> dict[str, NDArray[Any]]:
+        """Unitless features (N, C) of the voxels of every level that is read, by name, see OUT; at least one voxel.
+
+        Those of OUT are whole steps where the map is.
+        """
+        names = list(self._voxels.outputs)
+        return dict(zip(names, run_graph(self._voxels, names, voxel_inputs(scan.features, scan.levels)), strict=True))
+
+    def neck_and_head(self, canvas: NDArray[Any]) -> HeadMaps[NDArray[np.float32]]:
+        """The map (1, H, W, C) -> scores (A * classes, H, W), boxes (7A, H, W), directions (2A, H, W)."""
+        return channels_first(self._backbone.run(HeadMaps._fields, {"canvas": canvas}))
+
+    def deform(self, scan: VoxelScan, levels: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+        """Around which places (K, 3), metres, keypoints look at levels with features (N, C); by name, none without."""
+        if self._deform is None:
+            return {}
+        names = list(self._deform.outputs)
+        return dict(zip(names, run_graph(self._deform, names, deform_inputs(scan, self.settings, levels)), strict=True))
+
+    def describe(
+        self,
+        scan: VoxelScan,
+        levels: Mapping[str, NDArray[np.float32]],
+        bev: NDArray[np.float32],
+        places: Mapping[str, NDArray[np.float32]],
+        balls: Sequence[Sequence[NDArray[np.int32]]],
+    ) -> NDArray[np.float32]:
+        """Weighted unitless features (K, C) of the keypoints.
+
+        Args:
+            scan: with the keypoints.
+            levels: features (N, C) by name.
+            bev: (K, C) the map at the keypoints.
+            places: what `deform` gave.
+            balls: what `balls_around` gave.
+        """
+        given = keypoint_inputs(scan, self.settings.sources, levels, bev, balls) | dict(places)
+        return run_graph(self._keypoints, ["features"], given)[0]
+
+    def refine(
+        self, keypoints: NDArray[np.float32], features: NDArray[np.float32], grid: GridNeighbors
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Confidence logits (R,) and residuals (R, 7) of the proposals with this grid; keypoints (K, 3), metres."""
+        if not len(grid.points):
+            return np.empty(0, np.float32), np.empty((0, 7), np.float32)
+        grids = {f"grid_{number}": indices for number, indices in enumerate(grid.indices)}
+        given = {"keypoints": keypoints, "features": features, "grid_points": grid.points, **grids}
+        confidence, residuals = run_graph(self._refine, OUTPUTS, given)
+        return confidence, residuals
+
+    def _new_canvas(self) -> VoxelCanvas:
+        return VoxelCanvas(self.spec.level_shapes[-1], self._map_channels, self._map_type)
+
+
+_: type[Pipeline[PreparedVoxels, VoxelAnswer]] = PvRcnnPipeline  # mypy compares them

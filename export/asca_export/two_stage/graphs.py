@@ -1,0 +1,117 @@
+"""The second stage as an ONNX graph, its normalization folded into the layers before it."""
+
+import copy
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
+
+from asca_deploy.bundle import RefineSection
+from asca_deploy.two_stage.pipeline import grid_names, refine_interface
+from asca_export.graphs import export_row_graph
+from asca_export.sparse_forms import scale_and_shift
+from asca_export.two_stage.point_forms import GatheredSetAbstraction, GroupedSetAbstraction
+from asca_pillars.models.two_stage.keypoint_encoder import SourceRows
+from asca_pillars.models.two_stage.pillar_refiner import PillarRefiner
+from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
+from asca_pillars.models.two_stage.vector_pool import VectorPool
+from asca_pillars.ops.points.ball_layouts import BallGroup, GroupedBalls
+from asca_pillars.ops.two_stage.prepare import RefineSettings
+
+M = TypeVar("M", bound=nn.Module)
+
+
+class Shift(nn.Module):
+    """What is left of a normalization whose scale has gone into the weights before it: (rows, C) + (C,)."""
+
+    def __init__(self, shift: Tensor) -> None:
+        super().__init__()
+        self.shift = nn.Parameter(shift, requires_grad=False)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Add the shift."""
+        return rows + self.shift
+
+
+def fold_norms(network: M) -> M:
+    """A copy without normalization of point features that computes the same in evaluation mode."""
+    folded = copy.deepcopy(network).eval()
+    with torch.no_grad():
+        for module in folded.modules():
+            if isinstance(module, SetAbstraction):
+                for index, norm in enumerate(module.norms):
+                    module.norms[index] = _fold(module.layers[index], norm)  # type: ignore[arg-type]
+            elif isinstance(module, VectorPool):
+                module.norm = _fold_vectors(module)  # type: ignore[assignment]
+            elif isinstance(module, nn.Sequential):
+                for index in range(1, len(module)):
+                    if isinstance(norm := module[index], nn.BatchNorm1d):
+                        module[index - 1] = fuse_linear_bn_eval(module[index - 1], norm)  # type: ignore[type-var]
+                        module[index] = nn.Identity()
+    return folded
+
+
+def _fold(layer: nn.Linear, norm: nn.BatchNorm1d) -> Shift:
+    scale, shift = scale_and_shift(norm)
+    layer.weight *= scale[:, None]
+    return Shift(shift)
+
+
+def _fold_vectors(pool: VectorPool) -> Shift:
+    scale, shift = scale_and_shift(pool.norm)
+    pool.features.weight *= scale[:, None]
+    pool.places.mul_(scale.view(len(pool.places), 1, -1))
+    return Shift(shift)
+
+
+class _Flat(nn.Module):
+    """The second stage in fast forms, with one argument for each of `inputs`, the names of the graph's."""
+
+    def __init__(self, refiner: PillarRefiner, settings: RefineSettings, inputs: list[str]) -> None:
+        super().__init__()
+        fast = fold_norms(refiner)
+        fast.encode.balls = nn.ModuleList(map(GatheredSetAbstraction, _set_abstractions(refiner.encode.balls)))
+        fast.head.pools = nn.ModuleList(map(GroupedSetAbstraction, _set_abstractions(refiner.head.pools)))
+        self.refiner, self.settings, self.inputs = fast, settings, inputs
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """(R,) confidence logits and (R, 7) residuals."""
+        named: Any = dict(zip(self.inputs, inputs, strict=True))
+        keypoints = named["keypoints"]
+        balls = [named[f"ball_{number}"] for number in range(len(self.settings.ball_radii_m))]
+        gathered: Any = SourceRows(None, None)  # type: ignore[arg-type]
+        features, _ = self.refiner.encode([gathered], keypoints, named["bev"], balls)
+        grids = [
+            GroupedBalls(
+                tuple(BallGroup(*(named[name] for name in group)) for group in names.groups), named[names.rows]
+            )
+            for names in _grids(self.settings)
+        ]
+        confidence, residuals = self.refiner.head(
+            keypoints, features, named["grid_points"], grids, named["roi_features"]
+        )
+        return confidence, residuals
+
+
+def _grids(settings: RefineSettings) -> list[GroupedBalls[str]]:
+    return [grid_names(number, settings.grid_samples) for number in range(len(settings.grid_radii_m))]
+
+
+def _set_abstractions(modules: nn.ModuleList) -> list[SetAbstraction]:
+    found = [module for module in modules if isinstance(module, SetAbstraction)]
+    assert len(found) == len(modules)
+    return found
+
+
+def export_refine(refiner: PillarRefiner, section: RefineSection, classes: int, path: Path) -> None:
+    """Write refine.onnx: see `asca_deploy.two_stage.pipeline.refine_interface`; every number of rows is dynamic."""
+    settings, (inputs, outputs) = section.neighbors, refine_interface(section, classes)
+    rows = dict.fromkeys(inputs, "keypoints") | {"roi_features": "proposals", "grid_points": "proposals"}
+    for names in _grids(settings):
+        rows[names.rows] = "proposals"
+        for group in names.groups:
+            rows |= dict.fromkeys(group, group.queries)
+    of_cells = dict.fromkeys(("grid_points", *(names.rows for names in _grids(settings))), settings.grid_size**3)
+    export_row_graph(_Flat(refiner, settings, list(inputs)), path, inputs, rows, outputs, of_cells)

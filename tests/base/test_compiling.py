@@ -1,0 +1,117 @@
+"""numba's cache: used where it is whole, made anew where it is damaged, done without where it cannot be written."""
+
+import errno
+import logging
+import os
+from collections.abc import Callable
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import numba
+import pytest
+
+from asca_pillars.base import compiling
+
+KERNELS = """
+from numba import types
+
+from asca_pillars.base.compiling import cached, compiled
+
+
+@compiled(types.int64)
+def double(number):
+    return 2 * number
+
+
+@cached(error_model="numpy")
+def triple(number):
+    return 3 * number
+"""
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiling._CheckedCache, "warned", False)
+    path = tmp_path / "made_up_kernels.py"
+    path.write_text(KERNELS)
+    return path
+
+
+def hits(source: Path) -> list[bool]:
+    """Return for both kinds of functions whether a process that imports and calls them takes them from the cache."""
+    spec = spec_from_file_location("made_up_kernels", source)
+    assert spec is not None and spec.loader is not None
+    module: Any = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert (module.double(21), module.triple(14)) == (42, 42)
+    return [bool(function.stats.cache_hits) for function in (module.double, module.triple)]
+
+
+def flip(at: float) -> Callable[[bytes], bytes]:
+    def change(content: bytes) -> bytes:
+        place = int(at * (len(content) - 1))
+        return content[:place] + bytes([content[place] ^ 0x10]) + content[place + 1 :]
+
+    return change
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[: len(content) // 2],
+        lambda content: content[:-1],
+        lambda content: content[:-32],  # as numba itself writes them
+        flip(0),
+        flip(0.3),
+        flip(0.7),
+        flip(1),
+        lambda content: b"cos\nsystem\n(S'false'\ntR.",
+    ],
+)
+def test_a_damaged_cache_is_made_anew(source: Path, suffix: str, damage: Callable[[bytes], bytes]) -> None:
+    hits(source)
+    assert hits(source) == [True, True]
+    files = [path for path in (source.parent / "cache").rglob("*") if path.suffix == suffix]
+    assert len(files) == 2
+    for path in files:
+        path.write_bytes(damage(path.read_bytes()))
+    assert hits(source) == [False, False]
+    assert hits(source) == [True, True]
+
+
+def test_a_full_disk_is_named_and_ends_nothing(
+    source: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(name: Any, *_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as full, caplog.at_level(logging.WARNING):
+        full.setattr(os, "replace", fail)
+        assert hits(source) == [False, False]
+    (record,) = caplog.records
+    said = record.getMessage()
+    assert "cache" in said and "No space left on device" in said and "NUMBA_CACHE_DIR" in said
+    assert hits(source) == [False, False]
+    assert hits(source) == [True, True]
+
+
+def test_a_folder_in_the_place_of_a_file_ends_nothing(source: Path, caplog: pytest.LogCaptureFixture) -> None:
+    hits(source)
+    for path in [path for path in (source.parent / "cache").rglob("*") if path.is_file()]:
+        path.unlink()
+        path.mkdir()
+    assert hits(source) == [False, False]
+    assert "set NUMBA_CACHE_DIR to another folder" in caplog.text
+
+
+def test_compiled_without_a_cache_where_none_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere(_: Any) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr(compiling, "_CheckedCache", nowhere)
+    double = compiling.compiled(numba.types.int64)(lambda number: 2 * number)
+    assert double(21) == 42

@@ -1,0 +1,268 @@
+"""Writing files: all or nothing."""
+
+import errno
+import os
+import stat
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from asca_pillars.base.errors import OutputError
+from asca_pillars.base.files import atomic_directory, atomic_path, file_inside, portable_name, remove_directory
+from tests.bundle_folder import EXPORT, names, old_bundle
+
+
+def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "result.json"
+    with atomic_path(target) as temporary:
+        temporary.write_text("{}")
+        assert not target.exists()
+        assert temporary.parent == target.parent and temporary.suffix == ".json"
+    assert target.read_text() == "{}"
+    assert names(target.parent) == ["result.json"]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "result.json"
+    target.write_text("old")
+    with pytest.raises(RuntimeError, match="halfway"), atomic_path(str(target)) as temporary:
+        temporary.write_text("ne")
+        raise RuntimeError("halfway")
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["result.json"]
+
+
+def test_a_file_is_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "result.json"
+    target.write_text("old")
+    with atomic_path(target) as temporary:
+        temporary.write_text("new")
+    assert target.read_text() == "new"
+    assert names(tmp_path) == ["result.json"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
+def test_permissions_follow_the_umask(tmp_path: Path) -> None:
+    previous = os.umask(0o027)
+    try:
+        with atomic_path(tmp_path / "file") as temporary:
+            temporary.write_text("")
+        with atomic_directory(tmp_path / "folder", *EXPORT):
+            pass
+    finally:
+        os.umask(previous)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
+    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
+
+
+def test_a_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
+    target = tmp_path / "models" / "bundle"
+    with atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "a.onnx").write_text("a")
+        assert not target.exists()
+    assert names(target) == ["a.onnx"]
+    assert names(target.parent) == ["bundle"]
+
+
+def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    with atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "fresh.onnx").write_text("new")
+        assert names(target) == ["a.onnx", "bundle.json"]
+    assert names(target) == ["fresh.onnx"]
+    assert names(tmp_path) == ["bundle"]
+
+
+def test_a_failed_folder_leaves_the_old_one(tmp_path: Path) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    with pytest.raises(RuntimeError, match="halfway"), atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "half.onnx").write_text("new")
+        raise RuntimeError("halfway")
+    assert names(target) == ["a.onnx", "bundle.json"]
+    assert names(tmp_path) == ["bundle"]
+
+
+def test_the_old_folder_returns_if_the_new_one_cannot_take_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    replace = os.replace
+
+    def refuse_the_new_one(source: Path, destination: Path) -> None:
+        if destination == target and not Path(source).name.endswith("-old"):
+            raise OSError("no")
+        replace(source, destination)
+
+    monkeypatch.setattr(os, "replace", refuse_the_new_one)
+    with pytest.raises(OSError, match="no"), atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "fresh.onnx").write_text("new")
+    assert names(target) == ["a.onnx", "bundle.json"]
+    assert names(tmp_path) == ["bundle"]
+
+
+# --- what is not ours; the rule is tested in test_own_files
+
+
+def test_a_foreign_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    with pytest.raises(OutputError, match="notes"), atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "bundle.json").write_text("new")
+        (target / "notes").write_text("precious")
+    assert names(target) == ["a.onnx", "bundle.json", "notes"]
+    assert names(tmp_path) == ["bundle"]
+
+
+def test_one_s_own_folder_is_removed_and_nobody_else_s(tmp_path: Path) -> None:
+    remove_directory(tmp_path / "absent", *EXPORT)
+    remove_directory(old_bundle(tmp_path / "bundle"), *EXPORT)
+    (tmp_path / "empty").mkdir()
+    remove_directory(tmp_path / "empty", *EXPORT)
+    assert names(tmp_path) == ["empty"]
+    theirs = old_bundle(tmp_path / "theirs")
+    (theirs / "notes.txt").write_text("mine")
+    before = names(theirs)
+    with pytest.raises(OutputError, match=r"notes\.txt"):
+        remove_directory(theirs, *EXPORT)
+    assert names(theirs) == before
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="is a folder"), atomic_path(tmp_path):
+        raise AssertionError("not reached")
+    with pytest.raises(OutputError, match="no regular file"), atomic_path("/dev/null"):
+        raise AssertionError("not reached")
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_nothing_is_written_through_a_link(tmp_path: Path, there: bool) -> None:
+    if there:
+        old_bundle(tmp_path / "theirs")
+    (tmp_path / "file").symlink_to("theirs/a.onnx")
+    (tmp_path / "folder").symlink_to("theirs")
+    for writing in (atomic_path(tmp_path / "file"), atomic_directory(tmp_path / "folder", *EXPORT)):
+        with pytest.raises(OutputError, match="is a link, and nothing is written through links"), writing:
+            raise AssertionError("not reached")
+    with pytest.raises(OutputError, match="folder: is a link"):
+        remove_directory(tmp_path / "folder", *EXPORT)
+    assert names(tmp_path) == ["file", "folder", *["theirs"] * there]
+    assert not there or (tmp_path / "theirs" / "a.onnx").read_text() == "old"
+
+
+def test_a_name_as_long_as_a_file_system_takes_is_written(tmp_path: Path) -> None:
+    target = tmp_path / f"{'é' * 120}.json"
+    with atomic_path(target) as temporary:
+        temporary.write_text("{}")
+    assert names(tmp_path) == [target.name]
+
+
+# --- the system's errors, the disk, other threads
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EFBIG])
+def test_a_full_disk_names_the_file(tmp_path: Path, code: int) -> None:
+    for writing in (atomic_path(tmp_path / "a.ckpt"), atomic_directory(tmp_path / "a.ckpt", *EXPORT)):
+        with pytest.raises(OSError, match=r"a\.ckpt") as caught, writing:
+            raise OSError(code, os.strerror(code))
+        assert (caught.value.errno, caught.value.filename) == (code, str(tmp_path / "a.ckpt"))
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_takes_no_file_is_told_by_the_file_s_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *_: object) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(PermissionError) as caught, atomic_path(tmp_path / "a.json"):
+        pass
+    assert caught.value.filename == str(tmp_path / "a.json")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_files_and_folders_are_synced_before_they_get_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(str(Path(f"/proc/self/fd/{handle}").readlink())))
+    with atomic_path(tmp_path / "a.txt") as file:
+        assert synced == []
+    with atomic_directory(tmp_path / "b", *EXPORT) as folder:
+        (folder / "bundle.json").write_text('{"file": ""}')
+    wanted = [file, tmp_path, folder / "bundle.json", folder, tmp_path]
+    assert synced == [str(path) for path in wanted]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
+def test_other_threads_keep_their_umask(tmp_path: Path) -> None:
+    previous, stop, modes = os.umask(0o077), threading.Event(), set()
+
+    def create() -> None:
+        for number in range(3000):
+            handle = os.open(tmp_path / f"{number}", os.O_CREAT | os.O_WRONLY, 0o666)
+            modes.add(stat.S_IMODE(os.fstat(handle).st_mode))
+            os.close(handle)
+        stop.set()
+
+    thread = threading.Thread(target=create)
+    try:
+        thread.start()
+        while not stop.is_set():
+            with atomic_path(tmp_path / "file"):
+                pass
+        thread.join()
+    finally:
+        os.umask(previous)
+    assert modes == {0o600}
+
+
+@pytest.mark.parametrize("text", ["1000", "segment-10_a.b", "0", "a" * 100])
+def test_a_plain_name_stays(text: str) -> None:
+    assert portable_name(text) == text
+
+
+HARMFUL = [
+    "",
+    ".",
+    "..",
+    "../../x",
+    "/etc/passwd",
+    "a/b",
+    "a\\b",
+    "C:x",
+    "a\nb",
+    "a b",
+    "-x",
+    ".x",
+    "x.",
+    "NUL",
+    "com1.txt",
+]
+
+
+@pytest.mark.parametrize("text", [*HARMFUL, "a" * 101, "\0", "\udc80", "ü", "\u2028"])
+def test_any_text_is_one_plain_name(text: str, tmp_path: Path) -> None:
+    name = portable_name(text)
+    assert len(name) <= 100 and set(name) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789._-")
+    assert (tmp_path / name).resolve().parent == tmp_path.resolve()
+    (tmp_path / name).touch(exist_ok=False)
+    assert portable_name(name) == name
+    assert name.partition(".")[0].casefold() not in ("nul", "com1")
+
+
+def test_different_texts_have_different_names() -> None:
+    texts = [*HARMFUL, "_", "a_b", "a?b", "a*b", "x", "ä", "ö"]
+    assert len({portable_name(text) for text in texts}) == len(texts)
+
+
+def test_a_name_from_data_leads_nowhere_else(tmp_path: Path) -> None:
+    folder = tmp_path / "data"
+    (folder / "a").mkdir(parents=True)
+    (folder / "a" / "x.bin").touch()
+    (tmp_path / "secret").touch()
+    assert file_inside(folder, "a/x.bin") == folder / "a" / "x.bin"
+    outside = ["../secret", str(tmp_path / "secret"), "a/../../secret", "a/../a/x.bin"]
+    for name in (*outside, "", "a", "none", "a\0", "x" * 5000, "a/" * 3000 + "x"):
+        assert file_inside(folder, name) is None

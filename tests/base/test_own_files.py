@@ -1,0 +1,196 @@
+"""A command replaces its own products, recognized by content; never an input, never through a link."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from asca_pillars.base.errors import OutputError
+from asca_pillars.base.files import write_text
+from asca_pillars.base.own_files import (
+    Recognizer,
+    ending_with,
+    is_own_picture,
+    json_lines,
+    json_object,
+    page_end,
+    require_no_link,
+    require_not_input,
+    require_own,
+    require_own_file,
+    require_replaceable,
+    starting_with,
+)
+from asca_pillars.pictures.visualize import write_png
+from tests.bundle_folder import EXPORT, names, old_bundle
+
+REPORT = json_object("subject", "results", protocol="waymo")
+ABOUT = {"simulation.json": json_object("seed")}
+
+
+@pytest.mark.parametrize(
+    ("is_own", "own", "foreign"),
+    [
+        (REPORT, b'{"subject": 1, "results": [], "protocol": "waymo", "more": 2}', b'{"subject": 1, "results": []}'),
+        (REPORT, b'{"results": 1, "subject": 1, "protocol": "waymo"}', b'["subject", "results", "waymo"]'),
+        (json_object("a"), b'{"a": NaN}', b"\xff\xfe{}"),
+        (json_object("a"), b'{"a": 1}\n', b"[" * 5000),
+        (json_lines("scan"), b'{"scan": 1}\n{"torn', b'\n{"scan": 1}'),
+        (starting_with("# ours\n"), b"# ours\nx: 1\n", b"x: 1\n# ours\n"),
+        (
+            ending_with(page_end("asca eval")),
+            f"# Title\n{page_end('asca eval')}".encode(),
+            b"# Title\nby `asca eval`\n",
+        ),
+        (
+            ending_with(page_end("asca eval")),
+            page_end("asca eval").encode(),
+            f"{page_end('asca eval')}my note".encode(),
+        ),
+    ],
+)
+def test_a_file_is_recognized_by_its_content(tmp_path: Path, is_own: Recognizer, own: bytes, foreign: bytes) -> None:
+    path = tmp_path / "report"
+    require_own_file(path, "asca eval", is_own)
+    for harmless in (b"", own):
+        path.write_bytes(harmless)
+        require_own_file(path, "asca eval", is_own)
+    path.write_bytes(foreign)
+    with pytest.raises(OutputError, match=r"report: `asca eval` did not write it and would replace it"):
+        require_own_file(path, "asca eval", is_own)
+    assert path.read_bytes() == foreign
+
+
+def test_pictures_say_who_drew_them(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (40, 30, 3), np.uint8)
+    write_png(tmp_path / "ours.png", image)
+    cv2.imwrite(str(tmp_path / "theirs.png"), image)
+    assert is_own_picture(tmp_path / "ours.png") and not is_own_picture(tmp_path / "theirs.png")
+    read = cv2.imread(str(tmp_path / "ours.png"))
+    assert read is not None and np.array_equal(read, image), "the file is still whole"
+
+
+def test_an_input_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    bundle = old_bundle(tmp_path / "bundle")
+    (tmp_path / "link").symlink_to(bundle)
+    require_not_input(tmp_path / "other", (bundle, None, "bundle/a.onnx"))
+    require_not_input(bundle / "new.json", (bundle,))  # beside what is read
+    for target in (bundle, Path("bundle"), tmp_path / "link", tmp_path):
+        with pytest.raises(OutputError, match=r"would replace .*a\.onnx, which is read"):
+            require_not_input(target, (None, tmp_path / "link" / "a.onnx"))
+    with pytest.raises(OutputError, match="which is read"):
+        require_own_file(bundle / "bundle.json", "asca export", json_object("file"), ("link/bundle.json",))
+
+
+def test_a_folder_to_write_into_is_empty_or_ones_own(tmp_path: Path) -> None:
+    require_own(tmp_path / "absent", "asca simulate", ABOUT)
+    require_own(tmp_path, "asca simulate", ABOUT)
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"holds notes\.txt and nothing that `asca simulate` wrote"):
+        require_own(tmp_path, "asca simulate", ABOUT)
+    (tmp_path / "simulation.json").touch()
+    with pytest.raises(OutputError, match="nothing that `asca simulate` wrote"):
+        require_own(tmp_path, "asca simulate", ABOUT)
+    (tmp_path / "simulation.json").write_text('{"seed": 1}')
+    require_own(tmp_path, "asca simulate", ABOUT)
+    (tmp_path / "simulation.json").write_text('{"physics": "mine"}')
+    with pytest.raises(OutputError, match="nothing that `asca simulate` wrote"):
+        require_own(tmp_path, "asca simulate", ABOUT)
+    with pytest.raises(OutputError, match="is a file where a folder"):
+        require_own(tmp_path / "notes.txt", "asca simulate", ABOUT)
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(OutputError, match="is a link to nothing"):
+        require_own(tmp_path / "link", "asca simulate", ABOUT)
+
+
+def test_another_product_of_ones_own_does_not_give_a_foreign_one_away(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"a": 1}')
+    (tmp_path / "b.json").write_text("mine")
+    with pytest.raises(OutputError, match=r"b\.json"):
+        require_own(tmp_path, "asca eval", {"a.json": json_object("a"), "b.json": json_object("b")})
+
+
+def _link_of_a_file(out: Path, elsewhere: Path) -> None:
+    write_text(elsewhere / "about", '{"seed": 1}')
+    (out / "simulation.json").symlink_to(elsewhere / "about")
+
+
+def _link_of_a_folder(out: Path, elsewhere: Path) -> None:
+    elsewhere.mkdir()
+    (out / "scans").symlink_to(elsewhere)
+
+
+def _link_on_the_way(out: Path, elsewhere: Path) -> None:
+    (elsewhere / "0000").mkdir(parents=True)
+    (out / "scans").symlink_to(elsewhere)
+
+
+def _link_to_nothing(out: Path, elsewhere: Path) -> None:
+    (out / "scans").symlink_to(elsewhere)
+
+
+@pytest.mark.parametrize("place", [_link_of_a_file, _link_of_a_folder, _link_on_the_way, _link_to_nothing])
+def test_links_below_the_folder_are_refused(tmp_path: Path, place: Callable[[Path, Path], None]) -> None:
+    out = tmp_path / "out"
+    write_text(out / "simulation.json", '{"seed": 1}')
+    (tmp_path / "given").symlink_to(out)
+    for folder in (out, tmp_path / "given"):  # which may be a link itself
+        require_own(folder, "asca simulate", ABOUT, folders=("scans", "scans/0000"))
+    (out / "simulation.json").unlink()
+    place(out, tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match="is a link, and nothing is written through links"):
+        require_own(tmp_path / "given", "asca simulate", ABOUT, folders=("scans", "scans/0000"))
+
+
+def test_a_link_is_named_at_its_step(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b").symlink_to(tmp_path)
+    require_no_link(tmp_path, "a")
+    require_no_link(tmp_path / "a" / "b", ".")
+    require_no_link(tmp_path / "a" / "b", "c/d")
+    with pytest.raises(OutputError, match=r"a/b: is a link"):
+        require_no_link(tmp_path, "a/b/c")
+
+
+# --- folders that are replaced as a whole
+
+
+def test_a_folder_of_other_files_is_not_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "thesis"
+    target.mkdir()
+    require_replaceable(target, *EXPORT)
+    require_replaceable(tmp_path / "absent", *EXPORT)
+    (target / "thesis.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"thesis.txt and no bundle.json"):
+        require_replaceable(target, *EXPORT)
+    with pytest.raises(OutputError, match="is a file where a folder"):
+        require_replaceable(target / "thesis.txt", *EXPORT)
+
+
+def test_a_marker_of_somebody_else_marks_nothing(tmp_path: Path) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    (target / "bundle.json").write_text(json.dumps({"entries": ["a.onnx"]}))
+    with pytest.raises(OutputError, match=r"bundle\.json: `asca export` did not write it"):
+        require_replaceable(target, *EXPORT)
+
+
+@pytest.mark.parametrize("foreign", ["notes.txt", ".hidden", "b.onnx", "folder/"])
+def test_an_earlier_output_with_a_foreign_file_is_not_replaced(tmp_path: Path, foreign: str) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    require_replaceable(target, *EXPORT)
+    (target / foreign).mkdir() if foreign.endswith("/") else (target / foreign).write_text("precious")
+    with pytest.raises(OutputError, match=f"{foreign.rstrip('/')}: `asca export` did not write it"):
+        require_replaceable(target, *EXPORT)
+
+
+def test_a_link_in_an_earlier_output_is_not_replaced(tmp_path: Path) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    (target / "a.onnx").rename(tmp_path / "a.onnx")
+    (target / "a.onnx").symlink_to(tmp_path / "a.onnx")
+    with pytest.raises(OutputError, match=r"a\.onnx: is a link"):
+        require_replaceable(target, *EXPORT)
+    assert names(target) == ["a.onnx", "bundle.json"]

@@ -1,0 +1,87 @@
+"""Reading settings: files, overrides, and mistakes in either that are told in one line."""
+
+from pathlib import Path
+
+import pytest
+
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import load_config
+from tests.config_files import refusal, write
+
+
+def test_overrides_win(tmp_path: Path) -> None:
+    path = write(tmp_path, "train: {epochs: 3, batch_size: 2}\n")
+    overrides = (
+        "train.epochs=5",
+        "model.network.cpa=none",
+        "model.spec.grid.zones = 1",
+        "model.spec.grid.v_max_m=0.16",
+        "augment.scale=[0.9, 1.1]",
+        "data.camera_view=false",
+        "name=a=b",
+        "train.epochs=7",
+    )
+    config = load_config(path, overrides)
+    assert (config.train.epochs, config.train.batch_size) == (7, 2)  # the last of two wins, the others stay
+    assert isinstance(config.model, PillarModel)
+    assert (config.model.network.cpa, config.augment.scale, config.data.camera_view) == ("none", (0.9, 1.1), False)
+    assert (config.model.spec.grid.nx, config.name) == (432, "a=b")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("train.epoch=3", "unknown key `train.epoch`; did you mean `epochs`?"),
+        ("trian.epochs=3", "unknown key `trian`; did you mean `train`?"),
+        ("model.spec.grid.zone=2", "unknown key `model.spec.grid.zone`; did you mean `zones`?"),
+        ("epochs=3", "unknown key `epochs`; known keys: name, model"),
+        ("train.epochs", "`train.epochs`: an override is written key.subkey=value, such as train.epochs=20"),
+        ("=3", "an override is written key.subkey=value"),
+        ("train.seed.first=3", "`seed` is a value, it has no keys"),
+        ("train.epochs.first=3", "`train.epochs` = {'first': 3}: input should be a valid integer"),
+        ("train.epochs=", "`train.epochs` = None: input should be a valid integer"),
+        ("train.epochs=[", "`train.epochs=[`: the value is not valid YAML"),
+        ("name=2026-99-99", "`name=2026-99-99`: the value is not valid YAML"),
+        ("train.epochs=0", "train.epochs = 0: must be at least 1"),
+        ("train.precision=64", "`train.precision` = 64: input should be 'auto', 'fp32' or 'bf16'"),
+        ("model.spec.grid.zones=9", "zones 9 must lie between 1 and 5"),
+    ],
+)
+def test_overrides_that_cannot_be(tmp_path: Path, override: str, message: str) -> None:
+    line = refusal(write(tmp_path, "train: {seed: 1}\n"), "model.loss.box_weight=1", override)
+    assert message in line and override in line
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("train: {epochs: [", "not valid YAML: "),
+        ("train:\n\tepochs: 3\n", "not valid YAML: "),
+        ("name: 2026-99-99\n", "not valid YAML: "),
+        ("- train\n- model\n", "expected `key: value` lines, found a list"),
+        ("just words\n", "expected `key: value` lines, found a str"),
+        ("train:\n", "`train` = None: input should be a dictionary"),
+        ("train: {epochs: many}\n", "`train.epochs` = 'many': input should be a valid integer"),
+        ("model: {network: {block_channels: [64, 128]}}\n", "missing key `model.network.block_channels.2`"),
+        (
+            "model: {network: {cpa: chanel}}\n",
+            "`model.network.cpa` = 'chanel': input should be 'none'",
+        ),
+        ("model: {spec: {grid: {zones: 9}}}\n", "zones 9 must lie between 1 and 5"),
+        ("model: {spec: {grid: {x_range_m: [0, 70]}}}\n", "x_range_m [0, 70] must be a multiple of 7.68 m"),
+        ("model: {spec: {classes: []}}\n", "classes is empty"),
+    ],
+)
+def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text)
+    assert refusal(path).startswith(f"{path}: {message}")
+
+
+def test_files_that_are_not_text(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_bytes(b"name: caf\xe9\n")
+    assert refusal(path).startswith(f"{path}: not valid YAML: ")
+    assert "cannot be read (No such file or directory); these ship: ablation_small, ablation_two_stage, " in refusal(
+        tmp_path / "missing.yaml"
+    )
+    assert "cannot be read (Is a directory)" in refusal(tmp_path)

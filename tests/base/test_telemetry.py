@@ -1,0 +1,216 @@
+"""Nothing reports: no socket to the network is opened, and nothing is written beside what was asked for."""
+
+import dataclasses
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import yaml
+
+from asca_deploy import sample_scan_path
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
+from tests.socket_filter import NOT_HERE
+from tests.test_layout import PACKAGES, ROOT, imports
+
+FILTER = Path(__file__).parent / "socket_filter.py"
+KEPT = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "OPENBLAS_CORETYPE")
+"""Of the environment. What tells onnxruntime that it is tested, such as CI, makes it keep still."""
+CACHES = (".cache/numba", ".cache/matplotlib", ".config/matplotlib")
+"""Below the home folder: compiled functions where the package's own folder cannot be written, and a list of fonts."""
+IMPORTERS = {
+    "asca_deploy/onnx_runtime.py": "onnxruntime",
+    "asca_export/qdq.py": "onnxruntime.quantization",  # its package has imported the former
+}
+
+
+def test_onnxruntime_is_imported_in_one_place() -> None:
+    found = {}
+    for package in (*PACKAGES, ROOT / "benchmarks"):
+        for path in package.rglob("*.py"):
+            names = [name for name in imports(path) if name.split(".")[0] == "onnxruntime"]
+            if names:
+                found[path.relative_to(package.parent).as_posix()] = names
+    assert set(found) == set(IMPORTERS)
+    assert all(name.startswith(IMPORTERS[path]) for path, names in found.items() for name in names)
+    (first,) = imports(ROOT / "export" / "asca_export" / "__init__.py")
+    assert first == "asca_deploy.onnx_runtime"
+
+
+def test_no_example_of_the_documentation_imports_it() -> None:
+    pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    assert len(pages) > 20
+    assert [page.name for page in pages if "import onnxruntime" in page.read_text(encoding="utf-8")] == []
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected", "may_report"),
+    [(None, "1", False), ("", "1", False), ("0", "0", True), ("true", "true", False)],
+)
+def test_what_the_user_has_set_stays(
+    monkeypatch: pytest.MonkeyPatch, stated: str | None, expected: str, may_report: bool
+) -> None:
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "1")
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+    if stated is not None:
+        monkeypatch.setenv("ORT_DISABLE_TELEMETRY", stated)
+    disable_telemetry()
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == expected and os.environ["RAY_USAGE_STATS_ENABLED"] == "1"
+    assert onnxruntime_may_report() == may_report
+
+
+FIRST_IMPORT = """
+import importlib, os, sys
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "onnxruntime":
+            assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
+            print("seen")
+
+sys.meta_path.insert(0, Watch())
+importlib.import_module(sys.argv[1])
+"""
+
+
+@pytest.mark.parametrize("module", ["asca_deploy", "asca_export.qdq", "asca_pillars.training.loop"])
+def test_it_is_off_before_anybody_imports_onnxruntime(module: str) -> None:
+    result = run([sys.executable, "-c", FIRST_IMPORT, module])
+    assert result.returncode == 0 and "seen" in result.stdout, result.stderr
+
+
+IMPORTED_BEFORE = """
+import onnxruntime
+calls = []
+onnxruntime.disable_telemetry_events = lambda: calls.append(1)
+import asca_deploy
+print(len(calls))
+"""
+
+
+@pytest.mark.parametrize(("stated", "calls"), [(None, "1"), ("0", "0")])
+def test_what_can_be_done_where_the_caller_has_imported_it_before(
+    tmp_path: Path, stated: str | None, calls: str
+) -> None:
+    environment = {"HOME": str(tmp_path)} | ({} if stated is None else {"ORT_DISABLE_TELEMETRY": stated})
+    result = run([sys.executable, "-c", IMPORTED_BEFORE], environment)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == calls
+
+
+def run(
+    command: list[Any], environment: dict[str, str] | None = None, cwd: Path | None = None
+) -> subprocess.CompletedProcess[str]:
+    kept = {name: os.environ[name] for name in KEPT if name in os.environ}
+    return subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, timeout=300, cwd=cwd, env=kept | (environment or {})
+    )
+
+
+@pytest.fixture(scope="module")
+def _filtered() -> None:
+    opened = run([sys.executable, FILTER, sys.executable, "-c", "import socket; socket.socket(socket.AF_INET)"])
+    if opened.returncode == NOT_HERE:
+        pytest.skip("needs Linux that lets a process filter its own system calls (seccomp)")
+    assert opened.returncode == -signal.SIGSYS, "the filter sees sockets"
+    look_up = "import socket; socket.gethostbyname('example.org')"
+    looked_up = run([sys.executable, FILTER, sys.executable, "-c", look_up])
+    assert looked_up.returncode == -signal.SIGSYS, "and looking up a host"
+
+
+class Fresh:
+    """A home folder, a folder for temporary files and one to work in, all empty."""
+
+    def __init__(self, root: Path) -> None:
+        self.home, self.temporary, self.work = (root / name for name in ("home", "tmp", "work"))
+        for folder in (self.home, self.temporary, self.work):
+            folder.mkdir(parents=True)
+
+    def run(self, *command: Any, **environment: str) -> subprocess.CompletedProcess[str]:
+        places = {"HOME": str(self.home), "TMPDIR": str(self.temporary), "PYTHONDONTWRITEBYTECODE": "1"}
+        return run([sys.executable, FILTER, *command], places | environment, self.work)
+
+    def files(self) -> Iterator[Path]:
+        """All but those of the caches, relative to the root."""
+        for folder in (self.home, self.temporary, self.work):
+            for path in folder.rglob("*"):
+                name = path.relative_to(folder).as_posix()
+                if path.is_file() and not (folder == self.home and name.startswith(CACHES)):
+                    yield path.relative_to(self.home.parent)
+
+
+@pytest.fixture
+def fresh(tmp_path: Path, _filtered: None) -> Fresh:
+    return Fresh(tmp_path / "fresh")
+
+
+ASCA = (sys.executable, "-c", "import sys; sys.argv[0] = 'asca'; from asca_pillars.cli.main import main; main()")
+
+DETECT = """
+import sys, time
+from asca_pillars import Detector, read_scan
+print(len(Detector("asca_small_sim_int8")(read_scan(sys.argv[1]).points)))
+time.sleep(float(sys.argv[2]))
+"""
+REPORT_S = 12.0
+"""onnxruntime 1.32 opens its first socket nine seconds after it was imported."""
+
+
+def test_a_process_that_detects_for_long(fresh: Fresh) -> None:
+    result = fresh.run(sys.executable, "-c", DETECT, sample_scan_path(), REPORT_S)
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) > 3
+    assert list(fresh.files()) == []
+
+
+@pytest.mark.skipif(not onnxruntime.__version__.startswith("1.32."), reason="about what onnxruntime 1.32 does")
+def test_reports_would_be_seen(fresh: Fresh) -> None:
+    result = fresh.run(*(sys.executable, "-c", DETECT, sample_scan_path(), 2 * REPORT_S), ORT_DISABLE_TELEMETRY="0")
+    assert result.returncode == -signal.SIGSYS
+    assert any(path.name == "deviceid" for path in fresh.files())
+
+
+@pytest.mark.parametrize(
+    ("command", "results"),
+    [
+        (("detect", "-o", "out"), "work/out/"),
+        (("detect", "-o", "out", "-b", "asca_small_sim_int8", "--provider", "openvino"), "work/out/"),
+        (("bench", "--rounds", "1", "--json", "out.json"), "work/out.json"),
+        (("doctor",), "work/nothing"),
+    ],
+    ids=["detect", "openvino", "bench", "doctor"],
+)
+def test_commands_of_the_runtime(fresh: Fresh, command: tuple[object, ...], results: str) -> None:
+    if "openvino" in command and importlib.util.find_spec("openvino") is None:
+        pytest.skip("needs openvino")
+    result = fresh.run(*ASCA, *command)
+    assert result.returncode == 0, result.stderr
+    assert [path for path in fresh.files() if not path.as_posix().startswith(results)] == []
+
+
+def test_training_and_export(fresh: Fresh, tmp_path: Path) -> None:
+    from tests.export.tiny import SCANS
+    from tests.scenes import write_dataset
+    from tests.training.test_loop import CONFIG
+
+    data, scans = write_dataset(tmp_path / "data", 3), tmp_path / "scans"
+    scans.mkdir()
+    for number, points in enumerate(SCANS):
+        np.save(scans / f"{number}.npy", points)
+    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1))
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(to_dict(config)))
+    for command in (
+        ("train", tmp_path / "tiny.yaml", "--data", data, "--out", "run"),
+        ("export", "run/checkpoints/last.ckpt", "--scans", scans, "-o", "bundle"),
+    ):
+        result = fresh.run(*ASCA, *command)
+        assert result.returncode == 0, f"{command[0]}: {result.stdout}{result.stderr}"
+    assert {path.parts[:2] for path in fresh.files()} == {("work", "run"), ("work", "bundle")}

@@ -1,0 +1,307 @@
+"""`asca eval` as a whole: text folders, a bundle and a checkpoint, what is written, and what is refused in one line."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+
+from asca_deploy import default_bundle_path
+from asca_deploy.manifest import load_pillar_bundle
+from asca_pillars.base.errors import AscaError
+from asca_pillars.base.installation import install_command
+from asca_pillars.cli import eval as command
+from asca_pillars.cli.eval_steps import Protocol
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.saved_checkpoint import save_checkpoint
+from tests.scenes import SPEC
+from tests.training.test_loop import CONFIG
+
+BASE_INSTALL = """
+import sys
+from importlib.machinery import PathFinder
+from pathlib import Path
+
+class BaseInstall(PathFinder):
+    @classmethod
+    def find_spec(cls, name, *rest):
+        if name.split(".")[0] in ("torch", "lightning", "numba", "sklearn", "scipy", "matplotlib", "pandas"):
+            return None
+        return super().find_spec(name, *rest)
+
+sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
+from asca_pillars.cli.eval import evaluate
+evaluate(predictions=Path("det"), labels=Path("gt"), out=Path("out"))
+"""
+
+
+def evaluate(
+    model: Path | None = None,
+    *,
+    data: Path | None = None,
+    predictions: Path | None = None,
+    labels: Path | None = None,
+    out: Path,
+    json_path: Path | None = None,
+    gallery: int | None = 0,
+    compare: Path | None = None,
+    score: list[str] | None = None,
+    min_score: float = 0.05,
+    provider: str = "cpu",
+    precision: str | None = None,
+    threads: int | None = 1,
+    protocol: Protocol = "kitti",
+    split: str | None = None,
+) -> dict:
+    """Run the command; what it wrote as JSON."""
+    command.evaluate(
+        model,
+        data=data,
+        split=split,
+        predictions=predictions,
+        labels=labels,
+        out=out,
+        json=json_path,
+        gallery=gallery,
+        compare=compare,
+        score=score,
+        min_score=min_score,
+        protocol=protocol,
+        provider=provider,
+        precision=precision,
+        threads=threads if predictions is None else None,
+    )
+    return json.loads((out / ("report.json" if protocol == "kitti" else "waymo.json")).read_text())
+
+
+def refusal(tmp_path: Path, **arguments) -> str:
+    with pytest.raises(AscaError) as caught:
+        evaluate(**({"out": tmp_path / "out"} | arguments))
+    message = str(caught.value)
+    assert "\n" not in message and not (tmp_path / "out" / "report.json").exists()
+    return message.replace(f"{tmp_path}/", "")
+
+
+def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    report = evaluate(**texts, out=tmp_path / "out", json_path=tmp_path / "deep" / "results.json", gallery=None)
+    assert json.loads((tmp_path / "deep" / "results.json").read_text()) == report
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.md", "curves.png"}
+    # Six cars, all found: the protocol's cap.
+    assert report["results"]["Car"]["3d"]["R40"] == pytest.approx([12.5] * 3)
+    assert report["frames"] == 3 and report["shortage"] is None and report["environment"]["packages"]["numpy"]
+    printed = capsys.readouterr().out
+    assert f"{texts['predictions']} against {texts['labels']}: 3 frames" in printed
+    assert "Car easy: only 6 counted objects; a perfect detector gets at most 12.5 R40, 18.2 R11" in printed
+
+
+def test_a_missing_prediction_file_is_said_everywhere(
+    tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (texts["predictions"] / "000001.txt").unlink()
+    report = evaluate(**texts, out=tmp_path / "out")
+    sentence = (
+        "evaluated on 2 of 3 frames: no prediction file for 000001; a frame without detections needs an empty file"
+    )
+    assert report["shortage"] == sentence and report["frames_without_predictions"] == ["000001"]
+    assert any(line.endswith(sentence) for line in capsys.readouterr().out.splitlines())
+    assert sentence in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_the_base_install_is_enough_for_everything_but_the_curves(tmp_path: Path, texts: dict[str, Any]) -> None:
+    shutil.copytree(texts["labels"], tmp_path / "gt")
+    command = [sys.executable, "-c", BASE_INSTALL]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0 and not result.stderr, result.stderr
+    assert f"No curves.png without matplotlib: {install_command('eval')}" in result.stdout.splitlines()
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.md"}
+
+
+def test_predictions_with_a_dataset_are_scored_on_its_split_and_drawn(
+    tmp_path: Path, root: Path, texts: dict[str, Any]
+) -> None:
+    (texts["predictions"] / "000002.txt").write_text("")
+    report = evaluate(predictions=texts["predictions"], data=root, out=tmp_path / "out", gallery=None, score=["0.95"])
+    assert report["frames"] == 2  # of three, because `val` lists two
+    names = {path.name for path in (tmp_path / "out" / "gallery").iterdir()}
+    assert names == {"001_000001.png", "002_000002.png", "index.md"}  # nothing reaches 0.95: four misses each
+    assert {point["score"] for point in report["operating_points"]} == {0.95}
+    evaluate(**texts, data=root, out=tmp_path / "out", gallery=None)
+    assert {path.name for path in (tmp_path / "out" / "gallery").iterdir()} == {"001_000002.png", "index.md"}
+
+
+def test_another_detector_is_drawn_beside_the_first(
+    tmp_path: Path, root: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, other, out = texts["predictions"], tmp_path / "other", tmp_path / "out"
+    shutil.copytree(found, other)
+    compared = {"predictions": found, "data": root, "out": out, "gallery": None, "compare": other}
+    evaluate(**compared)
+    assert {path.name for path in (out / "gallery").iterdir()} == {"index.md"}, "they are the same"
+    # As an evaluation of a model leaves it, whose scores of cars do not reach its own threshold.
+    about = {"model": {"name": "newer"}, "scores": {"Car": 0.95, "Pedestrian": 0.3, "Cyclist": 0.3}, "files": []}
+    (other / "made_by.json").write_text(json.dumps(about))
+    (other / "000001.txt").unlink()
+    capsys.readouterr()
+    evaluate(**compared)
+    assert {path.name for path in (out / "gallery").iterdir()} == {"001_000002.png", "index.md"}
+    index = (out / "gallery" / "index.md").read_text()
+    assert index.startswith(f"# {found} and newer: where they differ most\n")
+    assert "| [000002](001_000002.png) | 0 | 0 | 2 | 0 |\n" in index
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"--compare {other}: evaluated on 1 of 2 frames: no prediction file for 000001" in said
+
+
+def test_the_shipped_bundle_and_its_predictions_score_the_same(
+    tmp_path: Path, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for path in (root / "training" / "velodyne").iterdir():
+        write_scan(path, read_scan(path).points * np.array([1, 1, 1, 0.1], np.float32))  # darker than any street
+    report = evaluate(data=root, out=out, gallery=1)
+    assert "asca_sim_int8 on" in report["subject"] and report["frames"] == 2
+    assert report["model"]["min_score"] == 0.05 and len(report["model"]["sha256"]["encoder"]) == 64
+    own = {spec.name: spec.score_threshold for spec in load_pillar_bundle(default_bundle_path()).spec.classes}
+    assert {point["class_name"]: point["score"] for point in report["operating_points"]} == own
+    names = {path.name for path in (out / "predictions").iterdir()}
+    assert names == {"000001.txt", "000002.txt", "made_by.json"}
+    lines = "".join((out / "predictions" / f"00000{frame}.txt").read_text() for frame in (1, 2)).splitlines()
+    assert lines and all(float(line.split()[15]) >= 0.05 for line in lines)
+    assert len(list((out / "gallery").glob("*.png"))) == 1
+    assert "2 of 2 scans are unlike those that asca_sim_int8 was trained on" in capsys.readouterr().out
+    assert json.loads((out / "predictions" / "made_by.json").read_text())["scores"] == own
+    again = evaluate(predictions=out / "predictions", data=root, out=tmp_path / "again")
+    for key in ("results", "bands", "best_scores"):  # text has no thresholds of its own
+        assert again[key] == report[key]
+
+
+def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
+    torch.manual_seed(0)
+    save_checkpoint(tmp_path / "last.ckpt", Checkpoint(CONFIG, build_model(CONFIG.model), 7))
+    report = evaluate(tmp_path / "last.ckpt", data=root, out=tmp_path / "out", min_score=0.001, threads=None)
+    assert report["model"]["steps"] == 7 and report["model"]["provider"] == "torch cpu"
+    assert sorted(path.name for path in (tmp_path / "out" / "predictions").glob("*.txt")) == [
+        "000001.txt",
+        "000002.txt",
+    ]
+    assert "choose cpu, cuda or auto" in refusal(
+        tmp_path / "other", model=tmp_path / "last.ckpt", data=root, provider="x"
+    )
+    assert "precision reduced does not go with checkpoints" in refusal(
+        tmp_path / "other", model=tmp_path / "last.ckpt", data=root, precision="reduced"
+    )
+    assert "no such checkpoint" in refusal(tmp_path / "other", model=tmp_path / "none.ckpt", data=root)
+    assert (
+        refusal(tmp_path / "other", model=tmp_path / "last.ckpt", data=root, threads=0)
+        == f"threads 0 must lie between 1 and {4 * (os.cpu_count() or 1)}: this machine has {os.cpu_count()} CPUs"
+    )
+
+
+def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path, root: Path) -> None:
+    names = ("Forklift", "Pallet", "Crane")
+    classes = tuple(replace(item, name=name) for item, name in zip(SPEC.classes, names, strict=True))
+    config = replace(CONFIG, model=replace(CONFIG.model, spec=replace(SPEC, classes=classes)))  # type: ignore[arg-type]
+    save_checkpoint(tmp_path / "last.ckpt", Checkpoint(config, build_model(config.model), 7))
+    message = refusal(tmp_path, model=tmp_path / "last.ckpt", data=root, threads=None)
+    assert "detects Forklift" in message and "give --protocol waymo, which scores any class" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
+    det, gt = texts["predictions"], texts["labels"]
+    assert refusal(tmp_path) == "nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR"
+    assert refusal(tmp_path, predictions=det) == (
+        "--predictions det needs --labels DIR, or --data ROOT that has the labels"
+    )
+    assert refusal(tmp_path, labels=gt, data=root) == (
+        "--labels kitti/training/label_2 goes with --predictions DIR; a model is run on --data ROOT"
+    )
+    assert refusal(tmp_path, model=tmp_path / "b", predictions=det, labels=gt) == (
+        "b and --predictions det: give a model or its predictions, not both"
+    )
+    assert refusal(tmp_path, **texts, gallery=3) == "--gallery 3 draws scans: give --data ROOT that has them"
+    other = tmp_path / "out" / "predictions"
+    assert refusal(tmp_path, **texts, compare=det) == "--compare det draws scans: give --data ROOT that has them"
+    assert refusal(tmp_path, **texts, data=root, compare=det, gallery=0) == (
+        "--compare det draws scans: leave --gallery 0 out"
+    )
+    assert refusal(tmp_path, data=root, compare=other, gallery=None) == (
+        "--compare out/predictions: this evaluation writes there; give it another --out"
+    )
+    assert refusal(tmp_path, **texts, data=root, compare=det, protocol="waymo") == (
+        "--compare det belongs to the gallery of --protocol kitti; leave it out"
+    )
+    assert refusal(tmp_path, **texts, score=["nan"]) == "--score nan must be a number"
+    assert refusal(tmp_path, **texts, split="val") == (
+        "--split val is a list of the frames of a dataset: give --data ROOT, too"
+    )
+    assert refusal(tmp_path, data=root, score=["0.04"]) == (
+        "score 0.04 of Car is below --min-score 0.05, the lowest that asca_sim_int8 is run with; lower --min-score"
+    )
+    assert "bundle.json" in refusal(tmp_path, model=tmp_path, data=root)
+    assert "velodyne" in refusal(tmp_path, data=tmp_path)
+    (gt / "000002.txt").unlink()
+    assert "label_2/000002.txt: cannot read the labels" in refusal(tmp_path, data=root)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("protocol", ["kitti", "waymo"])
+def test_a_json_that_cannot_be_written_is_told_before_the_work(
+    tmp_path: Path, texts: dict[str, Any], protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setattr(f"asca_pillars.cli.eval_steps.report_{protocol}", lambda *_: pytest.fail("too late"))
+    message = refusal(tmp_path, **texts, protocol=protocol, json_path=tmp_path / "folder")
+    assert message == "folder: is a folder; choose a file's name"
+
+
+def test_a_class_that_kitti_does_not_know_is_left_out_and_named(
+    tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = evaluate(**texts, out=tmp_path / "before")
+    capsys.readouterr()
+    rename(texts["labels"], "Cyclist", "Forklift")
+    report = evaluate(**texts, out=tmp_path / "out")
+    assert report["types_left_out"] == ["Forklift"]
+    sentence = "Forklift: left out (3 labels, 0 detections), because KITTI's protocol scores Car, Pedestrian, Cyclist"
+    assert any(note.startswith(sentence) for note in report["notes"]) and sentence in " ".join(
+        capsys.readouterr().out.split()
+    )
+    for name in ("Car", "Pedestrian"):
+        assert report["results"][name] == expected["results"][name]
+    rename(texts["predictions"], "Cyclist", "forklift")
+    waymo = evaluate(**texts, out=tmp_path / "out", protocol="waymo")
+    forklift = next(item for item in waymo["results"] if item["class_name"] == "Forklift" and item["level"] == 2)
+    assert forklift["objects"] == 3 and forklift["AP"] == pytest.approx(100)
+
+
+def test_classes_that_are_all_unknown_are_refused(tmp_path: Path, texts: dict[str, Any]) -> None:
+    for folder in texts.values():
+        for name in CLASS_NAMES:
+            rename(folder, name, "Forklift")
+    assert refusal(tmp_path, **texts) == (
+        "kitti/training/label_2: neither labels nor predictions are of a class that KITTI's protocol scores "
+        "(Car, Pedestrian, Cyclist); they have Forklift: give --protocol waymo, which scores any class"
+    )
+
+
+def rename(folder: Path, name: str, other: str) -> None:
+    for path in folder.glob("*.txt"):
+        path.write_text(path.read_text().replace(f"{name} ", f"{other} "))
+
+
+def test_labels_against_themselves_reach_the_cap(tmp_path: Path, texts: dict[str, Any]) -> None:
+    report = evaluate(**texts, out=tmp_path / "out")
+    for name, objects in (("Car", 6), ("Pedestrian", 3), ("Cyclist", 3)):
+        for metric in ("bbox", "bev", "3d", "aos"):
+            assert_allclose(report["results"][name][metric]["R40"], 100 * (objects - 1) / 40)

@@ -1,0 +1,277 @@
+"""The command `asca` as a user meets it: what it prints, what it writes, and how it refuses."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from rich.text import Text
+from typer.main import get_command
+
+from asca_deploy import Detector, sample_scan_path
+from asca_pillars.base.installation import install_command
+from asca_pillars.base.schema import to_dict
+from asca_pillars.cli.main import app
+from asca_pillars.data.kitti import KittiSplit, read_labels
+from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.in_process import run_here
+from tests.scenes import make_scene, write_dataset
+from tests.training.test_loop import CONFIG
+
+WITHOUT_TORCH = """
+import sys
+from importlib.machinery import PathFinder
+
+class BaseInstall(PathFinder):
+    @classmethod
+    def find_spec(cls, name, *rest):
+        heavy = {"torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy"}
+        heavy |= {"matplotlib", "openvino", "rosbags", "mcap", "rerun"}
+        if name.split(".")[0] in heavy:
+            return None
+        return super().find_spec(name, *rest)
+
+sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
+from asca_pillars.cli.main import main
+main()
+"""
+
+
+def asca(*arguments: object, cwd: Path | None = None, code: str = WITHOUT_TORCH) -> subprocess.CompletedProcess:
+    """Run the command in its own process; without `code` of its own, torch cannot be imported there."""
+    environment = os.environ | {"COLUMNS": "120", "NO_COLOR": "1"}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=environment)
+
+
+def refusal(result: subprocess.CompletedProcess) -> str:
+    """The one line with which a command refused."""
+    assert result.returncode == 2, result.stdout + result.stderr
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("asca: "), result.stderr
+    return lines[0]
+
+
+def test_help_says_all_that_is_written() -> None:
+    """Words in brackets are styles to rich, which drops those that it does not know."""
+    commands = get_command(app).commands.items()  # type: ignore[attr-defined]
+    assert len(commands) > 5
+    for name, command in commands:
+        for each in (command, *command.params):
+            written = each.help or ""
+            assert Text.from_markup(written).plain == written.replace("\\[", "["), f"{name} {each.name}"
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys; from typer.testing import CliRunner; from asca_pillars.cli.main import app\n"
+        "result = CliRunner().invoke(app, ['--help']); assert result.exit_code == 0, result.output\n"
+        "print(result.output)\n"
+        "heavy = {'numpy', 'cv2', 'onnxruntime', 'torch', 'pydantic', 'yaml'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    for command in ("detect", "bench", "simulate", "inspect", "prepare", "train", "eval", "export", "ablate", "doctor"):
+        assert command in result.stdout
+
+
+def test_detect_finds_boxes_in_the_sample_without_torch(tmp_path: Path) -> None:
+    result = asca("detect", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "Car" in result.stdout and "FPS" in result.stdout and "pillarize" in result.stdout
+    out = tmp_path / "detections"
+    assert {path.name for path in out.iterdir()} == {"detections.jsonl", "street.json", "street_bev.png"}
+    boxes = json.loads((out / "street.json").read_text())["boxes"]
+    expected = Detector()(read_scan(sample_scan_path()).points)
+    assert [box["class"] for box in boxes] == expected.names and len(boxes) >= 3
+    assert np.asarray(cv2.imread(str(out / "street_bev.png"))).shape[1] >= 500
+
+
+def test_detect_writes_kitti_text_and_overlays_where_there_is_a_calibration(tmp_path: Path) -> None:
+    root = write_dataset(tmp_path / "kitti", 3)
+    split = KittiSplit(root)
+    split.image_path("000001").parent.mkdir()
+    cv2.imwrite(str(split.image_path("000001")), np.full((375, 1242, 3), 90, np.uint8))
+    split.calib_path("000002").unlink()
+    result = asca("detect", root / "training" / "velodyne", "--out", tmp_path / "out", "--score", 0.02)
+    assert result.returncode == 0, result.stderr
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"000000.txt", "000001.txt", "000001_image.png"} <= names
+    assert "000002.txt" not in names and "000000_image.png" not in names
+    for frame_id in ("000000", "000001"):
+        for item in read_labels(tmp_path / "out" / f"{frame_id}.txt"):
+            assert item.score is not None and 0 <= item.bbox[0] < item.bbox[2] <= 1242
+
+
+def test_bench_reports_stages_and_machine(tmp_path: Path) -> None:
+    result = asca("bench", "--rounds", 2, "--json", tmp_path / "report.json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert set(report["stages_ms"]) == {"input", "pillarize", "encode", "tables", "neck+head", "decode"}
+    assert report["fps"] == pytest.approx(1000 / report["total_ms"]["p50"])
+    assert report["cpu"] and report["threads"] >= 1 and report["cold_ms"] > 0
+
+
+def test_doctor_names_the_missing_extras() -> None:
+    result = asca("doctor")
+    assert result.returncode == 0, result.stderr
+    assert "provider cpu: ok" in result.stdout
+    assert install_command("train") in result.stdout and install_command("sim") in result.stdout
+    assert f"provider openvino is not installed: `{install_command('openvino')}`" in result.stdout
+    assert "auto takes cpu int8" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("truncated.bin", b"\0" * 30, "truncated.bin"),
+        ("empty.bin", b"", "empty"),
+        ("scan.las", b"x", "unknown suffix '.las'"),
+        ("bad.pcd", b"VERSION .7\nFIELDS a b\n", "bad.pcd"),
+    ],
+)
+def test_detect_refuses_bad_scans_in_one_line(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert message in refusal(run_here("detect", tmp_path / name, cwd=tmp_path))
+    assert not (tmp_path / "detections").exists()
+
+
+def test_detect_refuses_what_is_not_there(tmp_path: Path) -> None:
+    assert "no such file or folder" in refusal(asca("detect", tmp_path / "none.bin"))
+    assert "bundle.json" in refusal(run_here("detect", "--bundle", tmp_path, cwd=tmp_path))
+    assert "unknown provider 'gpu'" in refusal(run_here("detect", "--provider", "gpu", cwd=tmp_path))
+    assert "unknown precision 'half'" in refusal(run_here("detect", "--precision", "half", cwd=tmp_path))
+    assert "threads" in refusal(run_here("detect", "--threads", 0, cwd=tmp_path))
+
+
+def test_a_scan_without_points_gives_no_boxes(tmp_path: Path) -> None:
+    np.save(tmp_path / "empty.npy", np.empty((0, 4), np.float32))
+    result = run_here("detect", "empty.npy", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert json.loads((tmp_path / "detections" / "empty.json").read_text())["boxes"] == []
+
+
+def test_commands_whose_extra_is_missing_say_what_to_install(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("name: x\n")
+    message = refusal(asca("train", tmp_path / "config.yaml", "--data", tmp_path, "--out", tmp_path / "run"))
+    assert install_command("train") in message
+    assert install_command("train") in refusal(asca("export", "last.ckpt", "-o", tmp_path / "bundle"))
+    assert install_command("sim") in refusal(asca("simulate", tmp_path / "sim", "-n", 1))
+
+
+def test_train_refuses_typos_and_missing_data(tmp_path: Path) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text("train: {epoch: 3}\n")
+    command = ("train", config, "--data", tmp_path, "--out", tmp_path / "run")
+    assert "unknown key `train.epoch`; did you mean `epochs`?" in refusal(run_here(*command))
+    config.write_text("name: x\n")
+    assert "did you mean `batch_size`?" in refusal(run_here(*command, "-s", "train.batchsize=2"))
+    assert "velodyne" in refusal(run_here(*command))
+    assert not (tmp_path / "run").exists()
+
+
+def test_export_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
+    assert "no such checkpoint" in refusal(run_here("export", tmp_path / "none.ckpt", "-o", tmp_path / "b"))
+    (tmp_path / "damaged.ckpt").write_bytes(b"not a checkpoint")
+    assert "damaged.ckpt: not a checkpoint" in refusal(
+        run_here("export", tmp_path / "damaged.ckpt", "-o", tmp_path / "b")
+    )
+
+
+def test_from_training_to_boxes(tmp_path: Path) -> None:
+    """train, export, detect: every command takes what the one before it wrote; a killed export leaves nothing."""
+    data = write_dataset(tmp_path / "data", 4)
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
+    run, bundle = tmp_path / "run", tmp_path / "bundle"
+    trained = run_here("train", tmp_path / "config.yaml", "--data", data, "--out", run, "-s", "train.epochs=1")
+    assert trained.returncode == 0, trained.stderr
+    scans = tmp_path / "scans"
+    for seed in range(8):
+        write_scan(scans / f"{seed}.bin", make_scene(seed)[0])
+    export = ("export", run / "checkpoints" / "last.ckpt", "-o", bundle, "--scans", scans)
+
+    command = [sys.executable, "-c", "from asca_pillars.cli.main import main; main()", *map(str, export)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not list(tmp_path.glob(".bundle.asca-*")):
+        assert process.poll() is None, "the export ended before it could be killed"
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not bundle.exists()
+
+    assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
+    assert "such as Car=0.35" in refusal(run_here(*export, "--score", "Car:0.2"))
+    exported = run_here(*export, "--score", "Pedestrian=0.21", "--with-weights")
+    assert exported.returncode == 0, exported.stderr
+    assert (bundle / "weights.ckpt").read_bytes() == (run / "checkpoints" / "weights.ckpt").read_bytes()
+    shutil.copytree(bundle, tmp_path / "torn")
+    with (tmp_path / "torn" / "weights.ckpt").open("r+b") as file:
+        file.seek(3000)
+        file.write(b"bits")
+    torn = run_here("export", tmp_path / "torn", "-o", tmp_path / "of_torn", "--scans", scans)
+    assert "weights.ckpt: is damaged, or of another bundle" in refusal(torn)
+    golden = ("export", bundle, "--golden", "-o", tmp_path / "golden")
+    assert run_here(*golden).returncode == 0
+    assert "--with-weights is for a checkpoint" in refusal(run_here(*golden, "--with-weights"))
+    assert "parity on 8 scans" in exported.stdout
+    manifest = json.loads((bundle / "bundle.json").read_text())
+    assert manifest["provenance"]["command"].startswith("asca train")
+    before = {spec.name: spec.score_threshold for spec in CONFIG.model.spec.classes}
+    after = {spec["name"]: spec["score_threshold"] for spec in manifest["spec"]["classes"]}
+    assert after == before | {"Pedestrian": 0.21}
+    assert "add --int8" in refusal(run_here(*export, "--calibrate", scans))
+    others = tmp_path / "others"
+    for seed in range(7, 16):  # the first is among the scans of parity
+        write_scan(others / f"{seed}.bin", make_scene(seed)[0])
+    quantized = run_here(*export, "--int8", "--calibrate", others)
+    assert quantized.returncode == 0, quantized.stderr
+    assert "1 calibration scans left out" in quantized.stdout
+    assert "calibrated on 8 scans" in quantized.stdout and "logit error" in quantized.stdout.lower()
+    assert json.loads((bundle / "bundle.json").read_text())["precision"] == "int8"
+    assert not (bundle / "weights.ckpt").exists()
+    detected = asca("detect", scans, "--bundle", bundle, "--out", tmp_path / "out")
+    assert detected.returncode == 0, detected.stderr
+    assert len(list((tmp_path / "out").glob("*.json"))) == 8
+
+
+def test_simulated_frames_are_what_detect_reads(tmp_path: Path) -> None:
+    result = run_here("simulate", "sim", "-n", 2, "--view", "camera", "-w", 1, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    detected = run_here("detect", "sim/training/velodyne", cwd=tmp_path)
+    assert detected.returncode == 0, detected.stderr
+    assert sorted(path.name for path in (tmp_path / "detections").glob("*.txt")) == ["000000.txt", "000001.txt"]
+    assert "view" in refusal(run_here("simulate", "other", "--view", "rear", cwd=tmp_path))
+
+
+def test_a_file_where_the_output_folder_should_be(tmp_path: Path) -> None:
+    target = tmp_path / "detections"
+    target.write_text("keep me")
+    assert "detections" in refusal(run_here("detect", cwd=tmp_path))
+    assert target.read_text() == "keep me"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no limit on the size of files")
+def test_a_full_disk_loses_nothing_that_was_there(tmp_path: Path) -> None:
+    assert run_here("detect", cwd=tmp_path).returncode == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "detections").iterdir()}
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))\n"  # a write beyond it fails
+    assert "File too large" in refusal(asca("detect", cwd=tmp_path, code=limit + WITHOUT_TORCH))
+    assert {path.name: path.read_bytes() for path in (tmp_path / "detections").iterdir()} == before
+
+
+def test_version() -> None:
+    result = asca("--version")
+    assert result.returncode == 0 and result.stdout.strip().count(".") == 2
+
+
+def test_the_command_is_installed() -> None:
+    assert shutil.which("asca", path=str(Path(sys.executable).parent))

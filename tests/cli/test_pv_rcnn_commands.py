@@ -1,0 +1,54 @@
+"""PV-RCNN in 8 bits through the commands: exported, named, run, timed and evaluated like any bundle."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asca_pillars.cli import detect_archive
+from asca_pillars.cli.detect import detect
+from asca_pillars.scans.scan_reader import write_scan
+from tests.cli.test_detect_archive import Here
+from tests.export.pv_rcnn.test_int8 import CALIBRATION, random_checkpoint
+from tests.export.tiny import SCANS
+from tests.in_process import run_here
+from tests.saved_checkpoint import save_checkpoint
+from tests.scenes import write_dataset
+
+
+def write_scans(folder: Path, scans: list[np.ndarray]) -> Path:
+    for number, points in enumerate(scans):
+        write_scan(folder / f"{number}.bin", points)
+    return folder
+
+
+def test_an_8_bit_bundle_from_export_to_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(tmp_path / "last.ckpt", random_checkpoint())
+    scans, bundle = write_scans(tmp_path / "scans", SCANS), tmp_path / "bundle"
+    calibration = write_scans(tmp_path / "calibration", CALIBRATION)
+    exported = run_here(
+        *("export", tmp_path / "last.ckpt", "-o", bundle, "--scans", scans, "--int8", "--calibrate", calibration)
+    )
+    assert exported.returncode == 0, exported.stderr
+    assert "parity on 8 scans" in exported.stdout and "calibrated on 8 scans" in exported.stdout
+    assert "conv2_0" in exported.stdout and "blocks.0.0" in exported.stdout
+    assert json.loads((bundle / "bundle.json").read_text())["precision"] == "int8"
+
+    detected = run_here("detect", scans, "--bundle", bundle, "--out", tmp_path / "out", "--threads", 1)
+    assert detected.returncode == 0, detected.stderr
+    assert "cpu int8" in detected.stdout and len(list((tmp_path / "out").glob("*.json"))) == len(SCANS)
+    monkeypatch.setattr(detect_archive, "run_shards", Here())
+    monkeypatch.setattr(detect_archive, "require", lambda extra: None)
+    detect([scans], out=tmp_path / "archive", bundle=bundle, cluster="made-up:1")
+    lines = [(tmp_path / folder / "detections.jsonl").read_text() for folder in ("out", "archive")]
+    assert lines[0] == lines[1]
+    monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
+    timed = run_here("bench", scans / "0.bin", "--bundle", bundle, "--rounds", 2, "--threads", 1)
+    assert timed.returncode == 0 and "voxels" in timed.stdout, timed.stderr
+    data = write_dataset(tmp_path / "data", 3, val_frames=2)
+    evaluated = run_here(
+        *("eval", bundle, "--data", data, "--out", tmp_path / "eval", "--threads", 1),
+        *("--gallery", 0, "--min-score", 0.01),
+    )
+    assert evaluated.returncode == 0, evaluated.stderr

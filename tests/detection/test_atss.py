@@ -1,0 +1,182 @@
+"""Adaptive training sample selection against loops over all anchors, and by hand on a square grid."""
+
+import math
+import statistics
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES, make_anchors
+from asca_pillars.detection.targets import Targets, assign_targets
+from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
+from asca_pillars.geometry.overlap import aligned_bev_iou
+from tests.detection.test_targets import ANCHORS, CAR, COUNT, CYCLIST, PEDESTRIAN, labelled_boxes, places
+
+# Cells of 1 m with centers at 0, 1, ..., 8 m.
+SQUARE = make_anchors(np.arange(9.0), np.arange(9.0), KITTI_CLASSES)
+ROUNDING = 1e-6
+
+
+def assign(*labelled: tuple[int, list[float]], anchors: np.ndarray = SQUARE) -> Targets:
+    boxes = np.array([box for _, box in labelled], np.float32).reshape(-1, 7)
+    return assign_targets(anchors, KITTI_CLASSES, boxes, np.array([label for label, _ in labelled], np.int64), "atss")
+
+
+def candidates_twin(anchors: list[list[float]], box: list[float], label: int, count: int) -> list[int]:
+    """Of each yaw the nine nearest of all anchors of the class."""
+    chosen = []
+    for kind in (2 * label, 2 * label + 1):
+        own = range(kind, len(anchors), count)
+        chosen += sorted(own, key=lambda i: ((anchors[i][0] - box[0]) ** 2 + (anchors[i][1] - box[1]) ** 2, i))[:9]
+    return chosen
+
+
+def depth_inside(center: list[float], box: list[float]) -> float:
+    """How far a place lies inside a box seen from above, negative outside, metres."""
+    dx, dy = center[0] - box[0], center[1] - box[1]
+    along = dx * math.cos(box[6]) + dy * math.sin(box[6])
+    across = dy * math.cos(box[6]) - dx * math.sin(box[6])
+    return min(box[3] / 2 - abs(along), box[4] / 2 - abs(across))
+
+
+def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
+    """State of every anchor of ANCHORS, and the box of each positive one."""
+    anchors = ANCHORS.reshape(-1, 7).astype(np.float64).tolist()
+    overlap = aligned_bev_iou(ANCHORS.reshape(-1, 7), boxes).tolist()
+    claims: dict[int, list[tuple[bool, float, int]]] = {}
+    for row, (box, label) in enumerate(zip(boxes.astype(np.float64).tolist(), labels.tolist(), strict=True)):
+        if label == IGNORED:
+            continue
+        candidates = candidates_twin(anchors, box, label, COUNT)
+        values = [overlap[index][row] for index in candidates]
+        floor = statistics.fmean(values) + statistics.pstdev(values)
+        for index, value in zip(candidates, values, strict=True):
+            if value == 0:
+                continue
+            if value == max(values):
+                claims.setdefault(index, []).append((True, value, row))
+                continue
+            depth = depth_inside(anchors[index], box)
+            assume(abs(value - floor) > ROUNDING and abs(depth) > ROUNDING)
+            if value > floor and depth > 0:
+                claims.setdefault(index, []).append((False, value, row))
+    matches = {index: max(rivals)[2] for index, rivals in claims.items()}
+    states = []
+    for index, row in enumerate(overlap):
+        negative_iou = KITTI_CLASSES[index % COUNT // 2].negative_iou
+        excused = any(label == IGNORED and iou >= negative_iou for label, iou in zip(labels, row, strict=True))
+        states.append(1 if index in matches else -1 if excused else 0)
+    return states, matches
+
+
+@settings(max_examples=40)
+@given(labelled_boxes())
+def test_equals_loops_over_all_anchors(labelled: tuple[np.ndarray, np.ndarray]) -> None:
+    boxes, labels = labelled
+    states, matches = assign_twin(boxes, labels)
+    targets = assign_targets(ANCHORS, KITTI_CLASSES, boxes, labels, "atss")
+    assert targets.state.reshape(-1).tolist() == states
+    assert targets.positives.tolist() == sorted(matches)
+    assert targets.matched.tolist() == [matches[index] for index in sorted(matches)]
+    np.testing.assert_array_equal(targets.anchors, ANCHORS.reshape(-1, 7)[targets.positives])
+    decoded = decode_boxes(targets.residuals, targets.directions, targets.anchors)
+    np.testing.assert_allclose(decoded[:, :6], boxes[targets.matched, :6], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(wrap_angle(decoded[:, 6] - boxes[targets.matched, 6]), 0, atol=2e-6)
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from([CAR, PEDESTRIAN, CYCLIST]), st.floats(2.2, 9.5), st.floats(-1.7, 3.0), st.floats(-math.pi, 3.14)
+)
+def test_an_object_on_the_grid_is_found_by_its_best_anchor(label: int, x: float, y: float, yaw: float) -> None:
+    spec = KITTI_CLASSES[label]
+    box = [x, y, -0.9, spec.length_m, spec.width_m, spec.height_m, yaw]
+    targets = assign((label, box), anchors=ANCHORS)
+    own = ANCHORS[..., 2 * label : 2 * label + 2, :].reshape(-1, 7)
+    best = aligned_bev_iou(own, np.array([box], np.float32)).max()
+    assert aligned_bev_iou(targets.anchors, np.array([box], np.float32)).max() == best > 0
+    assert {anchor // 2 for _, _, anchor in places(targets, 1)} == {label}
+    assert len(targets.positives) <= 18 and not (targets.state == -1).any()
+
+
+@settings(max_examples=40)
+@given(labelled_boxes(), st.randoms())
+def test_the_order_of_the_boxes_does_not_matter(labelled: tuple[np.ndarray, np.ndarray], random) -> None:  # type: ignore[no-untyped-def]
+    boxes, labels = labelled
+    order = list(range(len(boxes)))
+    random.shuffle(order)
+    one = assign_targets(ANCHORS, KITTI_CLASSES, boxes, labels, "atss")
+    other = assign_targets(ANCHORS, KITTI_CLASSES, boxes[order], labels[order], "atss")
+    # Two boxes that are equally good for an anchor are told apart by their order alone.
+    iou = aligned_bev_iou(ANCHORS.reshape(-1, 7)[one.positives], boxes[labels != IGNORED])
+    ranked = np.sort(iou, axis=1)
+    assume(ranked.shape[1] < 2 or not ((ranked[:, -1] == ranked[:, -2]) & (ranked[:, -1] > 0)).any())
+    np.testing.assert_array_equal(one.state, other.state)
+    np.testing.assert_array_equal(one.matched, np.array(order, np.int64)[other.matched])
+
+
+@pytest.mark.parametrize(("length_m", "columns"), [(1.95, {4}), (2.05, {3, 4, 5})])
+def test_positives_by_hand(length_m: float, columns: set[int]) -> None:
+    """A short car on the center of a cell, whose neighbors overlap it enough, but stand 1 m away.
+
+    1.95 x 1.6 m within an anchor of 3.9 x 1.6: 0.5; 1 m along x it shares 1.925 x 1.6, 0.4904; 1 m along y 1.95 x 0.6,
+    0.1429; both, 0.1408. The turned anchor, 1.6 x 3.9: 0.3765, the same along y, and 0.1527 wherever x differs.
+    Mean of 0.5, 2 x 0.4904, 2 x 0.1429, 4 x 0.1408, 3 x 0.3765 and 6 x 0.1527: 0.2431, standard deviation 0.1399:
+    positive from 0.3830 within 0.975 m. With 2.05 m the neighbors' centers lie inside.
+    """
+    targets = assign((CAR, [4.0, 3.0, -1.0, length_m, 1.6, 1.56, 0.0]))
+    assert places(targets, 1) == {(3, column, 0) for column in columns}
+    assert not (targets.state == -1).any()
+
+
+def test_a_pedestrian_between_the_centers_keeps_its_best_anchor() -> None:
+    """0.45 and 0.4 m from the nearest center, beyond its faces; the turned anchor shares 0.25 x 0.3, the other 0.07."""
+    targets = assign((PEDESTRIAN, [3.45, 3.4, -0.6, 0.8, 0.6, 1.73, 0.0]))
+    assert places(targets, 1) == {(3, 3, 3)}
+
+
+def test_an_anchor_of_two_boxes() -> None:
+    """The car of the anchor's size would also have the next column, which it overlaps by 2.9 / 4.9 = 0.59.
+
+    A narrow one, 3.0 x 1.0 m, lies within that anchor, 3 / 6.24 = 0.48, and within no other: it is its own. A short one
+    on the car's own center has nothing better either, but overlaps it less.
+    """
+    fitting = [4.0, 3.0, -1.0, 3.9, 1.6, 1.56, 0.0]
+    narrow, short = [5.4, 3.0, -1.0, 3.0, 1.0, 1.56, 0.0], [4.0, 3.1, -1.0, 2.0, 1.6, 1.56, 0.0]
+    for other, column, winner in ((narrow, 5, narrow), (short, 4, fitting)):
+        for order in ([fitting, other], [other, fitting]):
+            targets = assign(*((CAR, box) for box in order))
+            taken = dict(zip(targets.positives.tolist(), targets.matched.tolist(), strict=True))
+            assert taken[(3 * 9 + column) * COUNT] == order.index(winner)
+            assert taken[(3 * 9 + 3) * COUNT] == order.index(fitting)
+
+
+def test_without_thresholds_only_ignored_boxes_ignore() -> None:
+    box = [4.0, 3.0, -1.0, 3.9, 1.6, 1.56, 0.0]
+    alone, both, ignored = assign((CAR, box)), assign((CAR, box), (IGNORED, box)), assign((IGNORED, box))
+    assert places(alone, 1) == places(both, 1) == {(3, column, 0) for column in (3, 4, 5)}
+    assert not (alone.state == -1).any() and not (ignored.state == 1).any()
+    assert places(ignored, -1) == {(3, column, 0) for column in (3, 4, 5)}
+    assert not (both.state == -1).any()
+
+
+@pytest.mark.parametrize(("x", "y"), [(-3.0, 4.0), (12.0, 4.0), (500.0, 0.0)])
+def test_boxes_far_outside_change_nothing(x: float, y: float) -> None:
+    assert not assign((PEDESTRIAN, [x, y, -0.6, 0.8, 0.6, 1.73, 0.0])).state.any()
+
+
+def test_fewer_cells_than_candidates() -> None:
+    few = make_anchors(np.arange(2.0), np.arange(3.0), KITTI_CLASSES)
+    targets = assign((CYCLIST, [1.0, 2.0, -0.6, 1.76, 0.6, 1.73, 0.0]), anchors=few)
+    assert (2, 1, 4) in places(targets, 1)
+
+
+def test_no_boxes() -> None:
+    targets = assign()
+    assert not targets.state.any() and targets.state.dtype == np.int8
+    shapes = [part.shape for part in (targets.positives, targets.anchors, targets.residuals, targets.matched)]
+    assert shapes == [(0,), (0, 7), (0, 7), (0,)]
+    kinds = (targets.positives, targets.anchors, targets.residuals, targets.directions, targets.matched)
+    assert [part.dtype for part in kinds] == [np.int64, np.float32, np.float32, np.int64, np.int64]

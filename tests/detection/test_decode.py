@@ -1,0 +1,213 @@
+"""`decode` against a plain loop over anchors, and head maps that hold nothing or nonsense."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.anchors import KITTI_CLASSES, make_anchors
+from asca_pillars.detection.decode import HeadMaps, PostProcess, decode
+from asca_pillars.geometry.boxes import decode_boxes, encode_boxes
+from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.ops.pillar.grid import PillarGrid
+
+GRID = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))
+CLASSES = tuple(
+    dataclasses.replace(spec, score_threshold=score) for spec, score in zip(KITTI_CLASSES, (0.5, 0.3, 0.4), strict=True)
+)
+ANCHORS = make_anchors(*GRID.head_centers_m(), CLASSES)
+HEIGHT, WIDTH, COUNT, _ = ANCHORS.shape
+NAMES = ("Car", "Pedestrian", "Cyclist")
+
+
+def quiet_maps() -> HeadMaps:
+    """Head maps in which every anchor says no."""
+    return HeadMaps(
+        scores=np.full((COUNT, HEIGHT, WIDTH), -10.0, np.float32),
+        boxes=np.zeros((7 * COUNT, HEIGHT, WIDTH), np.float32),
+        directions=np.zeros((2 * COUNT, HEIGHT, WIDTH), np.float32),
+    )
+
+
+def write(maps: HeadMaps, anchor: int, row: int, column: int, box: np.ndarray, logit: float) -> None:
+    """Let one anchor report a box."""
+    residuals, direction = encode_boxes(box, ANCHORS[row, column, anchor])
+    maps.scores[anchor, row, column] = logit
+    maps.boxes[7 * anchor : 7 * anchor + 7, row, column] = residuals
+    maps.directions[2 * anchor + direction, row, column] = 1.0
+
+
+def noisy_maps(seed: int, mean_logit: float) -> HeadMaps:
+    rng = np.random.default_rng(seed)
+    return HeadMaps(
+        scores=rng.normal(mean_logit, 2.0, (COUNT, HEIGHT, WIDTH)).astype(np.float32),
+        boxes=rng.normal(0, 0.3, (7 * COUNT, HEIGHT, WIDTH)).astype(np.float32),
+        directions=rng.normal(0, 1, (2 * COUNT, HEIGHT, WIDTH)).astype(np.float32),
+    )
+
+
+def decode_twin(maps: HeadMaps, post: PostProcess) -> list[tuple[float, int, np.ndarray]]:
+    """(logit, label, box) of each detection, best first: one anchor at a time, no shortcuts."""
+    reported = []
+    for label, spec in enumerate(CLASSES):
+        found = []
+        for anchor in (2 * label, 2 * label + 1):
+            for row, column in np.ndindex(HEIGHT, WIDTH):
+                logit = float(maps.scores[anchor, row, column])
+                if 1 / (1 + math.exp(-logit)) >= spec.score_threshold:
+                    residuals = maps.boxes[7 * anchor : 7 * anchor + 7, row, column]
+                    direction = maps.directions[2 * anchor : 2 * anchor + 2, row, column].argmax()
+                    found.append((logit, label, decode_boxes(residuals, direction, ANCHORS[row, column, anchor])))
+        found = sorted(found, key=lambda item: -item[0])[: post.candidates]
+        kept: list[tuple[float, int, np.ndarray]] = []
+        for item in found:
+            better = np.array([other[2] for other in kept], np.float32).reshape(-1, 7)
+            if (bev_iou(item[2][None], better) <= post.nms_iou).all():
+                kept.append(item)
+        reported += kept
+    return sorted(reported, key=lambda item: -item[0])[: post.max_detections]
+
+
+@settings(max_examples=15)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([-6.0, -4.0]),
+    st.sampled_from([0.01, 0.3]),
+    st.sampled_from([20, 1000]),
+    st.sampled_from([5, 100]),
+    st.booleans(),
+    st.booleans(),
+)
+@example(0, -4.0, 0.3, 20, 100, False, False)  # more anchors than candidates
+@example(1, -4.0, 0.3, 20, 100, True, True)  # and equal ones among the last to get in
+def test_equals_a_plain_loop(
+    seed: int, mean_logit: float, nms_iou: float, candidates: int, max_detections: int, ties: bool, channels_last: bool
+) -> None:
+    maps, post = noisy_maps(seed, mean_logit), PostProcess(nms_iou, candidates, max_detections)
+    if ties:
+        maps = maps._replace(scores=np.round(maps.scores))
+    if channels_last:  # as the backbone leaves them
+        maps = HeadMaps(*(np.moveaxis(np.moveaxis(m, 0, -1).copy(), -1, 0) for m in maps))
+    detections = decode(maps, ANCHORS, CLASSES, post)
+    expected = decode_twin(maps, post)
+    assert detections.labels.tolist() == [label for _, label, _ in expected]
+    np.testing.assert_allclose(detections.scores, [1 / (1 + math.exp(-x)) for x, _, _ in expected], rtol=1e-6)
+    np.testing.assert_array_equal(detections.boxes, np.reshape([box for _, _, box in expected], (-1, 7)))
+    assert detections.class_names == NAMES
+
+
+def test_boxes_come_back_from_the_maps() -> None:
+    maps = quiet_maps()
+    car = np.array([9.1, 3.3, -0.9, 4.2, 1.7, 1.5, 2.8], np.float32)
+    cyclist = np.array([4.0, -1.0, -0.5, 1.8, 0.5, 1.7, -1.4], np.float32)
+    write(maps, 1, 20, 12, car, 2.0)  # a car's 90 degree anchor
+    write(maps, 4, 7, 3, cyclist, 3.0)
+    detections = decode(maps, ANCHORS, CLASSES, PostProcess())
+    np.testing.assert_allclose(detections.boxes, [cyclist, car], atol=1e-5)
+    np.testing.assert_allclose(detections.scores, 1 / (1 + np.exp([-3.0, -2.0])), rtol=1e-6)
+    assert detections.names == ["Cyclist", "Car"]
+    assert (detections.boxes.dtype, detections.scores.dtype, detections.labels.dtype) == (
+        np.float32,
+        np.float32,
+        np.int64,
+    )
+
+
+def test_suppression_keeps_classes_apart() -> None:
+    maps = quiet_maps()
+    box = np.array([9.0, 3.0, -0.8, 1.9, 0.7, 1.7, 0.1], np.float32)
+    for anchor, logit in ((2, 1.0), (3, 2.0), (4, 1.5)):  # pedestrian twice, cyclist
+        write(maps, anchor, 19, 12, box, logit)
+    assert decode(maps, ANCHORS, CLASSES, PostProcess()).names == ["Pedestrian", "Cyclist"]
+
+
+def test_each_class_has_its_threshold() -> None:
+    maps = quiet_maps()
+    for label in range(3):
+        # A score of 0.35: enough for a pedestrian alone.
+        write(maps, 2 * label, 5, 10 * label, ANCHORS[5, 10 * label, 2 * label], math.log(0.35 / 0.65))
+    assert decode(maps, ANCHORS, CLASSES, PostProcess()).names == ["Pedestrian"]
+
+
+@pytest.mark.parametrize(("threshold", "reported"), [(0.0, 100), (1.0, 0)])
+def test_thresholds_of_zero_and_one(threshold: float, reported: int) -> None:
+    classes = tuple(dataclasses.replace(spec, score_threshold=threshold) for spec in CLASSES)
+    assert len(decode(quiet_maps(), ANCHORS, classes, PostProcess())) == reported
+
+
+def test_cells_that_a_masked_neck_never_looks_at_are_not_reported_at_threshold_zero() -> None:
+    classes = tuple(dataclasses.replace(spec, score_threshold=0.0) for spec in CLASSES)
+    maps = quiet_maps()
+    maps.scores[:] = -1e4
+    write(maps, 0, 5, 10, ANCHORS[5, 10, 0], -20.0)
+    assert len(decode(maps, ANCHORS, classes, PostProcess())) == 1
+
+
+def test_nothing_found() -> None:
+    detections = decode(quiet_maps(), ANCHORS, CLASSES, PostProcess())
+    assert len(detections) == 0 and detections.boxes.shape == (0, 7)
+    assert detections.class_names == NAMES and detections.labels.dtype == np.int64
+
+
+def test_numbers_that_overflowed_give_no_boxes() -> None:
+    maps = quiet_maps()
+    good = np.array([9.1, 3.3, -0.9, 4.2, 1.7, 1.5, 0.2], np.float32)
+    write(maps, 0, 20, 12, good, 0.5)
+    maps.scores[0, 0, :4] = 5.0
+    maps.boxes[0, 0, 0] = np.inf  # x of anchor 0
+    maps.boxes[3, 0, 1] = np.nan  # length
+    maps.boxes[6, 0, 2] = -np.inf  # yaw
+    maps.boxes[4, 0, 3] = 200.0  # width: exp(200) is infinite in float32, and is held back
+    maps.scores[1, 0, 0] = np.nan
+    maps.scores[0, 0, 4] = 5.0
+    maps.boxes[1, 0, 4] = 3e38  # y: beyond float32 once multiplied by the diagonal
+    detections = decode(maps, ANCHORS, CLASSES, PostProcess(nms_iou=1.0))
+    assert np.isfinite(detections.boxes).all()
+    np.testing.assert_allclose(detections.boxes[:, 4], [160, 1.7], rtol=1e-5)
+
+
+def test_scores_do_not_overflow() -> None:
+    maps = quiet_maps()
+    classes = tuple(dataclasses.replace(spec, score_threshold=0.0) for spec in CLASSES)
+    maps.scores[:] = -1e4
+    write(maps, 0, 20, 12, ANCHORS[20, 12, 0], 1e4)
+    scores = decode(maps, ANCHORS, classes, PostProcess()).scores
+    assert scores[0] == 1 and (scores[1:] == 0).all()
+
+
+def test_maps_of_another_model_are_refused() -> None:
+    maps = quiet_maps()
+    swapped = HeadMaps(*(m.transpose(0, 2, 1) for m in maps))
+    with pytest.raises(ValueError, match=r"\(6, 32, 56\).*not.*\(6, 56, 32\)"):
+        decode(swapped, ANCHORS, CLASSES, PostProcess())
+    with pytest.raises(ValueError, match="2 classes"):
+        decode(maps, ANCHORS, CLASSES[:2], PostProcess())
+
+
+@pytest.mark.parametrize("settings", [{"nms_iou": -0.1}, {"nms_iou": 1.1}, {"candidates": 0}, {"max_detections": 0}])
+def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(settings))):
+        PostProcess(**settings)  # type: ignore[arg-type]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.1, 1.0]))
+def test_rows_of_active_cells_decode_as_maps_in_which_the_others_say_no(seed: int, share: float) -> None:
+    maps, quiet = noisy_maps(seed, -1.0), quiet_maps()
+    cells = np.flatnonzero(np.random.default_rng(seed).random(HEIGHT * WIDTH) < share)
+    for part, silent in zip(maps, quiet, strict=True):
+        silent.reshape(len(part), -1)[:, cells] = part.reshape(len(part), -1)[:, cells]
+    rows = HeadMaps(*(np.ascontiguousarray(part.reshape(len(part), -1)[:, cells].T) for part in maps))
+    expected, found = (
+        decode(quiet, ANCHORS, CLASSES, PostProcess()),
+        decode(rows, ANCHORS, CLASSES, PostProcess(), cells),
+    )
+    np.testing.assert_array_equal(found.boxes, expected.boxes)
+    np.testing.assert_array_equal(found.scores, expected.scores)
+    np.testing.assert_array_equal(found.labels, expected.labels)
+    with pytest.raises(ValueError, match="must have shapes"):
+        decode(rows, ANCHORS, CLASSES, PostProcess(), np.arange(len(cells) + 1))

@@ -1,0 +1,235 @@
+"""From a checkpoint to a proven bundle: parity for every reading, and refusal when the graphs are not the model."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+import typer
+
+from asca_deploy import Detector
+from asca_deploy.manifest import load_pillar_bundle, write_bundle_manifest
+from asca_deploy.pillar.pipeline import PillarPipeline
+from asca_export import graphs, reissue
+from asca_export.fast_forms import FastBackbone
+from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
+from asca_export.pillar.export import export_bundle
+from asca_pillars.base.errors import ExportError
+from asca_pillars.config.pillar import CpaReading
+from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.ops.pillar.prepare import PillarLimits
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.measure_input import measure_expected_input
+from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.export.tiny import SCANS, tiny_checkpoint, tiny_detector
+from tests.scenes import SPEC
+
+Exports = Callable[[CpaReading], Path]
+READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point", "linear")
+
+
+@pytest.mark.parametrize("cpa", READINGS)
+def test_a_bundle_tells_what_it_is_and_that_its_parity_was_kept(exported: Exports, cpa: CpaReading) -> None:
+    bundle = load_pillar_bundle(exported(cpa))
+    assert bundle.spec == SPEC and bundle.pillar.cpa == cpa and bundle.provenance.steps == 0
+    parity = bundle.parity
+    assert parity is not None and parity.scans == len(SCANS)
+    assert 0 < parity.head_maps_max_abs_error <= MAP_TOLERANCE
+    assert parity.box_max_error_m <= BOX_TOLERANCE_M and parity.yaw_max_error_rad <= YAW_TOLERANCE_RAD
+
+
+@pytest.mark.parametrize("cpa", READINGS)
+def test_a_bundle_finds_what_its_checkpoint_finds(exported: Exports, cpa: CpaReading) -> None:
+    """Not by the exporter's own report; one scan, for PyTorch takes seconds of attention among points."""
+    checkpoint, (points, *_) = tiny_checkpoint(cpa), SCANS
+    found = Detector(exported(cpa), score_threshold=0.0, threads=1)(points)
+    wanted = ScanDetector(checkpoint.detector, SPEC.with_score_threshold(0.0))(points)
+    assert len(found) == len(wanted) > 0
+    np.testing.assert_allclose(found.boxes, wanted.boxes, atol=1e-2)
+    np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-3)
+    np.testing.assert_array_equal(found.labels, wanted.labels)
+
+
+def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
+    """Features of 1e5 differ by more than 1e-3 from rounding alone, and the network that follows divides it away."""
+    checkpoint = tiny_checkpoint("none")
+    assert isinstance(checkpoint.detector, PillarDetector)
+    encode, first = checkpoint.detector.encode, checkpoint.detector.neck.get_submodule("blocks.0.0")
+    assert isinstance(first, torch.nn.Conv2d)
+    with torch.no_grad():
+        encode.norm.weight.mul_(1e5)
+        encode.norm.bias.mul_(1e5)
+        first.weight.div_(1e5)
+    parity = export_bundle(checkpoint, tmp_path, SCANS).parity
+    assert parity is not None and parity.head_maps_max_abs_error <= MAP_TOLERANCE
+
+
+def test_graphs_carry_the_contract(exported: Exports) -> None:
+    folder = exported("channel")
+    for name in ("encoder.onnx", "backbone.onnx"):
+        model = onnx.load(folder / name)
+        properties = {item.key: json.loads(item.value) for item in model.metadata_props}
+        assert properties["spec"]["grid"]["zones"] == SPEC.grid.zones
+        assert [spec["name"] for spec in properties["spec"]["classes"]] == list(SPEC.class_names)
+        assert b"site-packages" not in (folder / name).read_bytes()  # nor any other folder of this machine
+    encoder = onnx.load(folder / "encoder.onnx").graph
+    assert [node.name for node in encoder.input] == ["features", "pillar_index", "point_counts"]
+    assert encoder.input[0].type.tensor_type.shape.dim[0].dim_param  # the number of points is dynamic
+    backbone = onnx.load(folder / "backbone.onnx").graph
+    assert [node.name for node in backbone.output] == ["scores", "boxes", "directions"]
+
+
+def test_encoder_gives_the_same_features_every_time(exported: Exports) -> None:
+    """onnxruntime's threads race for the repeated indices of ScatterND: the runtime has to keep them out."""
+    pipeline = Detector(exported("none"), threads=2).pipeline
+    rng = np.random.default_rng(0)
+    points = rng.uniform((5, -6, -2, 0), (25, 7, 0, 1), (12000, 4)).astype(np.float32)
+    assert isinstance(pipeline, PillarPipeline)
+    pillars = pipeline.pillarize(points)
+    assert pillars.point_counts.max() > 4  # indices repeat
+    first = pipeline.encode(pillars).copy()
+    assert all(np.array_equal(pipeline.encode(pillars), first) for _ in range(300))
+
+
+def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
+    exported: Exports, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(exported("channel"), tmp_path / "bundle")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()}
+    other = tiny_detector("channel")
+    with torch.no_grad():
+        other.head.get_parameter("boxes.bias").add_(0.01)
+    export_backbone = graphs.export_backbone
+    wrong = FastBackbone(other)
+    monkeypatch.setattr(graphs, "export_backbone", lambda _, shape, path: export_backbone(wrong, shape, path))
+    with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime part at stage head `boxes`: .* 0\.01"):
+        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["bundle"], "temporary files are left"
+
+
+def test_the_expected_input_is_the_checkpoints_own(exported: Exports, tmp_path: Path) -> None:
+    checkpoint, measured = tiny_checkpoint("none"), load_pillar_bundle(exported("none"))
+    assert measured.expected_input == measure_expected_input(SCANS, checkpoint.config.data.camera_view)
+    assert measured.expected_input_from == "export"
+    known = ExpectedInput((1, 2), (0.1, 0.2), None, camera_view=False)
+    copied = export_bundle(checkpoint._replace(expected_input=known), tmp_path / "copied", SCANS)
+    assert load_pillar_bundle(tmp_path / "copied") == copied
+    assert (copied.expected_input, copied.expected_input_from) == (known, "training")
+
+
+def test_a_bundle_issued_again_runs_the_same_networks(exported: Exports, tmp_path: Path) -> None:
+    folder = shutil.copytree(exported("none"), tmp_path / "old")
+    described = load_pillar_bundle(folder)
+    provenance = replace(described.provenance, weights_file="weights.ckpt")
+    write_bundle_manifest(folder, replace(described, provenance=provenance))
+    (folder / "weights.ckpt").write_bytes(b"weights")
+    (tmp_path / "scans").mkdir()
+    for number, points in enumerate(SCANS[:2]):
+        write_scan(tmp_path / "scans" / f"{number}.bin", points)
+    reissue.main(folder, tmp_path / "scans", tmp_path / "new", camera_view=True, training=True)
+    old, new = load_pillar_bundle(folder), load_pillar_bundle(tmp_path / "new")
+    assert (tmp_path / "new" / "weights.ckpt").read_bytes() == b"weights"
+    assert new.expected_input == measure_expected_input(SCANS[:2], camera_view=True)
+    assert new == replace(old, expected_input=new.expected_input, expected_input_from="training", graphs=new.graphs)
+    with pytest.raises(typer.BadParameter, match="exists"):
+        reissue.main(folder, tmp_path / "scans", tmp_path / "new")
+
+
+def test_too_few_scans_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="7 scans given"):
+        export_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS[:7])
+
+
+@pytest.mark.parametrize("neck", ["dense", "sparse"])
+def test_parity_is_not_proven_on_nothing(neck: str, tmp_path: Path) -> None:
+    behind = [points * np.array([-1, 1, 1, 1], np.float32) for points in SCANS]
+    with pytest.raises(ExportError, match="none of the scans given to prove parity on has a point"):
+        export_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", behind)
+    assert not list(tmp_path.iterdir())
+    bundle = export_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", [*SCANS, behind[0]])
+    assert bundle.parity is not None and bundle.parity.scans == len(SCANS)
+
+
+def _maps(seed: int) -> HeadMaps:
+    rng = np.random.default_rng(seed)
+    height, width, count, _ = SPEC.anchors.shape
+    scores = rng.normal(-4, 1, (count, height, width))
+    return HeadMaps(
+        scores.astype(np.float32),
+        rng.normal(0, 0.1, (7 * count, height, width)).astype(np.float32),
+        rng.normal(0, 1, (2 * count, height, width)).astype(np.float32),
+    )
+
+
+def test_boxes_that_differ_are_noticed() -> None:
+    maps = _maps(0)
+    assert compare_boxes(maps, maps, SPEC).center_size_m == 0
+    moved = maps._replace(boxes=maps.boxes + np.float32(0.02))
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(maps, moved, SPEC)
+    turned = maps._replace(directions=-maps.directions)
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(maps, turned, SPEC)
+    fewer = maps._replace(scores=np.where(maps.scores == maps.scores.max(), -20, maps.scores))
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(maps, fewer, SPEC)
+
+
+def test_ties_are_no_differences() -> None:
+    """Two overlapping anchors of equal score: which one survives is arbitrary."""
+    maps = _maps(0)
+    maps.scores[:] = -20
+    left, right = maps.scores.copy(), maps.scores.copy()
+    left[0, 10, 10], left[0, 10, 11] = 2.0, 2.0 - 1e-6
+    right[0, 10, 10], right[0, 10, 11] = 2.0 - 1e-6, 2.0
+    compare_boxes(maps._replace(scores=left), maps._replace(scores=right), SPEC)
+
+
+def test_an_overlap_as_large_as_suppression_allows_is_a_tie() -> None:
+    maps = _maps(0)
+    maps.scores[:], maps.boxes[:] = -20, 0
+    maps.scores[0, 10, 10], maps.scores[0, 10, 12] = 2.0, 1.0
+    first, second = SPEC.anchors[10, 10, 0], SPEC.anchors[10, 12, 0]
+    length, width, allowed = first[3], first[4], SPEC.post.nms_iou
+    shift = length * (1 - allowed) / (1 + allowed)  # of two boxes in a row, whose overlap it makes the allowed one
+    sides = []
+    for factor in (1 - 1e-5, 1 + 1e-5, 1.02):
+        boxes = maps.boxes.copy()
+        boxes[0, 10, 12] = (first[0] + factor * shift - second[0]) / np.hypot(length, width)
+        sides.append(maps._replace(boxes=boxes))
+    suppressed, kept, apart = sides
+    assert len(SPEC.decode(suppressed)) == 1 and len(SPEC.decode(kept)) == 2
+    compare_boxes(suppressed, kept, SPEC)
+    with pytest.raises(ExportError, match="has no partner"):
+        compare_boxes(suppressed, apart, SPEC)
+
+
+@pytest.mark.parametrize("cpa", READINGS[1:])
+def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: CpaReading) -> None:
+    root = os.environ.get("ASCA_KITTI_MINI")
+    if not root:
+        pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")
+    split = KittiSplit(root)
+    scans = [read_scan(split.scan_path(frame_id)).points for frame_id in split.frame_ids]
+    # Attention among the points of every pillar takes seconds a scan in PyTorch: a quarter of the pillars then.
+    limits = PillarLimits(max_pillars=3000) if cpa == "point" else PillarLimits()
+    parity = export_bundle(tiny_checkpoint(cpa, PillarSpec(limits=limits)), tmp_path, scans).parity
+    assert parity is not None and parity.scans == len(scans)
+    assert parity.box_max_error_m <= 0.01 and parity.yaw_max_error_rad <= np.deg2rad(0.5)
+
+
+def test_onnxruntime_is_new_enough() -> None:
+    # 1.21 to 1.24 compute wrong int8 results on CPUs with AMX.
+    assert tuple(int(part) for part in onnxruntime.__version__.split(".")[:2]) >= (1, 25)

@@ -1,0 +1,128 @@
+"""A sparse neck as dense convolutions: the same function, and a bundle that runs where a sparse neck cannot."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+from asca_deploy import Detector
+from asca_deploy.manifest import load_pillar_bundle
+from asca_export.pillar.export import export_bundle
+from asca_export.pillar.masked_forms import NEVER, MarkedEncoder, MaskedBackbone
+from asca_export.two_stage.first_stage import BundleFirstStage
+from asca_pillars.base.errors import ExportError
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.models.pillar.neck import SparseRPNNeck
+from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.models.pillar.preparation import batch_pillars
+from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from tests.deploy.conftest import needs_openvino
+from tests.export.test_sparse_bundle import NOTHING, ONE_POINT, sparse_checkpoint
+from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint, tiny_detector
+from tests.scenes import SPEC
+
+RULES = ("sub", "fine")
+LEFT = [points[points[:, 1] > 4] for points in SCANS]
+"""Whole ones make every cell of the small map active."""
+
+
+@pytest.fixture(scope="module", params=RULES)
+def bundles(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The same weights with tables and with masks."""
+    folder, checkpoint = tmp_path_factory.mktemp("bundles"), sparse_checkpoint(request.param)
+    export_bundle(checkpoint, folder / "sparse", SCANS)
+    export_bundle(checkpoint, folder / "dense", SCANS, dense_neck=True)
+    return folder / "sparse", folder / "dense"
+
+
+class _Given(nn.Module):
+    """An encoder that gives these features whatever it is asked."""
+
+    def __init__(self, features: Tensor) -> None:
+        super().__init__()
+        self.features = features
+
+    def forward(self, *_: Tensor) -> Tensor:
+        return self.features
+
+
+def _canvas(detector: PillarDetector, features: Tensor, cells: Tensor) -> Tensor:
+    """(1, ny + 1, nx + 1, C)"""
+    image = detector.scatter(features, cells, [len(cells)]).permute(0, 2, 3, 1)
+    return F.pad(image, (0, 0, 1, 0, 1, 0))
+
+
+def _rows(maps: tuple[Tensor, ...], tables: NeckTables[Tensor]) -> HeadMaps[Tensor]:
+    return HeadMaps(*(part.flatten(0, 2)[tables.head_cells.long()] for part in maps))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_masks_give_what_tables_give(rule: str) -> None:
+    """Also where a pillar's features are all zero, which the first layer's bias makes something of."""
+    detector = tiny_detector("channel", neck="sparse", active_cells=rule)
+    pillars = SPEC.pillarize(LEFT[0])
+    batch = batch_pillars([pillars], [detector.preparation.place(pillars)])
+    tables = batch.neck
+    assert tables is not None and isinstance(detector.neck, SparseRPNNeck)
+    with torch.inference_mode():
+        features = detector.encode(batch.features, batch.pillar_index, batch.point_counts).clone()
+        features[:: len(features) // 5] = 0
+        expected = detector.head.at_cells(detector.neck(features, tables))
+        backbone, marked = MaskedBackbone(detector), MarkedEncoder(_Given(features))(*batch[:3])
+        found = backbone(_canvas(detector, marked, batch.cells))
+        unmarked = backbone(_canvas(detector, features, batch.cells))
+    for ours, theirs in zip(_rows(found, tables), expected, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+    elsewhere = torch.ones(found[0].shape[1:3]).bool().flatten()
+    elsewhere[tables.head_cells.long()] = False
+    assert elsewhere.any() and (found[0].flatten(0, 2)[elsewhere] == NEVER).all()
+    assert (_rows(unmarked, tables).scores - expected.scores).abs().max() > 0.01, "the marks decide"
+
+
+def test_the_bundles_find_the_same(bundles: tuple[Path, Path]) -> None:
+    sparse, dense = (Detector(folder, score_threshold=0.02) for folder in bundles)
+    manifest = load_pillar_bundle(bundles[1])
+    assert (manifest.pillar.neck, manifest.pillar.active_cells) == ("dense", None)
+    assert manifest.parity is not None and manifest.parity.scans == len(SCANS)
+    assert manifest.provenance.weights_sha256 == load_pillar_bundle(bundles[0]).provenance.weights_sha256
+    assert sum(len(sparse(points)) for points in SCANS) > 20
+    for points in (*SCANS, *LEFT, ONE_POINT, NOTHING):
+        ours, theirs = dense(points), sparse(points)
+        np.testing.assert_array_equal(ours.labels, theirs.labels)
+        np.testing.assert_allclose(ours.boxes, theirs.boxes, atol=1e-3)
+        np.testing.assert_allclose(ours.scores, theirs.scores, atol=1e-4)
+    assert len(Detector(bundles[1], score_threshold=1e-6)(NOTHING)) == 0, "no cell is active"
+
+
+def test_a_second_stage_reads_the_same_map_of_both(bundles: tuple[Path, Path]) -> None:
+    """The masks are joined after the map, and are not it."""
+    rows, whole = (BundleFirstStage(folder)(LEFT[0]).neck for folder in bundles)
+    channels = rows.shape[-1]
+    assert whole.shape[-1] == channels
+    active = whole.reshape(-1, channels)
+    active = active[active.any(axis=1)]
+    np.testing.assert_allclose(np.sort(active, axis=0), np.sort(rows[rows.any(axis=1)], axis=0), atol=1e-4)
+
+
+@needs_openvino
+def test_openvino_runs_it(bundles: tuple[Path, Path]) -> None:
+    ours, theirs = Detector(bundles[1], provider="openvino")(SCANS[0]), Detector(bundles[0])(SCANS[0])
+    assert len(ours) == len(theirs) > 0
+    np.testing.assert_allclose(ours.boxes, theirs.boxes, atol=1e-3)
+
+
+def test_a_graph_with_scores_elsewhere_is_no_proof(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("asca_export.parity.NEVER", -9.0)
+    with pytest.raises(ExportError, match="head `scores` of inactive cells"):
+        export_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", LEFT, dense_neck=True)
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_what_has_no_such_form_is_refused_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="--dense-neck: the neck of this model is dense"):
+        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, dense_neck=True)
+    with pytest.raises(ExportError, match="--dense-neck with --int8"):
+        export_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", SCANS, dense_neck=True, calibration=CALIBRATION)

@@ -1,0 +1,141 @@
+"""The whole network: Table 1's shapes and sizes, and that a feature cell lies where its anchor stands."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.config.pillar import CpaReading, NetworkConfig, PillarModel
+from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.models.pillar.neck import RPNNeck
+from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
+from asca_pillars.models.pillar.preparation import PillarBatch, batch_pillars
+from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.spec import PillarSpec
+
+# Rectangular, asymmetric, away from zero: a swapped axis or a forgotten minimum cannot hide.
+SPEC = PillarSpec(grid=PillarGrid(x_range_m=(4.8, 20.16), y_range_m=(-7.68, 12.8), v_max_m=0.32, zones=3))
+
+
+def _detector(cpa: CpaReading = "channel") -> PillarDetector:
+    torch.manual_seed(0)
+    return build_pillar_detector(PillarModel(spec=SPEC, network=NetworkConfig(cpa=cpa))).eval()
+
+
+def _points(count: int = 600, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    low, high = (4.8, -7.68, -2.0, 0.0), (20.16, 12.8, 0.5, 1.0)
+    return rng.uniform(low, high, (count, 4)).astype(np.float32)
+
+
+def test_shapes_follow_the_grid() -> None:
+    height, width = SPEC.grid.head_shape
+    assert (SPEC.grid.ny, SPEC.grid.nx) == (128, 112) and (height, width) == (64, 56)
+    batch = batch_pillars([SPEC.pillarize(_points(seed=1)), SPEC.pillarize(_points(seed=2))])
+    maps = _detector()(batch)
+    assert maps.scores.shape == (2, 6, height, width)
+    assert maps.boxes.shape == (2, 42, height, width)
+    assert maps.directions.shape == (2, 12, height, width)
+
+
+def test_neck_has_table_1s_widths_and_size() -> None:
+    neck = RPNNeck(64, (64, 128, 256), (3, 3, 3), 128)
+    assert neck(torch.zeros(1, 64, 16, 24)).shape == (1, 384, 8, 12)
+    convolutions = 4 * 64 * 64 * 9 + (64 + 3 * 128) * 128 * 9 + (128 + 3 * 256) * 256 * 9
+    upsampling = 64 * 128 + 128 * 128 * 4 + 256 * 128 * 16
+    normalization = 2 * (4 * 64 + 4 * 128 + 4 * 256 + 3 * 128)
+    assert sum(p.numel() for p in neck.parameters()) == convolutions + upsampling + normalization == 3_330_304
+
+
+def test_whole_network_size() -> None:
+    def count(network: NetworkConfig) -> int:
+        return sum(p.numel() for p in build_pillar_detector(PillarModel(network=network)).parameters())
+
+    head = 384 * (6 + 42 + 12) + 60
+    pfn = 9 * 64 + 128
+    assert count(NetworkConfig(cpa="none")) == 3_330_304 + head + pfn == 3_354_108
+    # The original PointPillars has blocks of 3, 5 and 5 convolutions after the strided one: about 4.8 M parameters.
+    original = count(NetworkConfig(cpa="none", block_convs=(3, 5, 5)))
+    assert original == 3_354_108 + 2 * (128 * 128 * 9 + 256) + 2 * (256 * 256 * 9 + 512)
+    assert round(original / 1e6, 1) == 4.8
+
+
+def test_scatter_equals_a_loop_and_frames_stay_apart() -> None:
+    detector = _detector()
+    ny, nx = SPEC.grid.ny, SPEC.grid.nx
+    cells = torch.tensor([0, 5 * nx + 7, ny * nx - 1, 5 * nx + 7, 9])
+    features = torch.rand(5, 64)
+    canvas = detector.scatter(features, cells, [3, 2])
+    expected = torch.zeros(2, 64, ny, nx)
+    for pillar, (frame, cell) in enumerate(zip([0, 0, 0, 1, 1], cells.tolist(), strict=True)):
+        expected[frame, :, cell // nx, cell % nx] = features[pillar]
+    assert torch.equal(canvas, expected)
+
+
+def test_an_empty_frame_in_a_batch_gives_maps() -> None:
+    empty = SPEC.pillarize(np.empty((0, 4), np.float32))
+    for cpa in ("none", "paper", "channel", "point", "linear"):
+        maps = _detector(cpa)(batch_pillars([empty, SPEC.pillarize(_points())]))
+        assert torch.isfinite(maps.scores).all() and len(maps.scores) == 2
+
+
+@pytest.mark.parametrize("neck", ["dense", "sparse"])
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_scans_of_a_point_or_a_cell_are_learnt_from(neck: Literal["dense", "sparse"], count: int) -> None:
+    """BatchNorm has no statistics of a single value; a training came to an end at such a scan."""
+    torch.manual_seed(0)
+    detector = build_pillar_detector(PillarModel(spec=SPEC, network=NetworkConfig(neck=neck))).train()
+    points = np.full((count, 4), (10.05, 1.05, -1, 0.5), np.float32)
+    points[:, 0] += np.linspace(0, 0.05, count)
+    nothing = LabeledFrame("0", points, np.empty((0, 7), np.float32), np.empty(0, np.int64))
+    batch = detector.preparation.collate([detector.preparation.prepare(nothing, None)])
+    terms = detector.loss(detector.predict(batch), batch)
+    total = torch.stack(list(terms.values())).sum()
+    total.backward()
+    assert torch.isfinite(total) and all(part.training for part in detector.modules())
+    assert all(weight.grad is None or torch.isfinite(weight.grad).all() for weight in detector.parameters())
+    if count:
+        assert sum(float(weight.grad.abs().sum()) for weight in detector.parameters() if weight.grad is not None) > 0
+
+
+def test_a_frame_does_not_depend_on_its_batch() -> None:
+    detector = _detector()
+    frames = [SPEC.pillarize(_points(seed=seed)) for seed in (1, 2)]
+    together, alone = detector(batch_pillars(frames)), detector(batch_pillars(frames[1:]))
+    torch.testing.assert_close(together.boxes[1], alone.boxes[0], rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize(("row", "column"), [(3, 2), (30, 40), (60, 55), (31, 8)])
+def test_a_pillar_excites_the_feature_cell_whose_anchor_stands_over_it(row: int, column: int) -> None:
+    """The shortest path (Block1, DeBlock1) is traced: the strongest answer is at the anchor nearest to the pillar."""
+    torch.manual_seed(0)
+    neck = RPNNeck(1, (1, 1, 1), (0, 0, 0), 1).eval()
+    with torch.no_grad():
+        for name, parameter in neck.named_parameters():
+            parameter.fill_(0.0 if name.endswith("bias") else 1.0)
+        kernel = neck.get_parameter("blocks.0.0.weight")
+        kernel.copy_(torch.tensor([[0.1, 0.2, 0.1], [0.2, 1.0, 1.0], [0.1, 1.0, 1.0]]))
+    canvas = torch.zeros(1, 1, SPEC.grid.ny, SPEC.grid.nx)
+    canvas[0, 0, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2] = 1.0
+    answer = neck(canvas)[0, 0]  # DeBlock1's channel
+    found = np.unravel_index(int(answer.argmax()), answer.shape)
+    assert found == (row, column)
+    cells = np.array([2 * row * SPEC.grid.nx + 2 * column, (2 * row + 1) * SPEC.grid.nx + 2 * column + 1])
+    pillar_center = SPEC.grid.cell_centers_m(cells).mean(axis=0)
+    np.testing.assert_allclose(SPEC.anchors[row, column, 0, :2], pillar_center, atol=1e-4)
+
+
+def test_pillar_batch_moves_indices_by_the_pillars_before() -> None:
+    frames = [SPEC.pillarize(_points(40, seed)) for seed in (1, 2, 3)]
+    batch: PillarBatch = batch_pillars(frames)
+    assert batch.frame_pillars == [len(frame.cells) for frame in frames]
+    assert torch.equal(torch.bincount(batch.pillar_index), batch.point_counts)
+    assert np.array_equal(np.concatenate([frame.cells for frame in frames]), batch.cells.numpy())
+
+
+def test_config_without_attention_and_with_one_zone_is_pointpillars() -> None:
+    spec = PillarSpec(grid=PillarGrid(zones=1, v_max_m=0.16))
+    detector = build_pillar_detector(PillarModel(spec=spec, network=NetworkConfig(cpa="none")))
+    assert (detector.grid.ny, detector.grid.nx) == (496, 432)
+    assert detector.encode.pillar_attention is None and detector.encode.point_attention is None

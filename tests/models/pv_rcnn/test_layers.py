@@ -1,0 +1,254 @@
+"""The network and both stages' training: published sizes, gradients, batches, and one frame learnt by heart."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.config.pv_rcnn import PvRcnnModel, PvRcnnNetwork
+from asca_pillars.config.tree import load_config
+from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.geometry.overlap import iou_3d
+from asca_pillars.models.pv_rcnn.batch import LabeledVoxels
+from asca_pillars.models.pv_rcnn.layers import build_pv_rcnn
+from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
+from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, VARIANTS, batch, frame, tiny_detector
+from tests.ops.sparse.test_rulebook import at_cells, dense
+
+EVERY_ANCHOR = AnchorProposals(candidates=3000, nms_iou=0.95, count=3000)
+
+
+def on_anchors() -> LabeledFrame:
+    """A frame whose boxes are anchors, so that an untrained first stage proposes them."""
+    boxes = SPEC.anchors[4, [5, 12, 20], [0, 2, 4]].copy()
+    return dataclasses.replace(frame(0), boxes=boxes, labels=np.array([0, 1, 2]))
+
+
+def seeing_detector() -> PvRcnnDetector:
+    """In evaluation mode, with maps that differ from scan to scan: an untrained network's are the same everywhere."""
+    detector = tiny_detector().train()
+    for module in detector.modules():
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+            module.momentum = 1.0
+    with torch.no_grad():
+        for part in detector.network.head.parameters():
+            part.normal_(0, 0.02)
+        detector.predict(batch(detector, frame(2), frame(3)))
+    return detector.eval()
+
+
+def gradients(detector: PvRcnnDetector, inputs: LabeledVoxels) -> dict[str, torch.Tensor]:
+    detector.train().zero_grad()
+    torch.manual_seed(3)
+    terms = detector.loss(detector.predict(inputs), inputs)
+    torch.stack(list(terms.values())).sum().backward()
+    assert all(torch.isfinite(term) for term in terms.values())
+    return {name: weight.grad.clone() for name, weight in detector.named_parameters() if weight.grad is not None}
+
+
+def test_the_published_model_has_its_published_size() -> None:
+    model = load_config("pv_rcnn_kitti").model
+    assert isinstance(model, PvRcnnModel)
+    assert dataclasses.replace(model, spec=PvRcnnModel().spec) == PvRcnnModel(), "the defaults are the published sizes"
+    network = build_pv_rcnn(model)
+    counts = {name: sum(weight.numel() for weight in part.parameters()) for name, part in network.named_children()}
+    assert not counts.pop("deform"), "nothing is deformed"
+    assert counts == {
+        "voxels": 711_872,
+        "neck": 4_576_768,
+        "head": 36_936,
+        "encode": 41_120 + 82_176 + 230_657,
+        "refine": 25_472 + 7_144_448 + 132_353 + 133_895,
+    }
+    assert sum(counts.values()) == 13_115_697
+
+
+def test_voxels_are_convolved_as_densely() -> None:
+    detector = seeing_detector()
+    scans = batch(detector, frame(0)).scans
+    features, levels = scans.features.double(), scans.levels
+    backbone = detector.network.voxels.double()
+    with torch.inference_mode():
+        found = backbone(features, levels)
+        for number, (shape, level) in enumerate(zip(SPEC.level_shapes, levels, strict=True)):
+            layers = list(backbone.same[number].children()) if number < len(backbone.same) else []
+            before = SPEC.level_shapes[max(number - 1, 0)], levels[max(number - 1, 0)].cells.numpy()
+            convolutions: list[Any] = [(layer, 1, 1, (shape, level.cells.numpy())) for layer in layers]
+            if number:
+                strided = SPEC.strided[number - 1]
+                convolutions.insert(0, (backbone.down[number - 1], strided.stride, strided.padding, before))
+            for layer, stride, padding, (lattice, cells) in convolutions:
+                volume = dense(features.numpy(), cells, lattice)
+                volume = F.conv3d(volume, layer.convolution.weight, stride=stride, padding=padding)
+                features = torch.relu(layer.norm(torch.from_numpy(at_cells(volume, level.cells.numpy()))))
+            torch.testing.assert_close(found[number], features)
+
+
+def test_shapes_and_the_canvas() -> None:
+    detector = tiny_detector().eval()
+    inputs = batch(detector, frame(0), frame(1))
+    with torch.inference_mode():
+        first = detector.network.propose(inputs.scans)
+        outputs = detector.predict(inputs)
+    rows, columns = SPEC.map_shape
+    assert [part.shape for part in first.maps] == [(2, channels * 6, rows, columns) for channels in (3, 7, 2)]
+    assert first.canvas.shape == (2, rows, columns, 2 * 12)
+    cells, height = inputs.scans.levels[-1].cells, 2
+    row, z = divmod(int(cells[-1]), height)
+    torch.testing.assert_close(first.canvas.flatten(0, 2)[row].view(height, 12)[z], first.levels[-1][-1])
+    rois = sum(map(len, outputs.proposals))
+    assert rois == len(outputs.found.confidence) == len(outputs.found.residuals) == 2 * 24
+    assert len(outputs.found.keypoint_logits) == len(inputs.scans.keypoints) == len(inputs.keypoint_states)
+
+
+def test_a_batch_of_two_is_two_batches_of_one() -> None:
+    detector = seeing_detector()
+    frames = frame(0), frame(1)
+    with torch.inference_mode():
+        together = detector.predict(batch(detector, *frames))
+        alone = [detector.predict(batch(detector, each)) for each in frames]
+    for number, one in enumerate(alone):
+        torch.testing.assert_close(together.maps.scores[number], one.maps.scores[0], atol=1e-5, rtol=1e-4)
+        np.testing.assert_allclose(together.proposals[number].boxes, one.proposals[0].boxes, atol=1e-4)
+    confidence = torch.cat([one.found.confidence for one in alone])
+    torch.testing.assert_close(together.found.confidence, confidence, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("changes", VARIANTS.values(), ids=VARIANTS)
+def test_every_weight_learns_and_the_same_each_time(changes: dict[str, Any]) -> None:
+    detector = tiny_detector(training_proposals=EVERY_ANCHOR, **changes)
+    with torch.no_grad():
+        for weight in detector.network.head.parameters():
+            weight.mul_(0.1)  # proposals stay at their anchors, some of which are objects
+    inputs = batch(detector, on_anchors(), frame(1))
+    first, again = gradients(detector, inputs), gradients(detector, inputs)
+    assert set(first) == {name for name, _ in detector.named_parameters()}
+    assert not [name for name, gradient in first.items() if not gradient.any()]
+    assert all(torch.equal(gradient, again[name]) for name, gradient in first.items())
+
+
+def test_a_first_stage_that_is_not_trained_stays_as_it_is() -> None:
+    detector = tiny_detector(training_proposals=EVERY_ANCHOR, train_first_stage=False)
+    before = {name: array.clone() for name, array in detector.state_dict().items()}
+    inputs = batch(detector, on_anchors(), frame(1))
+    optimizer = torch.optim.Adam(detector.parameters(), lr=1e-2, weight_decay=0.1, decoupled_weight_decay=True)
+    detector.train()
+    terms = detector.loss(detector.predict(inputs), inputs)
+    assert set(terms) == {"confidence", "residuals", "corners", "keypoints"}
+    torch.stack(list(terms.values())).sum().backward()
+    optimizer.step()
+    first = ("network.voxels.", "network.neck.", "network.head.")
+    changed = {name for name, array in detector.state_dict().items() if not torch.equal(array, before[name])}
+    assert changed and not [name for name in changed if name.startswith(first)]
+
+
+def test_training_draws_from_the_step_s_seed() -> None:
+    detector = tiny_detector().train()
+    inputs = batch(detector, frame(0))
+    drawn = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        drawn.append(detector.predict(inputs).proposals[0].boxes)
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert not np.array_equal(drawn[0], drawn[2])
+    assert len(drawn[0]) == MODEL.rois
+
+
+@pytest.mark.parametrize("points", [0, 1])
+def test_a_batch_without_voxels_is_learnt_from_and_changes_nothing(points: int) -> None:
+    empty = dataclasses.replace(
+        frame(0), points=frame(0).points[:points], boxes=np.empty((0, 7), np.float32), labels=np.empty(0, np.int64)
+    )
+    detector = tiny_detector()
+    inputs = batch(detector, empty)
+    before = {name: value.clone() for name, value in detector.named_buffers()}
+    assert not any(gradient.any() for gradient in gradients(detector, inputs).values())
+    for name, value in detector.named_buffers():
+        assert torch.equal(value, before[name]), name
+    with torch.inference_mode():
+        found = detector.eval().detect(detector.predict(inputs), SPEC.with_score_threshold(0.0))
+    assert (len(found[0]) == 0) == (points == 0)
+
+
+def test_an_empty_frame_changes_nothing_of_a_full_one_beside_it() -> None:
+    detector = seeing_detector()
+    empty = LabeledFrame("", np.empty((0, 4), np.float32), np.empty((0, 7), np.float32), np.empty(0, np.int64))
+    with torch.inference_mode():
+        alone = detector.predict(batch(detector, frame(0)))
+        for number, order in enumerate(((frame(0), empty), (empty, frame(0)))):
+            together = detector.predict(batch(detector, *order))
+            for joined, own in zip(together.maps, alone.maps, strict=True):
+                torch.testing.assert_close(joined[number], own[0], atol=1e-5, rtol=1e-4)
+            found, wanted = together.proposals[number], alone.proposals[0]
+            assert len(found) == len(wanted) > 0
+            np.testing.assert_allclose(found.boxes, wanted.boxes, atol=1e-4)
+            np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-5)
+            np.testing.assert_array_equal(found.labels, wanted.labels)
+            torch.testing.assert_close(together.found.confidence, alone.found.confidence, atol=1e-4, rtol=1e-3)
+    for order in ((frame(0), empty), (empty, frame(0))):
+        assert gradients(detector, batch(detector, *order))
+
+
+def test_lower_precision_leaves_positions_alone() -> None:
+    detector = tiny_detector().eval()
+    inputs = batch(detector, frame(0))
+    with torch.inference_mode():
+        exact = detector.predict(inputs)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = detector.predict(inputs)
+    assert found.found.confidence.dtype == torch.float32
+    torch.testing.assert_close(found.found.keypoint_logits, exact.found.keypoint_logits, atol=0.05, rtol=0.05)
+
+
+@pytest.mark.parametrize("variant", ["published", "VectorPool", "adaptive scales"])
+def test_learns_one_frame_by_heart(variant: str) -> None:
+    detector, wanted = tiny_detector(**VARIANTS[variant]), frame(5)
+    for module in detector.modules():
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+            module.momentum = 0.1  # so that a hundred steps are enough for its statistics
+    inputs = batch(detector, wanted)
+    optimizer = torch.optim.Adam(detector.parameters())
+    for step in range(160):
+        if step >= 40 and step % 20 == 0 and not _mistakes(detector, inputs, wanted):
+            break
+        torch.manual_seed(step)
+        optimizer.param_groups[0]["lr"] = 6e-3 * (1 - step / 160)
+        loss = torch.stack(list(detector.loss(detector.predict(inputs), inputs).values())).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert not _mistakes(detector, inputs, wanted)
+
+
+def _mistakes(detector: PvRcnnDetector, inputs: LabeledVoxels, wanted: LabeledFrame) -> str:
+    """How what is found differs from the frame's boxes; empty where each of them is found once, and nothing else."""
+    with torch.inference_mode():
+        (found,) = detector.eval().detect(detector.predict(inputs), SPEC.with_score_threshold(0.5))
+    detector.train()
+    if len(found) != len(wanted.boxes):
+        return f"{len(found)} boxes"
+    overlap = iou_3d(found.boxes, wanted.boxes)
+    best = overlap.argmax(axis=0)
+    if set(best) != set(range(len(best))) or overlap.max(axis=0).min() <= 0.85:
+        return f"overlaps {overlap.max(axis=0)}"
+    return "" if np.array_equal(found.labels[best], wanted.labels) else f"labels {found.labels[best]}"
+
+
+def test_settings_that_cannot_be() -> None:
+    for make, message in (
+        (lambda: PvRcnnModel(rois=1), "model.rois = 1"),
+        (lambda: PvRcnnModel(network=PvRcnnNetwork(source_widths=((8,),))), "source_widths has 1 entries"),
+        (lambda: PvRcnnNetwork(dropout=1.0), "model.network.dropout = 1"),
+        (lambda: PvRcnnNetwork(grid_widths=()), "model.network.grid_widths"),
+        (lambda: PvRcnnNetwork(block_convs=(-1, 1)), "model.network.block_convs"),
+        (lambda: VoxelSetSettings(keypoints=0), "keypoints 0"),
+        (lambda: VoxelSetSettings(grid_radii_m=()), "grid_radii_m"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            make()

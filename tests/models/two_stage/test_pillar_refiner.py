@@ -1,0 +1,149 @@
+"""The second stage as a whole: shapes, batches, and one frame learnt by heart."""
+
+import numpy as np
+import pytest
+import torch
+
+from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.detection.decode import PostProcess
+from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.overlap import iou_3d
+from asca_pillars.models.two_stage.keypoint_encoder import BallSource, KeypointEncoder
+from asca_pillars.models.two_stage.loss import refine_loss
+from asca_pillars.models.two_stage.pillar_refiner import PillarRefiner
+from asca_pillars.models.two_stage.refined_detector import refine
+from asca_pillars.models.two_stage.roi_head import RoiHead
+from asca_pillars.models.two_stage.samples import RefineBatch, collate_samples, collate_scans
+from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
+from asca_pillars.ops.points.farthest_points import farthest_points
+from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.prepare import RefineSettings, refine_scan
+from tests.models.two_stage.drawn_samples import prepare_sample
+from tests.scenes import make_scene
+
+NAMES = ("Car", "Pedestrian", "Cyclist")
+LABELS = np.array([0, 0, 1, 2])
+SETTINGS = RefineSettings(grid_size=3, ball_samples=8, grid_samples=8)
+BEV_CHANNELS = 3
+
+
+def small_refiner(seed: int = 0) -> PillarRefiner:
+    torch.manual_seed(seed)
+    encode = KeypointEncoder([BallSource(1, 2, (8, 16))], BEV_CHANNELS, 16, weighting_channels=16)
+    head = RoiHead(
+        [SetAbstraction(16, (16, 16)) for _ in range(2)], 3, roi_channels=len(NAMES) + 4, hidden=32, dropout=0.0
+    )
+    return PillarRefiner(encode, head)
+
+
+def proposed_frame(seed: int) -> tuple[LabeledFrame, Proposed]:
+    """A scene with, for each of its boxes, three proposals not quite in its place, and one in none."""
+    points, boxes = make_scene(seed)[:2]
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0, 1, (3, len(boxes), 7)) * [0.15, 0.1, 0.1, 0.1, 0.05, 0.05, 0.1]
+    lost = np.array([[20, 6, -1, 4, 2, 1.5, 0.3]])
+    moved = np.concatenate([*(boxes + noise), lost]).astype(np.float32)
+    labels = np.append(np.tile(LABELS, 3), 0)
+    detections = Detections(moved, rng.uniform(0.1, 0.9, len(moved)).astype(np.float32), labels, NAMES)
+    keypoints = np.ascontiguousarray(points[farthest_points(points, 256), :3])
+    bev = rng.normal(size=(len(keypoints), BEV_CHANNELS)).astype(np.float32)
+    return LabeledFrame(f"{seed:06d}", points, boxes, LABELS), Proposed(detections, keypoints, bev)
+
+
+def batch(seeds: tuple[int, ...]) -> RefineBatch:
+    rng = np.random.default_rng(0)
+    return collate_samples([prepare_sample(*proposed_frame(seed), SETTINGS, 16, rng) for seed in seeds])
+
+
+def test_shapes() -> None:
+    inputs, targets = batch((0, 1))
+    found = small_refiner()(inputs)
+    assert found.confidence.shape == targets.confidence.shape == (32,)
+    assert found.residuals.shape == targets.residuals.shape == (32, 7)
+    assert found.keypoint_logits.shape == targets.keypoint_states.shape
+    assert targets.positive.any() and (targets.keypoint_states == 1).any()
+
+
+def test_an_untrained_head_hardly_moves_proposals() -> None:
+    assert small_refiner().eval()(batch((0,)).inputs).residuals.abs().max() < 0.05
+
+
+def test_a_batch_of_two_is_two_batches_of_one() -> None:
+    network = small_refiner().eval()
+    scans = [refine_scan(f.points, p, p.proposals, SETTINGS) for f, p in map(proposed_frame, (0, 1))]
+    with torch.inference_mode():
+        together = network(collate_scans(scans))
+        alone = [network(collate_scans([scan])) for scan in scans]
+    for joined, *parts in zip(together, *alone, strict=True):
+        torch.testing.assert_close(joined, torch.cat(parts), atol=1e-5, rtol=1e-5)
+
+
+def test_every_weight_learns() -> None:
+    network = small_refiner()
+    inputs, targets = batch((0, 1))
+    refine_loss(network(inputs), targets).total.backward()
+    still = [name for name, weight in network.named_parameters() if weight.grad is None or not weight.grad.any()]
+    assert not still
+
+
+def test_gradients() -> None:
+    torch.manual_seed(0)
+    encode = KeypointEncoder([BallSource(1, 1, (3,))], BEV_CHANNELS, 4, weighting_channels=4)
+    head = RoiHead([SetAbstraction(4, (3,))], 2, roi_channels=7, hidden=4, dropout=0.0)
+    network = PillarRefiner(encode, head).double().eval()
+    settings = RefineSettings(ball_radii_m=(0.8,), ball_samples=3, grid_size=2, grid_radii_m=(1.6,), grid_samples=3)
+    frame, proposed = proposed_frame(0)
+    few = Proposed(proposed.proposals, proposed.keypoints[:12], proposed.bev[:12])
+    inputs = collate_scans([refine_scan(frame.points, few, few.proposals[:2], settings)])
+    inputs = inputs._replace(
+        **{
+            name: getattr(inputs, name).double()
+            for name in ("points", "keypoints", "bev", "grid_points", "roi_features")
+        }
+    )
+
+    def found(bev: torch.Tensor, roi_features: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(network(inputs._replace(bev=bev, roi_features=roi_features)))
+
+    assert torch.autograd.gradcheck(found, (inputs.bev.requires_grad_(), inputs.roi_features.requires_grad_()))
+
+
+def test_learns_one_frame_by_heart() -> None:
+    network, frame_and_proposals = small_refiner(), proposed_frame(5)
+    frame, proposed = frame_and_proposals
+    rng = np.random.default_rng(0)
+    optimizer = torch.optim.Adam(network.parameters(), lr=5e-3)
+    for _ in range(150):
+        sample = collate_samples([prepare_sample(frame, proposed, SETTINGS, 16, rng)])
+        loss = refine_loss(network(sample.inputs), sample.targets).total
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    found = refine(network.eval(), frame.points, proposed, SETTINGS, PostProcess(), "second")
+    overlap = iou_3d(found.boxes, frame.boxes)
+    best = overlap.argmax(axis=0)
+    before = iou_3d(proposed.proposals.boxes, frame.boxes).max(axis=0)
+    assert overlap[best, range(4)].mean() > max(before.mean(), 0.85)
+    assert (found.labels[best] == LABELS).all()
+    assert set(best) == {0, 1, 2, 3}, "the best four are the objects"
+
+
+def test_a_scan_without_proposals() -> None:
+    frame, proposed = proposed_frame(0)
+    nothing = Proposed(Detections.empty(NAMES), proposed.keypoints[:0], proposed.bev[:0])
+    assert len(refine(small_refiner().eval(), frame.points, nothing, SETTINGS, PostProcess(), "second")) == 0
+    sample = prepare_sample(frame, nothing, SETTINGS, 16, np.random.default_rng(0))
+    assert len(sample.targets.rois) == 0
+
+
+@pytest.mark.parametrize("seeds", [(0, 1), (1, 0)])
+def test_a_frame_without_samples_in_a_batch(seeds: tuple[int, int]) -> None:
+    rng = np.random.default_rng(0)
+    samples = []
+    for seed in seeds:
+        frame, proposed = proposed_frame(seed)
+        if seed:
+            proposed = Proposed(Detections.empty(NAMES), proposed.keypoints[:0], proposed.bev[:0])
+        samples.append(prepare_sample(frame, proposed, SETTINGS, 16, rng))
+    inputs, targets = collate_samples(samples)
+    assert torch.isfinite(refine_loss(small_refiner()(inputs), targets).total)

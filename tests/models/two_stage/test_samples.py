@@ -1,0 +1,92 @@
+"""Samples of the second stage and their batches."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.models.two_stage.samples import RefineSample, collate_samples, collate_scans
+from asca_pillars.ops.two_stage.first_stage import propose_on
+from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan, roi_features
+from tests.models.two_stage.drawn_samples import prepare_sample
+from tests.models.two_stage.random_stage import SETTINGS, RandomStage
+from tests.scenes import make_scene
+
+GEOMETRY = RefineSettings(ball_samples=6, grid_size=2, grid_samples=5)
+
+
+def sample(seed: int, draw: int = 0) -> RefineSample:
+    points, boxes = make_scene(seed)[:2]
+    frame = LabeledFrame(f"{seed:06d}", points, boxes, np.array([0, 0, 1, 2]))
+    proposed = propose_on(RandomStage(), points, SETTINGS)
+    return prepare_sample(frame, proposed, GEOMETRY, 12, np.random.default_rng(draw))
+
+
+def scan(seed: int) -> RefineScan:
+    return sample(seed).scan
+
+
+def test_a_sample_depends_on_its_generator_alone() -> None:
+    one, same, other = sample(0), sample(0), sample(0, draw=1)
+    assert one.targets.rois.tolist() == same.targets.rois.tolist() != other.targets.rois.tolist()
+    np.testing.assert_array_equal(one.scan.grid_indices[1], same.scan.grid_indices[1])
+
+
+def test_points_that_no_ball_reaches_are_left_out_and_no_others() -> None:
+    points = make_scene(0)[0]
+    proposed = propose_on(RandomStage(), points, SETTINGS)
+    found = refine_scan(points, proposed, proposed.proposals, GEOMETRY)
+    away = np.linalg.norm(found.keypoints[:, None] - points[None, :, :3], axis=2)
+    for radius_m, indices in zip(GEOMETRY.ball_radii_m, found.ball_indices, strict=True):
+        inside = np.minimum((away < radius_m).sum(axis=1), GEOMETRY.ball_samples)
+        for row, count in zip(indices, inside, strict=True):
+            assert len(np.unique(row)) == pytest.approx(count, abs=0)
+
+
+def test_a_second_thread_finds_the_same_neighbors() -> None:
+    points = make_scene(0)[0]
+    proposed = propose_on(RandomStage(), points, SETTINGS)
+    alone = refine_scan(points, proposed, proposed.proposals, GEOMETRY)
+    with ThreadPoolExecutor(1) as executor:
+        found = refine_scan(points, proposed, proposed.proposals, GEOMETRY, executor)
+    for one, two in zip(alone.ball_indices + alone.grid_indices, found.ball_indices + found.grid_indices, strict=True):
+        np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(alone.grid_points, found.grid_points)
+
+
+def test_indices_of_a_batch_point_at_the_same_rows() -> None:
+    scans = [scan(0), scan(1)]
+    batch = collate_scans(scans)
+    rows = np.concatenate([s.points for s in scans] + [np.full((1, 4), np.nan)])
+    for radius, together in enumerate(batch.ball_indices):
+        alone = [np.concatenate([s.points, np.full((1, 4), np.nan)])[s.ball_indices[radius]] for s in scans]
+        np.testing.assert_array_equal(rows[together.numpy()], np.concatenate(alone))
+    rows = np.concatenate([s.keypoints for s in scans] + [np.full((1, 3), np.nan)])
+    for radius, together in enumerate(batch.grid_indices):
+        alone = [np.concatenate([s.keypoints, np.full((1, 3), np.nan)])[s.grid_indices[radius]] for s in scans]
+        np.testing.assert_array_equal(rows[together.numpy()], np.concatenate(alone))
+        assert any((s.grid_indices[radius] == len(s.keypoints)).any() for s in scans), "some balls are empty"
+
+
+def test_shapes_of_a_batch() -> None:
+    inputs, targets = collate_samples([sample(0), sample(1)])
+    assert inputs.roi_features.shape == (24, 3 + 4)
+    assert inputs.grid_points.shape == (24 * 8, 3)
+    assert targets.residuals.shape == (24, 7)
+    assert len(targets.keypoint_states) == len(inputs.keypoints)
+
+
+def test_roi_features() -> None:
+    proposals = propose_on(RandomStage(), make_scene(0)[0], SETTINGS).proposals
+    features = roi_features(proposals)
+    assert (features[:, :3].argmax(axis=1) == proposals.labels).all()
+    np.testing.assert_allclose(1 / (1 + np.exp(-features[:, 3])), proposals.scores, rtol=1e-4)
+    np.testing.assert_array_equal(features[:, 4:], proposals.boxes[:, 3:6])
+
+
+@pytest.mark.parametrize("change", [{"grid_size": 0}, {"ball_radii_m": (0.4, -1)}, {"grid_radii_m": ()}])
+def test_impossible_settings(change: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(change))):
+        RefineSettings(**change)

@@ -1,0 +1,114 @@
+"""Voxels against a loop over points, and the compiled loops against NumPy's."""
+
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, Voxels, voxelize
+from asca_pillars.ops.sparse.rulebook import CellMap
+from tests.ops.sparse.test_rulebook import numpy_map
+
+GRID = VoxelGrid((1.0, 4.0), (-2.0, 1.2), (-1.5, 0.5), (0.3, 0.2, 0.1), max_points=3)
+
+
+def in_numpy(points: np.ndarray, grid: VoxelGrid) -> Voxels:
+    with patch("asca_pillars.ops.pv_rcnn.voxels.load_kernels", lambda _: None):
+        return voxelize(points, grid, numpy_map(grid.shape))
+
+
+def cloud(seed: int, count: int, spread_m: float, odd: float) -> np.ndarray:
+    """(count, 4) points, the share `odd` of their values on borders of voxels, next to them, or not finite."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal((2.5, 0, -0.5, 0.5), (spread_m, spread_m, 0.6, 0.2), (count, 4)).astype(np.float32)
+    for axis, ((low, _), size) in enumerate(zip(GRID.ranges_m, GRID.size_m, strict=True)):
+        edges = (low + size * np.arange(33)).astype(np.float32)
+        borders = np.concatenate([edges, np.nextafter(edges, np.float32(9)), np.nextafter(edges, np.float32(-9))])
+        chosen = rng.random(count) < odd
+        points[chosen, axis] = rng.choice([*borders, np.nan, np.inf, -np.inf], chosen.sum())
+    return points
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0, 1, 50, 500]),
+    st.sampled_from([0.05, 1.0]),
+    st.sampled_from([0.0, 0.4]),
+)
+def test_voxels_are_the_same_in_numpy(seed: int, count: int, spread_m: float, odd: float) -> None:
+    points, cell_map = cloud(seed, count, spread_m, odd), CellMap(GRID.shape)
+    voxelize(cloud(seed + 1, count, spread_m, odd), GRID, cell_map)  # of which nothing may stay
+    found, expected = voxelize(points, GRID, cell_map), in_numpy(points, GRID)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert found.features.dtype == expected.features.dtype == np.float32
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 9000), st.sampled_from([0.01, 0.03, 0.05, 0.1, 0.16]), st.floats(-200, 200))
+@example(17, 0.01, 0.0)  # its quotient rounds up to the range's end
+def test_the_last_point_of_a_range_is_in_its_last_voxel(count: int, size_m: float, low_m: float) -> None:
+    """Far from 0 float32 rounds more than a voxel's share; a point was then put one row on, or beyond the map."""
+    grid = VoxelGrid((low_m, low_m + count * size_m), (0, 0.2), (0, 0.2), (size_m, 0.1, 0.1), empty_layers=0)
+    ends = np.array([low_m, low_m + count * size_m], np.float32)
+    points = np.array([[ends[0], 0.15, 0.15], [np.nextafter(ends[1], ends[0]), 0.15, 0.15]], np.float32)
+    cells = grid.cells(points)
+    with patch("asca_pillars.ops.pv_rcnn.voxels.load_kernels", lambda _: None):
+        np.testing.assert_array_equal(cells, grid.cells(points))
+    assert grid.shape == (2, 2, count)
+    columns = (0, count - 1)
+    assert cells.tolist() == [(count + column) * 2 + 1 for column in columns], "second row of y, second layer of z"
+
+
+@pytest.mark.parametrize("form", [lambda p: voxelize(p, GRID, CellMap(GRID.shape)), lambda p: in_numpy(p, GRID)])
+def test_voxels_hold_the_mean_of_their_first_points(form: object) -> None:
+    points = cloud(7, 400, 0.5, 0.0)
+    nz, ny, nx = GRID.shape
+    assert (nz, ny, nx) == (21, 16, 10)  # one layer above the range
+    held: dict[int, list[np.ndarray]] = {}
+    outside = 0
+    for point in points:
+        x, y, z = (
+            int(np.floor((point[axis] - low) / size))
+            for axis, ((low, _), size) in enumerate(zip(GRID.ranges_m, GRID.size_m, strict=True))
+        )
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz - 1:
+            held.setdefault((y * nx + x) * nz + z, []).append(point)
+        else:
+            outside += 1
+    voxels = form(points)  # type: ignore[operator]
+    assert voxels.points_outside == outside > 0
+    assert voxels.cells.tolist() == sorted(held)
+    assert max(map(len, held.values())) > GRID.max_points
+    for cell, feature in zip(voxels.cells, voxels.features, strict=True):
+        np.testing.assert_allclose(feature, np.mean(held[cell][: GRID.max_points], axis=0), rtol=1e-6)
+    inside = np.abs(GRID.centers_m(voxels.cells) - voxels.features[:, :3]) <= np.array(GRID.size_m) / 2 + 1e-5
+    assert inside.all()
+
+
+def test_the_default_grid_is_that_of_pv_rcnn() -> None:
+    assert VoxelGrid().shape == (41, 1600, 1408)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x_range_m": (0.0, 70.42)}, "whole number"),
+        ({"z_range_m": (-3.0, 3.5)}, "more than 64"),
+        ({"y_range_m": (4.0, -4.0)}, "smaller first"),
+        ({"size_m": (0.05, 0.0, 0.1)}, "positive size"),
+        ({"max_points": 0}, "max_points"),
+    ],
+)
+def test_impossible_grids_are_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        VoxelGrid(**change)  # type: ignore[arg-type]
+
+
+def test_a_map_of_another_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match="shape"):
+        voxelize(np.zeros((1, 4), np.float32), GRID, CellMap((1, 2, 3)))

@@ -1,0 +1,89 @@
+"""Proposals and keypoints of a first stage."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, KeypointSettings, propose_on
+from asca_pillars.ops.two_stage.proposals import ProposalSettings
+from tests.models.two_stage.random_stage import CHANNELS, SETTINGS, RandomStage
+from tests.scenes import SPEC, make_scene
+
+
+def test_quotas_and_suppression() -> None:
+    found = propose_on(RandomStage(), make_scene(0)[0], SETTINGS).proposals
+    settings = SETTINGS.proposals
+    assert np.bincount(found.labels).tolist() == list(settings.quotas), "noise fills every quota"
+    assert found.scores.min() >= settings.score_threshold
+    assert found.scores.min() < SPEC.classes[0].score_threshold, "the detector's own threshold does not count"
+    for label in range(3):
+        boxes = found.boxes[found.labels == label]
+        assert np.triu(bev_iou(boxes, boxes), 1).max() <= settings.nms_iou
+
+
+def test_keypoints_are_points_near_proposals_with_the_map_below_them() -> None:
+    points, stage = make_scene(0)[0], RandomStage()
+    found = propose_on(stage, points, SETTINGS)
+    assert 0 < len(found.keypoints) <= 64
+    assert (found.keypoints[:, None] == points[None, :, :3]).all(axis=2).any(axis=1).all()
+    away = np.linalg.norm(found.keypoints[:, None, :2] - found.proposals.boxes[None, :, :2], axis=2)
+    reach = np.hypot(found.proposals.boxes[:, 3], found.proposals.boxes[:, 4]) / 2 + SETTINGS.keypoints.margin_m
+    assert (away < reach + 1e-4).any(axis=1).all()
+    assert found.bev.shape == (len(found.keypoints), CHANNELS)
+    # Bilinear: within what the four cells around say, and the cell itself right at its center.
+    neck = stage(points).neck
+    x_m, y_m = SPEC.head_centers_m()
+    column, row = (np.abs(found.keypoints[:, axis, None] - c).argmin(axis=1) for axis, c in ((0, x_m), (1, y_m)))
+    near = np.stack(
+        [
+            neck[np.clip(row + r, 0, len(y_m) - 1), np.clip(column + c, 0, len(x_m) - 1)]
+            for r in (-1, 0, 1)
+            for c in (-1, 0, 1)
+        ]
+    )
+    assert (found.bev <= near.max(axis=0) + 1e-5).all() and (found.bev >= near.min(axis=0) - 1e-5).all()
+
+
+class PlacesStage(RandomStage):
+    """Its neck says of each cell where it is."""
+
+    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+        x_m, y_m = SPEC.head_centers_m()
+        neck = np.stack(np.meshgrid(x_m, y_m), axis=-1).astype(np.float32)
+        return super().__call__(points)._replace(neck=neck)
+
+
+def test_a_keypoint_reads_the_neck_at_its_own_place() -> None:
+    found = propose_on(PlacesStage(), make_scene(0)[0], SETTINGS)
+    own = found.keypoints[:, :2]
+    lowest, highest = np.array([(centers[0], centers[-1]) for centers in SPEC.head_centers_m()]).T
+    between = ((own > lowest) & (own < highest)).all(axis=1)
+    assert between.sum() > 30, "beside the outermost cells the map's border counts"
+    np.testing.assert_allclose(found.bev[between], own[between], atol=1e-4)
+
+
+def test_an_empty_scan() -> None:
+    found = propose_on(RandomStage(), np.empty((0, 4), np.float32), SETTINGS)
+    assert found.keypoints.shape == (0, 3)
+    assert found.bev.shape == (0, CHANNELS)
+
+
+def test_nothing_proposed() -> None:
+    settings = FirstStageSettings(ProposalSettings(score_threshold=1.0))
+    found = propose_on(RandomStage(), make_scene(0)[0], settings)
+    assert len(found.proposals) == len(found.keypoints) == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        (lambda: ProposalSettings(nms_iou=1.5), "nms_iou 1.5"),
+        (lambda: ProposalSettings(quotas=(3, 0)), "quotas"),
+        (lambda: KeypointSettings(count=0), "count 0"),
+    ],
+)
+def test_impossible_settings(settings: object, match: str) -> None:
+    with pytest.raises(ConfigError, match=match):
+        settings()  # type: ignore[operator]

@@ -1,0 +1,101 @@
+"""Which proposals are sampled, and what the second stage should say of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.detection.detections import Detections
+from asca_pillars.ops.two_stage.box_residuals import decode_refinement
+from asca_pillars.ops.two_stage.roi_targets import (
+    FOREGROUND_IOU,
+    HARD_IOU,
+    Overlaps,
+    keypoint_states,
+    match_proposals,
+    roi_targets,
+    sample_rois,
+)
+
+NAMES = ("Car", "Pedestrian")
+CAR = np.array([10, 0, -1, 4, 2, 1.5, 0], np.float32)
+
+
+def proposals(*rows: tuple[float, int]) -> Detections:
+    """Cars moved along x from CAR by so many metres, with these labels."""
+    boxes = np.stack([CAR + np.array([dx, 0, 0, 0, 0, 0, 0], np.float32) for dx, _ in rows])
+    labels = np.array([label for _, label in rows], np.int64)
+    return Detections(boxes, np.full(len(rows), 0.5, np.float32), labels, NAMES)
+
+
+def overlaps(seed: int, count: int, kinds: int) -> Overlaps:
+    rng = np.random.default_rng(seed)
+    bands = [(0, 0.099), (0.1, 0.549), (0.56, 1)]
+    chosen = [bands[k] for k in range(3) if kinds >> k & 1] or bands
+    iou = np.array([rng.uniform(*chosen[rng.integers(len(chosen))]) for _ in range(count)])
+    return Overlaps(iou, np.zeros(count, np.int64), rng.random(count) < 0.2)
+
+
+def test_matching_is_by_class() -> None:
+    # Moved by d m, 4 m long boxes share (4 - d) / (4 + d).
+    found = match_proposals(proposals((1, 0), (1, 1), (3, 0), (40, 0)), CAR[None], np.array([0]))
+    assert found.iou == pytest.approx([3 / 5, 0, 1 / 7, 0])
+    assert found.matched.tolist() == [0, -1, 0, -1]
+    assert not found.ignored.any()
+
+
+def test_what_overlaps_an_ignored_box_is_neither_right_nor_wrong() -> None:
+    boxes = np.stack([CAR, CAR + np.array([6, 0, 0, 0, 0, 0, 0], np.float32)])
+    found = match_proposals(proposals((0, 0), (6, 0), (5, 1), (20, 0)), boxes, np.array([0, IGNORED]))
+    assert found.ignored.tolist() == [False, True, True, False]
+
+
+def test_no_objects() -> None:
+    found = match_proposals(proposals((0, 0), (1, 1)), np.empty((0, 7), np.float32), np.empty(0, np.int64))
+    assert found.iou.tolist() == [0, 0]
+    targets = roi_targets(proposals((0, 0), (1, 1)), np.empty((0, 7), np.float32), found, np.array([0, 1, 1]))
+    assert targets.confidence.tolist() == [0, 0, 0]
+    assert not targets.positive.any()
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.integers(0, 7), st.integers(1, 128))
+def test_quotas(seed: int, count: int, kinds: int, wanted: int) -> None:
+    found = overlaps(seed, count, kinds)
+    rois = sample_rois(found, wanted, np.random.default_rng(seed))
+    again = sample_rois(found, wanted, np.random.default_rng(seed))
+    assert rois.tolist() == again.tolist()
+    usable = found.iou[~found.ignored]
+    assert len(rois) == (wanted if len(usable) else 0)
+    assert not found.ignored[rois].any()
+    drawn = found.iou[rois]
+    foreground = drawn[drawn >= FOREGROUND_IOU]
+    background = drawn[drawn < FOREGROUND_IOU]
+    there = (usable >= FOREGROUND_IOU).sum()
+    if (usable < FOREGROUND_IOU).any() and len(rois):
+        assert len(foreground) == min(there, round(wanted / 2))
+        assert len(np.unique(rois[drawn >= FOREGROUND_IOU])) == len(foreground)
+        hard, easy = (usable < FOREGROUND_IOU) & (usable >= HARD_IOU), usable < HARD_IOU
+        if hard.any() and easy.any():
+            assert (background >= HARD_IOU).sum() == round(0.8 * len(background))
+
+
+def test_targets() -> None:
+    given = proposals((0, 0), (1, 0), (1.2, 0), (8 / 3, 0), (40, 0))
+    found = match_proposals(given, CAR[None], np.array([0]))
+    rois = np.array([0, 1, 2, 3, 4, 1])
+    targets = roi_targets(given, CAR[None], found, rois)
+    # Overlaps 1, 3/5, 2.8/5.2 = 0.538, 0.2 and 0.
+    assert targets.confidence == pytest.approx([1, 0.7, 2 * (2.8 / 5.2 - 0.25), 0, 0, 0.7], abs=1e-5)
+    assert targets.positive.tolist() == [True, True, False, False, False, True]
+    back = decode_refinement(targets.residuals, given.boxes[rois])
+    np.testing.assert_allclose(back[targets.positive], np.stack([CAR] * 3), atol=1e-5)
+    np.testing.assert_allclose(targets.residuals[~targets.positive], 0, atol=1e-6)
+    assert (targets.boxes[[0, 1, 5]] == CAR).all()
+
+
+def test_keypoint_states() -> None:
+    boxes = np.stack([CAR, CAR + np.array([10, 0, 0, 0, 0, 0, 0], np.float32)])
+    x = np.array([10, 12.05, 12.2, 20, 22.05, 40], np.float32)
+    keypoints = np.stack([x, 0 * x, 0 * x - 1], axis=1)
+    assert keypoint_states(keypoints, boxes, np.array([0, IGNORED])).tolist() == [1, -1, 0, -1, -1, 0]

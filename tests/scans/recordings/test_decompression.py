@@ -1,0 +1,237 @@
+"""Compressed messages, chunks and files, decompression bombs, and files of rosbag2 without their folder."""
+
+import bz2
+import gc
+import io
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
+
+import lz4.frame
+import zstandard
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.recordings import decompression
+from asca_pillars.scans.recordings.decompression import decompress_bz2, decompress_lz4, decompress_zstd
+from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from tests.scans.recordings.cloud_recordings import CLOUD, cloud_points, clouds, stamps, store, write_mcap
+from tests.scans.recordings.decompression_bombs import zstd_zeros
+
+DATA = np.random.default_rng(0).integers(0, 9, 300_000, np.uint8).tobytes()
+
+
+def test_what_was_packed_comes_back() -> None:
+    packer = zstandard.ZstdCompressor().compressobj()
+    unsized = packer.compress(DATA) + packer.flush()
+    for packed in (zstandard.compress(DATA), unsized):
+        assert decompress_zstd(packed) == decompress_zstd(packed, len(DATA)) == DATA
+    assert decompress_lz4(lz4.frame.compress(DATA)) == decompress_lz4(lz4.frame.compress(DATA), len(DATA)) == DATA
+    assert decompress_bz2(bz2.compress(DATA)) == DATA
+
+
+@pytest.mark.parametrize("size", [len(DATA) - 1, len(DATA) + 1, 0, 2**40])
+def test_another_size_than_the_stated_one_is_an_error(size: int) -> None:
+    packer = zstandard.ZstdCompressor().compressobj()
+    for packed in (zstandard.compress(DATA), packer.compress(DATA) + packer.flush()):
+        with pytest.raises((ValueError, zstandard.ZstdError)):
+            decompress_zstd(packed, size)
+    with pytest.raises(ValueError):
+        decompress_lz4(lz4.frame.compress(DATA), size)
+
+
+def test_decompression_bombs_are_stopped_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decompression, "MAX_BYTES", 2**20)
+    zeros = bytes(2**24)
+    for bomb in (zstd_zeros(2**33, stated=True), zstd_zeros(2**33, stated=False)):
+        with pytest.raises(ValueError, match=r"\d+ bytes (state that they )?unpack to"):
+            decompress_zstd(bomb)
+    with pytest.raises(ValueError, match="unpack to more than"):
+        decompress_lz4(lz4.frame.compress(zeros))
+    with pytest.raises(ValueError, match="unpack to more than"):
+        decompress_bz2(bz2.compress(zeros))
+
+
+def test_torn_streams_are_errors() -> None:
+    for unpack, packed in ((decompress_lz4, lz4.frame.compress(DATA)), (decompress_bz2, bz2.compress(DATA))):
+        with pytest.raises(ValueError, match="end is missing"):
+            unpack(packed[:-8])
+    with pytest.raises(zstandard.ZstdError):
+        decompress_zstd(zstandard.compress(DATA)[:-8])
+
+
+# --- rosbag2
+
+
+def rosbag2(folder: Path, storage: str, mode: str) -> Path:
+    writer = Writer2(folder, version=9, storage_plugin=StoragePlugin[storage])
+    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/lidar", CLOUD, typestore=store())
+        for time_ns, message in clouds(3):
+            writer.write(connection, time_ns, store().serialize_cdr(message, CLOUD))
+    return folder
+
+
+def scans(path: Path) -> list[RecordedScan]:
+    recording = open_recording(path)
+    return list(RecordedScans(recording, recording.point_cloud_topic(), 1.0).read())
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+@pytest.mark.parametrize("mode", ["MESSAGE", "FILE"])
+def test_files_without_their_folder(tmp_path: Path, storage: str, mode: str) -> None:
+    folder = rosbag2(tmp_path / "bag", storage, mode)
+    (file,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
+    for path in (folder, file):
+        assert is_recording(path) and [one.time_ns for one in scans(path)] == stamps(3)
+    (folder / "metadata.yaml").unlink()
+    for path in (folder, file):
+        assert is_recording(path) and [one.time_ns for one in scans(path)] == stamps(3)
+    file.rename(moved := tmp_path / f"OTHER{file.name[3:].upper()}")
+    assert is_recording(moved) and all(one.scan is not None for one in scans(moved))
+
+
+def test_what_the_user_unpacked_is_read_instead(tmp_path: Path) -> None:
+    folder = rosbag2(tmp_path / "bag", "SQLITE3", "FILE")
+    packed = folder / "bag.db3.zstd"
+    (folder / "bag.db3").write_bytes(decompress_zstd(packed.read_bytes()))
+    packed.write_bytes(b"no longer needed")
+    assert len(scans(folder)) == 3
+    packed.unlink()
+    assert len(scans(folder)) == 3
+
+
+@pytest.mark.parametrize("suffix", [".mcap.zst", ".bag.zstd", ".BAG.ZST"])
+def test_files_that_were_packed_afterwards(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".mcap.zst":
+        plain = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(3)})
+    else:
+        plain = rosbag1(tmp_path / "a.bag", Writer1.CompressionFormat.LZ4)
+    (tmp_path / f"b{suffix}").write_bytes(zstandard.compress(plain.read_bytes()))
+    assert [one.time_ns for one in scans(tmp_path / f"b{suffix}")] == stamps(3)
+
+
+def test_copies_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    plain = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(3)})
+    (tmp_path / "a.mcap.zst").write_bytes(zstandard.compress(plain.read_bytes()))
+    (tmp_path / "b.mcap.zst").write_bytes(zstandard.compress(b"no MCAP"))
+    recording = open_recording(tmp_path / "a.mcap.zst")
+    assert len(list((tmp_path / "temporary").iterdir())) == 1
+    with pytest.raises(ScanError, match=r"b\.mcap\.zst: no readable MCAP"):
+        open_recording(tmp_path / "b.mcap.zst")
+    del recording
+    gc.collect()
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_a_file_that_breaks_off_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    plain = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8)}).read_bytes()
+    packed = io.BytesIO()
+    with zstandard.ZstdCompressor().stream_writer(packed, closefd=False) as writer:
+        for start in range(0, len(plain), 500):
+            writer.write(plain[start : start + 500])
+            writer.flush(zstandard.FLUSH_BLOCK)
+    (tmp_path / "a.mcap.zst").write_bytes(packed.getvalue()[: len(packed.getvalue()) // 2])
+    recording = open_recording(tmp_path / "a.mcap.zst")
+    assert 2 <= len(list(recording.messages("/lidar"))) < 8
+    assert recording.damage is not None and "ends early" in recording.damage
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("name", ["a.mcap.zstd", "a.db3.zstd", "a.bag.zst"])
+def test_files_that_unpack_to_gigabytes_are_refused(
+    tmp_path: Path, name: str, stated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decompression, "MAX_FILE_BYTES", 2**24)
+    (tmp_path / name).write_bytes(zstd_zeros(2**33, stated=stated))
+    with pytest.raises(ScanError, match=rf"{name}: unpacks to more than .* unpack it yourself \(zstd -d\)"):
+        open_recording(tmp_path / name)
+
+
+def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(3)})
+    (tmp_path / "a.mcap.zst").write_bytes(zstandard.compress(plain.read_bytes()))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10}))
+    with pytest.raises(ScanError, match=r"a\.mcap\.zst: unpacks to \d+ bytes, and .* has room for 10; set TMPDIR"):
+        open_recording(tmp_path / "a.mcap.zst")
+
+
+def test_messages_that_unpack_to_gigabytes_cost_themselves(tmp_path: Path) -> None:
+    messages: list[tuple[int, Any]] = clouds(3)
+    messages[1] = (messages[1][0], zstd_zeros(2**33, stated=True))
+    found = scans(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
+    assert [one.scan is not None for one in found] == [True, False, True]
+
+
+def test_a_rosbag2_with_a_file_missing_or_damaged_is_read_without_it(tmp_path: Path) -> None:
+    folder = tmp_path / "bag"
+    for part in range(4):
+        write_mcap(folder / f"bag_{part}.mcap", {"/lidar": clouds(4)[part : part + 1]})
+    names = ", ".join(f"bag_{part}.mcap" for part in range(4))
+    (folder / "metadata.yaml").write_text(
+        f"rosbag2_bagfile_information: {{relative_file_paths: [{names}], storage_identifier: mcap}}"
+    )
+    assert [one.time_ns for one in scans(folder)] == stamps(4)
+    (folder / "bag_1.mcap").unlink()
+    (folder / "bag_3.mcap").write_bytes(b"torn")
+    recording = open_recording(folder)
+    found = RecordedScans(recording, recording.point_cloud_topic(), 1.0).read()
+    assert [one.time_ns for one in found] == [stamps(4)[0], stamps(4)[2]]
+    assert recording.damage == f"{folder}: bag_1.mcap is missing"
+
+
+# --- ROS 1
+
+
+def rosbag1(path: Path, compression: Any, count: int = 3) -> Path:
+    one = store(ros1=True)
+    writer = Writer1(path)
+    writer.set_compression(compression)
+    writer.chunk_threshold = 1  # a chunk for each message
+    with writer:
+        connection = writer.add_connection("/lidar", CLOUD, typestore=one)
+        from benchmarks.made_recordings import point_cloud2
+
+        for index, time_ns in enumerate(stamps(count)):
+            message = point_cloud2(one, time_ns, cloud_points(index))
+            writer.write(connection, time_ns, one.serialize_ros1(message, CLOUD))
+    return path
+
+
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_a_damaged_chunk_of_a_bag_costs_its_messages_alone(tmp_path: Path, compression: str) -> None:
+    path = rosbag1(tmp_path / "a.bag", Writer1.CompressionFormat[compression], 5)
+    assert [one.time_ns for one in scans(path)] == stamps(5)
+    with Reader1(path) as reader:
+        chunk = sorted(reader.chunks.values(), key=lambda one: one.datapos)[2]
+    data = bytearray(path.read_bytes())
+    data[chunk.datapos + 30 : chunk.datapos + 60] = bytes(30)
+    path.write_bytes(data)
+    recording = open_recording(path)
+    times = [one.recorded_ns for one in recording.messages("/lidar")]
+    assert times == [*stamps(5)[:2], *stamps(5)[3:]]
+    assert recording.damage is not None and "4 of the 5 messages of /lidar can be read" in recording.damage
+
+
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_a_chunk_of_a_bag_unpacks_to_no_more_than_the_limit(
+    tmp_path: Path, compression: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decompression, "MAX_BYTES", 300)
+    monkeypatch.setattr(decompression, "MAX_RATIO", 0)
+    recording = open_recording(rosbag1(tmp_path / "a.bag", Writer1.CompressionFormat[compression]))
+    assert list(recording.messages("/lidar")) == []
+    assert recording.damage is not None and "unpack to more than 300" in recording.damage

@@ -1,0 +1,243 @@
+"""MCAP files as other writers leave them, damaged ones, and decompression bombs."""
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
+
+from mcap.writer import CompressionType, IndexType
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.recordings import decompression, mcap_files
+from asca_pillars.scans.recordings.open_recording import open_recording
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans
+from asca_pillars.scans.recordings.recording import Recording, Topic
+from tests.scans.recordings.cloud_recordings import CLOUD, cloud_points, clouds, stamps, store, write_mcap
+from tests.scans.recordings.decompression_bombs import zstd_zeros
+
+WRITERS: dict[str, dict[str, Any]] = {
+    "all": {},
+    "no channels in the summary": {"repeat_channels": False},
+    "no schemas in the summary": {"repeat_schemas": False},
+    "neither": {"repeat_channels": False, "repeat_schemas": False},
+    "no statistics": {"use_statistics": False},
+    "no indexes": {"index_types": IndexType.NONE},
+    "no message indexes": {"index_types": IndexType.CHUNK},
+    "no chunks": {"use_chunking": False},
+    "no summary offsets": {"use_summary_offsets": False},
+    "no checksums": {"enable_crcs": False},
+    "checksum of all data": {"enable_data_crcs": True},
+    "lz4": {"compression": CompressionType.LZ4},
+    "not compressed": {"compression": CompressionType.NONE},
+    "one chunk": {"chunk_size": 10**6},
+}
+
+
+def times(recording: Recording, topic: str = "/lidar") -> list[int | None]:
+    return [one.recorded_ns for one in recording.messages(topic)]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_of_any_writer(tmp_path: Path, name: str) -> None:
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8), "/rear": clouds(2)}, **WRITERS[name])
+    recording = open_recording(path)
+    assert recording.topics == [Topic("/lidar", CLOUD, 8), Topic("/rear", CLOUD, 2)]
+    assert times(recording) == stamps(8) and recording.damage is None
+    scans = list(RecordedScans(recording, recording.point_cloud_topic("/rear"), 1.0).read())
+    assert [one.time_ns for one in scans] == stamps(2)
+
+
+def test_messages_of_chunks_that_overlap_come_by_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = clouds(12)
+    mixed = [everything[index] for index in (3, 0, 7, 1, 2, 9, 4, 11, 5, 6, 8, 10)]
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": mixed}))
+    assert times(recording) == stamps(12)
+    monkeypatch.setattr(mcap_files, "_MAX_OPEN_BYTES", 1)
+    assert sorted(map(int, filter(None, times(recording)))) == stamps(12), "none is lost where memory is not enough"
+
+
+def test_a_topic_without_a_schema_can_be_named(tmp_path: Path) -> None:
+    """As early versions of rosbag2's plugin wrote it."""
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(2)}, has_schema=False))
+    with pytest.raises(ScanError, match=r"/lidar \(unknown, 2\): if .* name it \(--topic /lidar\)"):
+        recording.point_cloud_topic()
+    scans = list(RecordedScans(recording, recording.point_cloud_topic("/lidar"), 1.0).read())
+    assert [one.time_ns for one in scans] == stamps(2) and all(one.scan is not None for one in scans)
+
+
+def test_a_topic_without_a_schema_that_holds_something_else(tmp_path: Path) -> None:
+    message = store().types["std_msgs/msg/String"](data="no points")
+    data = bytes(store().serialize_cdr(message, "std_msgs/msg/String"))
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/note": [(5, data)]}, has_schema=False))
+    (one,) = RecordedScans(recording, recording.point_cloud_topic("/note"), 1.0).read()
+    assert one.scan is None and "no readable PointCloud2" in str(one.trouble)
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [
+        ("livox_ros_driver/CustomMsg", "xfer_format 0"),
+        ("livox_ros_driver2/msg/CustomMsg", "xfer_format 0"),
+        ("velodyne_msgs/msg/VelodyneScan", "velodyne_pointcloud"),
+        ("ouster_ros/msg/PacketMsg", "ouster_ros"),
+        ("ouster_sensor_msgs/msg/PacketMsg", "ouster_ros"),
+        ("sensor_msgs/msg/PointCloud", "point_cloud_converter"),
+        ("foxglove.PointCloud", "record the PointCloud2"),
+        ("pandar_msgs/PandarScan", "driver"),
+        ("rslidar_msg/msg/RslidarPacket", "driver"),
+        ("nebula_msgs/msg/NebulaPackets", "driver"),
+    ],
+)
+def test_scans_of_another_type_have_their_own_remedy(tmp_path: Path, kind: str, remedy: str) -> None:
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {}, others={"/scans": kind}))
+    for topic in (None, "/scans"):
+        with pytest.raises(ScanError, match=remedy) as refusal:
+            recording.point_cloud_topic(topic)
+        assert kind in str(refusal.value) and "record the scans, too" not in str(refusal.value)
+        assert "none" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("kind", ["sensor_msgs/msg/LaserScan", "radar_msgs/msg/RadarScan", "std_msgs/msg/String"])
+def test_other_types_hold_no_scans(tmp_path: Path, kind: str) -> None:
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {}, others={"/other": kind}))
+    with pytest.raises(ScanError, match="record the scans, too"):
+        recording.point_cloud_topic()
+
+
+@pytest.mark.parametrize("time_ns", [2**63, 2**64 - 1])
+def test_times_that_no_clock_shows_are_none(tmp_path: Path, time_ns: int) -> None:
+    message = clouds(1)[0][1]
+    message.header.stamp.sec = message.header.stamp.nanosec = 0
+    recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": [(time_ns, message), (5, message)]}))
+    scans = list(RecordedScans(recording, recording.point_cloud_topic(), 1.0).read())
+    assert [one.time_ns for one in scans] == [5, 0]
+    assert scans[1].scan is not None and "time stamp" in scans[1].scan.notes.remarks[0]
+    assert scans[0].scan is not None and scans[0].scan.notes.remarks == ()
+
+
+# --- decompression bombs
+
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+def with_chunk(data: bytes, *, compression: str, size: int, crc: int = 0) -> bytes:
+    """A file of one chunk and no summary."""
+    name = compression.encode()
+    body = struct.pack("<QQQII", 0, 1, size, crc, len(name)) + name + struct.pack("<Q", len(data)) + data
+    return MAGIC + record(1, bytes(8)) + record(6, body) + record(15, bytes(4)) + footer(0)
+
+
+def footer(summary_start: int) -> bytes:
+    return record(2, struct.pack("<QQI", summary_start, 0, 0)) + MAGIC
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def channel(number: int = 1) -> bytes:
+    names = (b"/lidar", b"cdr")
+    return record(4, struct.pack("<HH", number, 0) + b"".join(struct.pack("<I", len(n)) + n for n in names) + bytes(4))
+
+
+@pytest.mark.parametrize(
+    ("data", "size"),
+    {
+        "stated": (zstd_zeros(2**33, stated=True), 2**33),
+        "not stated by the chunk": (zstd_zeros(2**33, stated=True), 100),
+        "not stated by the frame": (zstd_zeros(2**33, stated=False), 2**33),
+        "stated by nobody": (zstd_zeros(2**33, stated=False), 100),
+        "just too much": (zstd_zeros(2**28, stated=True), 2**28),
+    }.values(),
+)
+def test_chunks_are_unpacked_to_no_more_than_is_stated(tmp_path: Path, data: bytes, size: int) -> None:
+    (tmp_path / "a.mcap").write_bytes(with_chunk(data, compression="zstd", size=size))
+    with pytest.raises(ScanError, match=r"1 of its chunks are damaged .*copy or record it again"):
+        open_recording(tmp_path / "a.mcap").point_cloud_topic()
+
+
+def test_chunks_of_lz4_are_unpacked_to_no_more_than_is_stated(tmp_path: Path) -> None:
+    import lz4.frame
+
+    packed = lz4.frame.compress(bytes(2**24))
+    for size in (100, 2**24 + 1, 2**40):
+        (tmp_path / "a.mcap").write_bytes(with_chunk(packed, compression="lz4", size=size))
+        with pytest.raises(ScanError, match="1 of its chunks are damaged"):
+            open_recording(tmp_path / "a.mcap").point_cloud_topic()
+
+
+@pytest.mark.parametrize(
+    "filling",
+    [bytes(10**7), record(0x90, b"") * 10**5, channel() * 10**5, record(5, struct.pack("<HIQQ", 9, 0, 0, 0)) * 10**5],
+    ids=["zeros", "private records", "channels", "messages of no channel"],
+)
+def test_what_fills_a_chunk_hides_no_message(tmp_path: Path, filling: bytes) -> None:
+    message = record(5, struct.pack("<HIQQ", 1, 0, 7, 7) + b"data")
+    content = channel() + message + filling
+    whole = with_chunk(content, compression="", size=len(content), crc=zlib.crc32(content))
+    (tmp_path / "a.mcap").write_bytes(whole)
+    recording = open_recording(tmp_path / "a.mcap")
+    assert [one.data for one in recording.messages("/lidar")] == [b"data"]
+
+
+def test_chunks_within_the_summary_are_not_decompressed(tmp_path: Path) -> None:
+    """The library would unpack the chunks there as if they belonged to the summary."""
+    content = with_chunk(zstd_zeros(2**33, stated=True), compression="zstd", size=2**33)
+    (tmp_path / "a.mcap").write_bytes(content.removesuffix(footer(0)) + footer(8))
+    with pytest.raises(ScanError, match="1 of its chunks are damaged"):
+        open_recording(tmp_path / "a.mcap").point_cloud_topic()
+
+
+def test_a_large_chunk_that_is_large_packed_too_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decompression, "MAX_BYTES", 100)
+    for compression in (CompressionType.ZSTD, CompressionType.LZ4):
+        path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8)}, chunk_size=10**6, compression=compression)
+        assert times(open_recording(path)) == stamps(8)
+
+
+# --- damage
+
+
+def test_a_message_that_breaks_off_does_not_lose_those_before(tmp_path: Path) -> None:
+    message = record(5, struct.pack("<HIQQ", 1, 0, 7, 7) + b"data")
+    content = channel() + message + message[:-1]
+    (tmp_path / "a.mcap").write_bytes(with_chunk(content, compression="", size=len(content)))
+    recording = open_recording(tmp_path / "a.mcap")
+    assert len(list(recording.messages("/lidar"))) == 1
+    assert recording.damage is not None and "breaks off" in recording.damage
+
+
+@pytest.mark.parametrize("name", ["all", "no statistics", "lz4", "not compressed", "no chunks"])
+def test_damage_anywhere_is_said_and_costs_no_more_than_a_chunk(tmp_path: Path, name: str) -> None:
+    whole = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8, 20)}, **WRITERS[name]).read_bytes()
+    rng = np.random.default_rng(3)
+    for place in rng.integers(30, len(whole), 60).tolist():
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        (tmp_path / "b.mcap").write_bytes(damaged)
+        _read(tmp_path / "b.mcap", lambda count, lost: lost or count == 8)
+
+
+def _read(path: Path, is_right: Callable[[int, bool], bool]) -> None:
+    try:
+        recording = open_recording(path)
+        topic = recording.point_cloud_topic("/lidar")
+        scans = list(RecordedScans(recording, topic, 1.0).read())
+    except ScanError:
+        return
+    lost = recording.damage is not None or any(one.scan is None for one in scans)
+    assert is_right(len(scans), lost), (path, len(scans))
+
+
+def test_an_unread_point_is_none(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(1)})
+    recording = open_recording(path)
+    (one,) = RecordedScans(recording, recording.point_cloud_topic(), 1.0).read()
+    assert one.scan is not None and np.array_equal(one.scan.points, cloud_points(0))

@@ -1,0 +1,115 @@
+"""The height of the ground near the sensor, whatever else the scan holds."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.ground_height import (
+    NamedPoints,
+    estimate_height,
+    estimate_named_height,
+    fit_ground_plane,
+    measured_mounting,
+)
+from asca_pillars.scans.input_check import ground_z_m
+from asca_pillars.scans.mounting import Mounting
+
+
+def street(count: int = 4000) -> NDArray[np.float32]:
+    """Flat ground at z = -1.7 with a wall along one side."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform((0, -7.6, -1.75, 0.1), (23, 10.2, -1.65, 0.5), (count, 4))
+    points[: count // 3, 1:3] = rng.uniform((9.5, -1.7), (10, 1.3), (count // 3, 2))
+    return points.astype(np.float32)
+
+
+def test_the_ground_is_not_a_reflection_below_it_nor_the_vehicles_roof() -> None:
+    points = street()
+    points[:80, 2] = -9.0  # 2 % ghosts under the road
+    roof = np.tile(np.array([[0.5, 0.2, -0.4, 0.3]], np.float32), (60_000, 1))
+    assert ground_z_m(np.concatenate([points, roof])) == pytest.approx(-1.7, abs=0.1)
+
+
+def test_too_few_points_near_the_sensor() -> None:
+    assert ground_z_m(street(40)) is None
+    assert ground_z_m(street()[:0]) is None
+    assert ground_z_m(street() + np.array([100, 0, 0, 0], np.float32)) is None
+
+
+def sloped(height: float, tilt_deg: float = 0.0, seed: int = 0, noise_m: float = 0.02) -> NDArray[np.float32]:
+    """Ground all around, so far below the sensor, with walls on both sides and a few cars."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((-25, -12, 0, 0.1), (25, 12, 0, 0.5), (20_000, 4))
+    points[:, 2] = np.tan(np.radians(tilt_deg)) * points[:, 0] - height + rng.normal(0, noise_m, len(points))
+    points[:5000, 1] = rng.choice([-12, 12], 5000)
+    points[:5000, 2] += rng.uniform(0, 5, 5000)
+    points[5000:6000, :3] = rng.uniform((5, 2, -height + 0.3), (9, 4, -height + 1.5), (1000, 3))
+    return points.astype(np.float32)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.4, 1.73, 3.2])
+def test_the_height_is_estimated(height: float) -> None:
+    estimate = estimate_height([sloped(height, seed=seed) for seed in range(3)])
+    assert estimate.height_m == pytest.approx(height, abs=0.03)
+    assert estimate.spread_m < 0.05 and estimate.share > 0.8 and estimate.scans == 3
+    assert f"{estimate.height_m:.2f} m" in str(estimate)
+
+
+def test_points_on_a_line_are_no_ground() -> None:
+    line = np.linspace((-16, -11.7, -1.7), (16, 11.9, -1.7), 4000)
+    assert fit_ground_plane(line) is None
+    with pytest.raises(ScanError, match="too few points near the sensor, or all on one line"):
+        estimate_height([line])
+
+
+def test_the_height_is_estimated_along_the_axes() -> None:
+    points = sloped(1.2)
+    points[:, 1:3] *= -1
+    mounting, estimate = measured_mounting([points], Mounting(axes="x,-y,-z"))
+    assert mounting == Mounting(sensor_height_m=estimate.height_m, axes="x,-y,-z")
+    assert estimate.height_m == pytest.approx(1.2, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("scans", "message"),
+    [
+        ([], "without a scan"),
+        ([sloped(1.7)[:100]], "scan 1: too few points"),
+        ([sloped(1.7, tilt_deg=9)], "tilted by 9 degrees"),
+        ([sloped(1.7, noise_m=2.0)], "of the low points"),
+        ([sloped(1.7), sloped(1.2)], r"2 scans disagree by 0\.50 m .*: 1\.2. m in scan 2, 1\.7. m in scan 1;"),
+        ([sloped(1.7)[:100], sloped(1.7, tilt_deg=9)], r"from scan 1: too few points .* \(and 1 more\)"),
+    ],
+)
+def test_an_unsure_height_is_refused(scans: list[NDArray[np.float32]], message: str) -> None:
+    with pytest.raises(ScanError, match=message) as error:
+        estimate_height(scans)
+    assert "--sensor-height" in str(error.value)
+
+
+NO_GROUND = {
+    "too few points": sloped(1.7)[:100],
+    "tilted by 9 degrees": sloped(1.7, tilt_deg=9),
+    "of the low points": sloped(1.7, noise_m=2.0),
+}
+
+
+@pytest.mark.parametrize("why", NO_GROUND)
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_scan_without_ground_is_left_out_and_named(why: str, place: int) -> None:
+    scans = [NamedPoints(f"{number}.bin", sloped(1.7, seed=number)) for number in range(2)]
+    scans.insert(place, NamedPoints("garage.bin", NO_GROUND[why]))
+    estimate = estimate_named_height(scans)
+    assert estimate.height_m == pytest.approx(1.7, abs=0.03) and estimate.scans == 2
+    (left_out,) = estimate.left_out
+    assert left_out.startswith("garage.bin: ") and why in left_out
+    assert f"from 2 scans, which agree within {estimate.spread_m:.2f} m" in str(estimate)
+    assert str(estimate).endswith(f"; left out: {left_out}")
+    assert estimate_height([points for _, points in scans]).left_out[0].startswith(f"scan {place + 1}: ")
+
+
+def test_no_more_scans_are_read_than_needed() -> None:
+    scans = iter([NamedPoints(str(number), sloped(1.7, seed=number)) for number in range(4)])
+    assert estimate_named_height(scans, enough=2).scans == 2
+    assert next(scans).name == "2"
