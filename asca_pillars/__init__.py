@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from asca_pillars.base.telemetry import disable_telemetry
 
 if TYPE_CHECKING:
-    from asca_deploy import Bundle, Detector, ScanQueue, Tracker, Tracks, load_bundle
+    from asca_deploy import Bundle, Detector, ScanDetections, ScanQueue, Tracker, Tracks, load_bundle
     from asca_pillars.base.errors import AscaError
     from asca_pillars.detection.detections import Detection, Detections
     from asca_pillars.detection.report import FrameReport
@@ -34,6 +34,7 @@ __all__ = [
     "FrameReport",
     "Mounting",
     "Scan",
+    "ScanDetections",
     "ScanQueue",
     "Tracker",
     "Tracks",
@@ -51,6 +52,7 @@ _HOMES = {
     "FrameReport": "asca_pillars.detection.report",
     "Mounting": "asca_pillars.scans.mounting",
     "Scan": "asca_pillars.scans.scan_reader",
+    "ScanDetections": "asca_deploy",
     "ScanQueue": "asca_deploy",
     "Tracker": "asca_deploy",
     "Tracks": "asca_deploy",

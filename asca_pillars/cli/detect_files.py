@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy import Detections
+from asca_deploy import ScanDetections
 from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.base.files import atomic_path, write_json, write_text
 from asca_pillars.base.input_files import require_content
@@ -130,7 +130,7 @@ class ResultWriter:
         if kind is None and self._lines is not None:
             remove_companions(self.out, self._written)
 
-    def __call__(self, path: Path, name: Path, scan: Scan, detections: Detections) -> None:
+    def __call__(self, path: Path, name: Path, scan: Scan, detections: ScanDetections) -> None:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too.
 
         Those of them that an earlier run wrote, and this one does not, are removed if the boxes are others now.
@@ -159,7 +159,9 @@ class ResultWriter:
             return False
         return bool(json.loads(path.read_text(encoding="utf-8"))["boxes"] == boxes)
 
-    def _write_camera_view(self, path: Path, name: Path, detections: Detections, calibration: Calibration) -> set[str]:
+    def _write_camera_view(
+        self, path: Path, name: Path, detections: ScanDetections, calibration: Calibration
+    ) -> set[str]:
         """Write the boxes that the camera sees as text, and draw them on its image; return the endings of the files."""
         image = self._image(path.parent.parent / "image_2" / f"{path.stem}.png")
         _write_kitti(self._named(name, ".txt"), detections, calibration, image)
@@ -208,7 +210,7 @@ class ResultWriter:
         return self.out / name.with_name(name.name + ending)
 
 
-def _write_kitti(path: Path, detections: Detections, calibration: Calibration, image: Any) -> None:
+def _write_kitti(path: Path, detections: ScanDetections, calibration: Calibration, image: Any) -> None:
     """What the camera sees, as KITTI's tools want it: they know no boxes outside the image."""
     size_wh = None if image is None else (image.shape[1], image.shape[0])
     write_text(path, detections.to_kitti(calibration, size_wh))
@@ -219,7 +221,7 @@ def as_line(content: dict[str, Any]) -> str:
     return json.dumps(content) + "\n"
 
 
-def scan_content(path: Path, scan: Scan, detections: Detections, scope: DetectorScope) -> dict[str, Any]:
+def scan_content(path: Path, scan: Scan, detections: ScanDetections, scope: DetectorScope) -> dict[str, Any]:
     """What is written of one scan, as plain values; `path` names it, `scope` is the detector's."""
     report, notes = detections.report, scan.notes
     return {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from asca_deploy import Detections, Detector, FrameReport
+from asca_deploy import Detector, FrameReport, ScanDetections
 from asca_pillars.base.errors import printable
 from asca_pillars.scans.scan_reader import ScanNotes
 
@@ -33,7 +33,7 @@ def remark(console: Console, text: str) -> None:
     console.print(printable(text), style="yellow", soft_wrap=True)
 
 
-def boxes(path: Path, detections: Detections) -> Table:
+def boxes(path: Path, detections: ScanDetections) -> Table:
     """The boxes of one scan, the nearest first."""
     table = Table(title=f"{path.name}: {len(detections)} objects")
     for column in ("class", "score", "distance", "direction", "size l x w x h", "heading"):

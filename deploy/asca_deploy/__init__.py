@@ -3,6 +3,7 @@
 from asca_deploy.bundle import Bundle
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
+from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.scan_queue import ScanQueue
 from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
 from asca_deploy.tracker import Tracker
@@ -15,6 +16,7 @@ __all__ = [
     "Detections",
     "Detector",
     "FrameReport",
+    "ScanDetections",
     "ScanQueue",
     "Tracker",
     "Tracks",

@@ -3,7 +3,7 @@
 import logging
 import weakref
 from collections.abc import Generator, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
@@ -18,13 +18,13 @@ from asca_deploy.manifest import load_bundle
 from asca_deploy.open_pipeline import open_pipeline
 from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pipeline import Laps
+from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import find_bundle
 from asca_deploy.stream import overlapped
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.system import check_threads
 from asca_pillars.detection import decode
-from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.report import FrameReport, ScanCounts, summed
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.input_check import InputWarning, check_input
@@ -146,7 +146,7 @@ class Detector:
         """How often the network runs for a scan: once, or in every direction with `view="around"`."""
         return len(self._turns)
 
-    def __call__(self, points: NDArray[Any]) -> Detections:
+    def __call__(self, points: NDArray[Any]) -> ScanDetections:
         """Detect objects in one scan.
 
         Args:
@@ -167,7 +167,7 @@ class Detector:
         raw = [self.pipeline.infer(self._prepare(frame, turn), frame.laps) for turn in frame.turns]
         return self._finish(frame, raw)
 
-    def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[Detections, None, None]:
+    def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[ScanDetections, None, None]:
         """Detections of scan after scan, in order, the same as one by one and more of them per second.
 
         While the network works on one scan, the next is read and prepared and the one before is decoded, in threads
@@ -190,7 +190,7 @@ class Detector:
             frame.laps.append((_WAITING, perf_counter()))
             return frame, [self.pipeline.infer(one, frame.laps) for one in prepared]
 
-        def finish(found: tuple[_Frame, list[Any]]) -> Detections:
+        def finish(found: tuple[_Frame, list[Any]]) -> ScanDetections:
             frame, raw = found
             frame.laps.append((_WAITING, perf_counter()))
             return self._finish(frame, raw)
@@ -221,7 +221,7 @@ class Detector:
         frame.counts.append(prepared.counts)
         return prepared
 
-    def _finish(self, frame: _Frame, raw: list[Any]) -> Detections:
+    def _finish(self, frame: _Frame, raw: list[Any]) -> ScanDetections:
         found = [self.pipeline.finish(one, frame.laps) for one in raw]
         if self.passes == 1:
             detections, counts = found[0], frame.counts[0]
@@ -256,7 +256,13 @@ class Detector:
             warnings=tuple(warning.text for warning in frame.warnings),
         )
         source = weakref.ref(frame.source) if isinstance(frame.source, np.ndarray) else None
-        return replace(detections, _report=report, _source=source, _ranges=self._ranges, _level=self._level)
+        return ScanDetections(
+            **{field.name: getattr(detections, field.name) for field in fields(detections)},
+            report=report,
+            ranges=self._ranges,
+            level=self._level,
+            source=source,
+        )
 
 
 def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> UsablePoints:

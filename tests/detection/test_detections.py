@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from asca_pillars.detection.detections import Detection, Detections
-from tests.cameras import make_calibration
 from tests.sent import sent
 
 THREE = Detections(
@@ -78,26 +77,6 @@ def test_plain_values() -> None:
         "yaw_rad": 0.0,
     }
     assert json.loads(THREE.to_json()) == THREE.to_dicts()
-
-
-def test_kitti_text_holds_what_the_camera_sees() -> None:
-    lines = [line.split() for line in THREE.to_kitti(make_calibration()).splitlines()]
-    assert [(words[0], words[15]) for words in lines] == [
-        ("Car", "0.900000"),
-        ("Cyclist", "0.600000"),
-    ]  # the pedestrian is behind
-
-
-def test_a_picture_without_a_detector_shows_the_boxes() -> None:
-    assert THREE.plot(width_px=200).shape[1:] == (200, 3)
-    assert Detections.empty(("Car",)).plot(width_px=200).shape[1:] == (200, 3)
-    assert THREE._repr_png_() is None
-    assert "<td>Cyclist</td>" in THREE._repr_html_() and "<img" not in THREE._repr_html_()
-
-
-def test_no_report_without_a_detector() -> None:
-    with pytest.raises(ValueError, match="no report"):
-        _ = THREE.report
 
 
 def test_they_can_be_copied_and_sent_to_other_processes() -> None:

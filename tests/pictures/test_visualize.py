@@ -199,11 +199,3 @@ def test_boxes_on_the_image_take_given_colors():
     drawn = draw_on_image(image, box, [""], None, calib, colors=[(255, 0, 255)])
     assert len(near(drawn, (255, 0, 255))[0]) > 100
     assert not drawn[..., 1].any()  # an empty text leaves no mark
-
-
-def test_a_plot_is_a_picture_in_a_notebook() -> None:
-    found = detections([10, 2, -1, 4, 1.6, 1.5, 0.3])
-    picture = found.plot(np.random.default_rng(0).uniform(-20, 20, (500, 4)), labels=found.boxes + 1)
-    shown = cv2.imdecode(np.frombuffer(picture._repr_png_(), np.uint8), cv2.IMREAD_COLOR)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(shown, picture)
-    assert picture[0]._repr_png_() is None  # type: ignore[attr-defined]  # a row of it is no picture
