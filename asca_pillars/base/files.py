@@ -14,12 +14,14 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from asca_pillars.base.errors import OutputError
 from asca_pillars.base.locks import CAN_LOCK, RETIRED, is_temporary, locked
 from asca_pillars.base.own_files import Recognizer, require_no_link, require_replaceable
 
+WEIGHTS_FILE: Literal["weights.ckpt"] = "weights.ckpt"
+"""Trained weights alone, among the checkpoints of a run and in a bundle."""
 _LONGEST_NAME_BYTES = 255  # of a file, on nearly every file system
 _NOT_PLAIN = re.compile(r"[^A-Za-z0-9._-]")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # devices of Windows

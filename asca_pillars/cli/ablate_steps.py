@@ -139,10 +139,12 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
         DatasetError: a list or a file is missing, the data have no camera, or fewer validation frames than parity is
             proven on.
     """
+    from asca_deploy.shipped import find_checkpoint
     from asca_export.pillar.export import MIN_SCANS
     from asca_pillars.training.initial_weights import initial_weights
 
     base = load_config(config, overrides)
+    init = None if init is None else find_checkpoint(init)
     for variant in variants:
         if reason := variant.misfit(base.model):
             raise ConfigError(f"--variants {variant.name}: {reason}; leave it out, or give a base that fits")

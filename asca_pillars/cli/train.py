@@ -31,6 +31,7 @@ def train(
     """
     from rich.console import Console
 
+    from asca_deploy.shipped import find_checkpoint
     from asca_pillars.config.tree import load_config
     from asca_pillars.training.run_files import require_own_run
 
@@ -38,6 +39,7 @@ def train(
     require("train")
     require_own_run(out, init)
     console = Console(markup=False)
+    init = None if init is None else find_checkpoint(init)
     with console.status("Loading PyTorch"):
         from asca_pillars.training.callbacks import TrainingInterruptedError
         from asca_pillars.training.loop import train as run_training

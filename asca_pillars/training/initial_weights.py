@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from asca_deploy.shipped import find_checkpoint
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
@@ -13,19 +12,18 @@ from asca_pillars.models.checkpoint import load_checkpoint
 _FIRST_STAGE = tuple(f"network.{part}." for part in PvRcnnModel.FIRST_STAGE)
 
 
-def initial_weights(config: Config, init: str | Path | None) -> dict[str, Any]:
+def initial_weights(config: Config, init: Path | None) -> dict[str, Any]:
     """What a new run of `config` takes from `init`, by the names of `state_dict`; the rest starts at random.
 
     All weights, but where `model.train_first_stage` is false, those of the first stage alone.
 
     Args:
         config: of the run.
-        init: a checkpoint, or a bundle that holds its own (folder, or name of one that ships); None for none.
+        init: a checkpoint; None for none.
 
     Raises:
         TrainingError: they are not of this configuration's network, or none are given to a first stage that is not
             trained.
-        BundleError: `init` is a bundle without weights.
     """
     alone = isinstance(config.model, PvRcnnModel) and not config.model.train_first_stage
     if init is None:
@@ -35,16 +33,15 @@ def initial_weights(config: Config, init: str | Path | None) -> dict[str, Any]:
                 "the checkpoint or bundle of a trained one with --init"
             )
         return {}
-    path = find_checkpoint(init)
     theirs, ours = (
         {name: array for name, array in weights.items() if not alone or name.startswith(_FIRST_STAGE)}
-        for weights in (load_checkpoint(path).detector.state_dict(), build_model(config.model).state_dict())
+        for weights in (load_checkpoint(init).detector.state_dict(), build_model(config.model).state_dict())
     )
     for name in ours | theirs:
         found, wanted = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
         if found != wanted:
             raise TrainingError(
-                f"{path}: weights of another network: {name} is {found} there and {wanted} in this configuration; "
+                f"{init}: weights of another network: {name} is {found} there and {wanted} in this configuration; "
                 "model.spec and model.network have to be like those that it was trained with"
             )
     return theirs

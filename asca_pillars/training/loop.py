@@ -16,8 +16,8 @@ from lightning.pytorch.callbacks import Checkpoint, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
-from asca_deploy.bundle import WEIGHTS
 from asca_pillars.base.errors import TrainingError
+from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.base.locks import only_writer, recover
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, ModelConfig, TrainConfig
@@ -52,7 +52,7 @@ def train(
     *,
     devices: str = "auto",
     num_nodes: int = 1,
-    init: str | Path | None = None,
+    init: Path | None = None,
 ) -> Path:
     """Train `config` on a dataset, or go on where an interrupted run in `out` stopped.
 
@@ -68,7 +68,7 @@ def train(
             that has no checkpoint yet gives way.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
-        init: weights that a new run starts from, see `initial_weights`; a run that goes on must have started from
+        init: checkpoint that a new run starts from, see `initial_weights`; a run that goes on must have started from
             them.
 
     Returns:
@@ -81,17 +81,14 @@ def train(
         TrainingInterruptedError: Ctrl-C; the run is saved.
         OutputError: another process trains in `out`.
         DatasetError, ScanError: the data cannot be read, or no training frame has a box of any class.
-        BundleError, ExportError, ConfigError: the first stage of two cannot be used, or `init` is a bundle without
-            weights.
+        BundleError, ExportError, ConfigError: the first stage of two cannot be used.
     """
     # The processes of one run share its folder: the first holds it.
     with only_writer(out, COMMAND) if getattr(rank_zero_only, "rank", 0) == 0 else nullcontext():
         return _train(config, data_root, Path(out), devices, num_nodes, init)
 
 
-def _train(
-    config: Config, data_root: str | Path, out: Path, devices: str, num_nodes: int, init: str | Path | None
-) -> Path:
+def _train(config: Config, data_root: str | Path, out: Path, devices: str, num_nodes: int, init: Path | None) -> Path:
     if isinstance(config.model, RefineModel):
         config = replace(config, model=with_first_stage(config.model))
     checkpoints = out / "checkpoints"
@@ -141,7 +138,7 @@ def _train(
             trainer.fit(module, data, ckpt_path=str(resumed) if goes_on else None, weights_only=True)
         finally:  # a run that was stopped has weights to take elsewhere, too
             if trainer.is_global_zero and (checkpoints / LAST).is_file():
-                save_weights(checkpoints / LAST, checkpoints / WEIGHTS)
+                save_weights(checkpoints / LAST, checkpoints / WEIGHTS_FILE)
     return checkpoints / LAST
 
 

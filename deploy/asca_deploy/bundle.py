@@ -29,7 +29,6 @@ SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
 BUNDLE_FOLDER = ("asca export", MANIFEST, json_object("schema_version", "graphs", "spec"))
 """Command, marker and its recognizer, as `atomic_directory` takes them."""
-WEIGHTS: Literal["weights.ckpt"] = "weights.ckpt"
 ENCODER = "encoder"
 BACKBONE = "backbone"
 REFINE = "refine"

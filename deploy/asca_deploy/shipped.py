@@ -4,10 +4,11 @@ import hashlib
 from importlib import resources
 from pathlib import Path
 
-from asca_deploy.bundle import MANIFEST, WEIGHTS
+from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_bundle
 from asca_deploy.manifest_file import refuse_run_folder
 from asca_pillars.base.errors import BundleError
+from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.base.input_files import require_content
 
 
@@ -48,14 +49,14 @@ def find_weights(bundle: str | Path) -> Path:
         BundleError: there is no such bundle, it is damaged, it holds none, or another one than it was exported with.
     """
     folder = find_bundle(bundle)
-    path = folder / WEIGHTS
+    path = folder / WEIGHTS_FILE
     require_content(path, BundleError)
     if not path.is_file():
         refuse_run_folder(folder)
-        having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS).is_file()]
+        having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS_FILE).is_file()]
         raise BundleError(
-            f"{bundle}: holds no {WEIGHTS}, which `asca export --with-weights` adds to a bundle; of those that ship "
-            f"{', '.join(having) or 'none'} has one"
+            f"{bundle}: holds no {WEIGHTS_FILE}, which `asca export --with-weights` adds to a bundle; of those that "
+            f"ship {', '.join(having) or 'none'} has one"
         )
     known = (folder / MANIFEST).is_file()  # weights alone in a folder are weights, too
     expected = load_bundle(folder).provenance.weights_file_sha256 if known else None
@@ -71,7 +72,7 @@ def find_checkpoint(source: str | Path) -> Path:
         BundleError: as `find_weights`.
     """
     path = Path(source)
-    return path if path.is_file() or path.suffix == Path(WEIGHTS).suffix else find_weights(source)
+    return path if path.is_file() or path.suffix == Path(WEIGHTS_FILE).suffix else find_weights(source)
 
 
 def sample_scan_path() -> Path:

@@ -13,11 +13,11 @@ from typing import Annotated
 
 import typer
 
-from asca_deploy.bundle import BUNDLE_FOLDER, WEIGHTS
+from asca_deploy.bundle import BUNDLE_FOLDER
 from asca_deploy.manifest import load_pillar_bundle, write_bundle_manifest
 from asca_deploy.shipped import find_bundle
 from asca_export import graphs
-from asca_pillars.base.files import atomic_directory
+from asca_pillars.base.files import WEIGHTS_FILE, atomic_directory
 from asca_pillars.scans.find_scans import find_scans
 from asca_pillars.scans.measure_input import measure_expected_input
 from asca_pillars.scans.scan_reader import read_scan
@@ -43,7 +43,7 @@ def main(
         for name, graph in loaded.graphs.items():
             shutil.copyfile(source / graph.file, graphs.graph_path(folder, name))
         if loaded.provenance.weights_file:
-            shutil.copyfile(source / WEIGHTS, folder / WEIGHTS)
+            shutil.copyfile(source / WEIGHTS_FILE, folder / WEIGHTS_FILE)
         known = replace(loaded, expected_input=expected, expected_input_from="training" if training else "export")
         signed = graphs.sign(folder, known)
         write_bundle_manifest(folder, signed)

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.bundle import WEIGHTS
 from asca_deploy.manifest import load_pillar_bundle
+from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.models.checkpoint import load_checkpoint, weights_sha256
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.scans.scan_reader import write_scan
@@ -64,7 +64,7 @@ def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path
     exported = run_here("export", folder, "-o", folder, "--scans", scans, "--score", "0.3")
     assert exported.returncode == 0, exported.stderr
     assert {each.score_threshold for each in load_pillar_bundle(folder).spec.classes} == {0.3}
-    weights, kept = (load_checkpoint(each / WEIGHTS).detector.state_dict() for each in (with_weights, folder))
+    weights, kept = (load_checkpoint(each / WEIGHTS_FILE).detector.state_dict() for each in (with_weights, folder))
     assert weights_sha256(weights) == weights_sha256(kept)
 
 

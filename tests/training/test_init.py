@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from asca_deploy import shipped
+from asca_deploy.shipped import find_checkpoint
 from asca_pillars.base.errors import BundleError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import load_checkpoint
@@ -31,7 +32,9 @@ def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.
         "a_model": bundle / "weights.ckpt",
     }
     for number, (init, source) in enumerate(sources.items()):
-        found = load_checkpoint(train(STILL, data, tmp_path / str(number), init=init)).detector.parameters()
+        found = load_checkpoint(
+            train(STILL, data, tmp_path / str(number), init=find_checkpoint(init))
+        ).detector.parameters()
         for expected, parameter in zip(load_checkpoint(source).detector.parameters(), found, strict=True):
             torch.testing.assert_close(parameter, expected, msg=f"{parameter.shape} from {init}")
     for init, error, message in (
@@ -41,6 +44,6 @@ def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.
         (tmp_path / "none.ckpt", TrainingError, "no such checkpoint"),
     ):
         with pytest.raises(error, match=message) as caught:
-            train(OTHER, data, tmp_path / "refused", init=init)
+            train(OTHER, data, tmp_path / "refused", init=find_checkpoint(init))
         assert "\n" not in str(caught.value)
     assert not (tmp_path / "refused").exists()  # the corrected command finds nothing in its way

@@ -14,7 +14,6 @@ from asca_deploy.bundle import (
     BACKBONE,
     BUNDLE_FOLDER,
     ENCODER,
-    WEIGHTS,
     Bundle,
     CanvasFormat,
     Parity,
@@ -33,7 +32,7 @@ from asca_export.pillar.masked_forms import MarkedEncoder, MaskedBackbone
 from asca_export.sparse_forms import SparseBackbone
 from asca_export.sparse_graphs import export_sparse_backbone, sparse_multiply_accumulates
 from asca_pillars.base.errors import ExportError
-from asca_pillars.base.files import atomic_directory
+from asca_pillars.base.files import WEIGHTS_FILE, atomic_directory
 from asca_pillars.base.system import cpu_model, default_threads, git_revision, package_versions
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import ModelConfig, pillar_spec
@@ -177,9 +176,9 @@ def write_proven(
         ExportError: there is none.
     """
     if weights is not None:
-        save_weights(weights, folder / WEIGHTS)
-        digest = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
-        kept = dataclasses.replace(draft.provenance, weights_file=WEIGHTS, weights_file_sha256=digest)
+        save_weights(weights, folder / WEIGHTS_FILE)
+        digest = hashlib.sha256((folder / WEIGHTS_FILE).read_bytes()).hexdigest()
+        kept = dataclasses.replace(draft.provenance, weights_file=WEIGHTS_FILE, weights_file_sha256=digest)
         draft = dataclasses.replace(draft, provenance=kept)
     signed = graphs.sign(folder, draft)
     write_bundle_manifest(folder, signed)
