@@ -128,7 +128,7 @@ def measure_ms(stage: Callable[[], Any]) -> float:
 def in_numpy() -> Iterator[None]:
     """As without numba."""
     with ExitStack() as patches:
-        for module in ("pillars.pillarize", "tables.cell_map", "geometry.decode"):
+        for module in ("ops.pillar.prepare", "ops.sparse.rulebook", "detection.decode"):
             patches.enter_context(patch(f"asca_pillars.{module}.load_kernels", lambda _: None))
         yield
 

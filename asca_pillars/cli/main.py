@@ -1,4 +1,4 @@
-"""The command `asca`: registers what `commands` holds. Each command imports what it needs when it runs."""
+"""The command `asca`: registers what `cli` holds. Each command imports what it needs when it runs."""
 
 from typing import Annotated
 

@@ -10,7 +10,7 @@ from asca_pillars.base import installation
 from asca_pillars.base.installation import install_command, source_tree, upgrade_advice
 from asca_pillars.cli.extras import EXTRAS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def test_in_a_source_tree_the_advice_names_it() -> None:
@@ -22,9 +22,10 @@ def test_in_a_source_tree_the_advice_names_it() -> None:
 def test_of_a_wheel_the_advice_names_the_package(tmp_path: Path) -> None:
     """A stranger's pyproject.toml beside the packages, as some wheels install one, makes no source tree."""
     package = tmp_path / "site packages" / "asca_pillars"
-    package.mkdir(parents=True)
-    shutil.copy(installation.__file__, package)
-    (package / "__init__.py").touch()
+    (package / "base").mkdir(parents=True)
+    shutil.copy(installation.__file__, package / "base")
+    for folder in (package, package / "base"):
+        (folder / "__init__.py").touch()
     (package.parent / "pyproject.toml").write_text('[project]\nname = "other"\n')
     code = "from asca_pillars.base.installation import *; print(install_command('train')); print(upgrade_advice())"
 

@@ -21,7 +21,7 @@ from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_repor
 from tests.socket_filter import NOT_HERE
 from tests.test_layout import PACKAGES, ROOT, imports
 
-FILTER = Path(__file__).parent / "socket_filter.py"
+FILTER = Path(__file__).parents[1] / "socket_filter.py"
 KEPT = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "OPENBLAS_CORETYPE")
 """Of the environment. What tells onnxruntime that it is tested, such as CI, makes it keep still."""
 CACHES = (".cache/numba", ".cache/matplotlib", ".config/matplotlib")
