@@ -18,14 +18,9 @@ from asca_pillars.data.kitti.calibration import Calibration, project_edges
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.pictures.colors import class_rgb
 from asca_pillars.pictures.drawing import BACKGROUND, OVERSAMPLING, SUBPIXEL_BITS, Color, Image, Texts, View, subpixels
 
-_CLASS_COLORS: dict[str, Color] = {
-    "Car": (40, 165, 255),
-    "Pedestrian": (150, 80, 255),
-    "Cyclist": (120, 235, 60),
-}
-_OTHER_COLORS: tuple[Color, ...] = ((255, 200, 70), (255, 120, 200), (90, 230, 230), (200, 200, 200))
 _RING, _GRAY, _WHITE = (74, 62, 54), (190, 180, 172), (255, 255, 255)
 _POINT_PX = 3
 _LEGEND_PX, _LEGEND_ROW_PX = 200, 22  # width kept free for it, and height of a row
@@ -34,8 +29,9 @@ _RING_TEXT_DEG = (-40, -30, 40, 30, 0, -135, 135, 180)
 
 
 def class_color(name: str) -> Color:
-    """The BGR color of a class: the same in every picture, whatever else is in it."""
-    return _CLASS_COLORS.get(name) or _OTHER_COLORS[zlib.crc32(name.encode()) % len(_OTHER_COLORS)]
+    """The color of a class as OpenCV has it: blue, green, red, 0..255."""
+    red, green, blue = class_rgb(name)
+    return blue, green, red
 
 
 def read_image(path: Path) -> Image | None:
