@@ -40,8 +40,8 @@ from asca_pillars.data.insertion.free_space import FreeSpace
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
-from asca_pillars.pictures.drawing import BACKGROUND
-from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_layers, write_png
+from asca_pillars.pictures.drawing import BACKGROUND, BoxLayer
+from asca_pillars.pictures.visualize import class_color, draw_layers, write_png
 
 METHODS: dict[InsertMethod, str] = {"gt_aug": "GT-Aug", "rs_aug": "RS-Aug"}
 MAX_HEIGHT_ERROR_M = 0.2

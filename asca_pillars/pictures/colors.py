@@ -1,4 +1,4 @@
-"""Colors of classes: the one table for pictures, videos, the browser's page, rerun, Foxglove and ROS markers.
+"""Colors of classes and heights: the one table for pictures, the browser's page, rerun, Foxglove and ROS markers.
 
 The colors are chosen on a dark background and stay apart for people with protanopia, deuteranopia and tritanopia:
 CIE76 differences of 40 and more between cars, pedestrians and cyclists, of 20 and more between any two
@@ -7,6 +7,9 @@ CIE76 differences of 40 and more between cars, pedestrians and cyclists, of 20 a
 
 import zlib
 from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
 
 Rgb = tuple[int, int, int]
 """Red, green, blue, 0..255."""
@@ -18,6 +21,10 @@ CLASS_COLORS: dict[str, Rgb] = {
 }
 OTHER_COLORS: tuple[Rgb, ...] = ((150, 120, 255), (220, 238, 145), (240, 105, 200), (175, 140, 40))
 """Of classes with other names: which one depends on the name alone."""
+
+HEIGHT_RAMP: tuple[Rgb, ...] = ((66, 104, 160), (84, 176, 168), (240, 226, 166))
+"""Of points from the ground to `HEIGHT_SPAN_M` above it: muted, so that boxes stand out."""
+HEIGHT_SPAN_M = 4.0
 
 
 def class_rgb(name: str) -> Rgb:
@@ -34,3 +41,16 @@ def class_shares(name: str) -> tuple[float, float, float]:
 def color_table(names: Iterable[str]) -> dict[str, list[int]]:
     """Red, green, blue, 0..255, of each class by its name, as JSON holds them."""
     return {name: list(class_rgb(name)) for name in names}
+
+
+def ground_height(z_m: NDArray[np.floating]) -> float:
+    """Where the color ramp begins: the height (m) that a tenth of the points (N,) lie below; 0 without points."""
+    return float(np.percentile(z_m, 10)) if len(z_m) else 0.0
+
+
+def height_rgb(z_m: NDArray[np.floating], ground_m: float) -> NDArray[np.uint8]:
+    """Colors (N, 3), red, green, blue, of points at heights (N,), metres."""
+    shares = np.clip((z_m - ground_m) / HEIGHT_SPAN_M, 0, 1)
+    stops = np.linspace(0, 1, len(HEIGHT_RAMP))
+    channels = [np.interp(shares, stops, [color[channel] for color in HEIGHT_RAMP]) for channel in range(3)]
+    return np.round(np.stack(channels, axis=-1)).astype(np.uint8)

@@ -4,7 +4,6 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,25 @@ from asca_pillars.data.kitti.calibration import Calibration, project_edges
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.pictures.colors import class_rgb
-from asca_pillars.pictures.drawing import BACKGROUND, OVERSAMPLING, SUBPIXEL_BITS, Color, Image, Texts, View, subpixels
+from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
+from asca_pillars.pictures.drawing import (
+    BACKGROUND,
+    LEGEND_PX,
+    LEGEND_ROW_PX,
+    OVERSAMPLING,
+    SUBPIXEL_BITS,
+    BoxLayer,
+    Color,
+    Image,
+    Texts,
+    View,
+    draw_color_bar,
+    draw_legend,
+    subpixels,
+)
 
 _RING, _GRAY, _WHITE = (74, 62, 54), (190, 180, 172), (255, 255, 255)
 _POINT_PX = 3
-_LEGEND_PX, _LEGEND_ROW_PX = 200, 22  # width kept free for it, and height of a row
 _PNG_HEADER_BYTES = 33  # signature and IHDR, which other chunks may follow
 _RING_TEXT_DEG = (-40, -30, 40, 30, 0, -135, 135, 180)
 
@@ -61,20 +73,6 @@ class Picture(np.ndarray[Any, np.dtype[np.uint8]]):
         return png_bytes(self) if self.ndim == 3 and self.dtype == np.uint8 else None
 
 
-@dataclass(frozen=True, eq=False)
-class BoxLayer:
-    """Boxes that are drawn alike, and their line in the legend."""
-
-    name: str
-    boxes: NDArray[np.floating]
-    """(N, 7) LiDAR boxes."""
-    color: Color
-    texts: Sequence[str] = ()
-    """What stands beside each box; nothing if empty."""
-    thickness_px: int = 4
-    """Of the outline, before the picture is made half as large."""
-
-
 def draw_bev(
     points: NDArray[np.floating],
     detections: Detections | None,
@@ -92,14 +90,26 @@ def draw_bev(
 
     The picture shows the part of the ranges in which there is something.
     """
-    layers = []
+    return draw_layers(points, class_layers(detections, labels), ranges, width_px=width_px)
+
+
+def class_layers(
+    detections: Detections | None, labels: NDArray[np.floating] | None = None, texts: Sequence[str] | None = None
+) -> list[BoxLayer]:
+    """A layer for each class, in its color, and one for ground truth (M, 7) if there is any.
+
+    `texts` stand beside the detections, in their order; None for the scores.
+    """
     found = Detections.empty(()) if detections is None else detections
+    texts = [f"{score:.2f}" for score in found.scores] if texts is None else texts
+    layers = []
     for label, name in enumerate(found.class_names):
-        own = found[found.labels == label]
-        layers.append(BoxLayer(name, own.boxes, class_color(name), [f"{score:.2f}" for score in own.scores]))
+        own = found.labels == label
+        named = [text for text, mine in zip(texts, own, strict=True) if mine]
+        layers.append(BoxLayer(name, found.boxes[own], class_color(name), named))
     if labels is not None and len(labels):
         layers.append(BoxLayer("ground truth", labels, _WHITE, thickness_px=2))
-    return draw_layers(points, layers, ranges, width_px=width_px)
+    return layers
 
 
 def draw_layers(
@@ -129,7 +139,9 @@ def draw_layers(
     for layer, layer_outlines in reversed(list(zip(layers, outlines, strict=True))):
         for outline in layer_outlines:
             _draw_footprint(canvas, view.pixels(outline), layer.color, layer.thickness_px)
-    _draw_legend(texts, view, layers)
+    draw_legend(texts, layers)
+    draw_color_bar(texts)
+    _draw_scale(texts, view)
     for layer, layer_outlines in zip(layers, outlines, strict=True):
         for outline, text in zip(layer_outlines, layer.texts, strict=bool(layer.texts)):
             if view.shows(view.pixels(outline.mean(axis=0))):
@@ -189,10 +201,7 @@ def _draw_points(canvas: Image, view: View, points: NDArray[np.floating]) -> Non
     if not len(points):
         return
     points = points[np.argsort(points[:, 2])]  # the highest last, on top
-    ground_m = np.percentile(points[:, 2], 10)
-    height = np.clip((points[:, 2] - ground_m) / 3.0, 0, 1)
-    ramp = np.round(70 + 185 * height).astype(np.uint8)[:, None]
-    colors = cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS)[:, 0]
+    colors = height_rgb(points[:, 2], ground_height(points[:, 2]))[:, ::-1]
     columns, rows = view.pixels(points[:, :2]).astype(np.int64).T
     for down in range(_POINT_PX):
         for right in range(_POINT_PX):
@@ -202,7 +211,7 @@ def _draw_points(canvas: Image, view: View, points: NDArray[np.floating]) -> Non
 
 def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
     """Circles of equal distance to the sensor, with texts beside the legend's place, and the sensor as an arrow."""
-    legend = np.array([_LEGEND_PX, _LEGEND_ROW_PX * (legend_rows + 1)]) * OVERSAMPLING
+    legend = np.array([LEGEND_PX, LEGEND_ROW_PX * (legend_rows + 1)]) * OVERSAMPLING
     reach_m = math.hypot(view.x_max_m, max(abs(view.y_max_m), abs(view.y_max_m - view.width_px / view.px_per_m)))
     step_m = 10 if reach_m < 100 else 20
     around = np.radians(np.arange(360))
@@ -217,6 +226,7 @@ def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
             texts.put(f"{radius_m} m", [(visible[0][0] - 20, visible[0][1] + 8)], _GRAY)
     arrow = view.pixels(np.array([[1.3, 0], [-0.5, 0.8], [0, 0], [-0.5, -0.8]]))
     cv2.fillPoly(texts.canvas, [subpixels(arrow)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)
+    texts.reserve(*arrow.min(axis=0), *arrow.max(axis=0))
 
 
 def _draw_footprint(canvas: Image, outline: NDArray[np.float64], color: Color, thickness: int) -> None:
@@ -234,14 +244,7 @@ def _put_beside(texts: Texts, outline: NDArray[np.float64], text: str, color: Co
     texts.put(text, [(right + 8, middle), (left - width - 8, middle), above, below], color)
 
 
-def _draw_legend(texts: Texts, view: View, layers: Sequence[BoxLayer]) -> None:
-    """Legend with the number of boxes of each layer, and the scale."""
-    rows = [(f"{layer.name}  {len(layer.boxes)}", layer.color) for layer in layers]
-    line = _LEGEND_ROW_PX * OVERSAMPLING
-    for number, (text, color) in enumerate(rows):
-        left, base = 16 * OVERSAMPLING, 12 * OVERSAMPLING + (number + 1) * line - line // 4
-        cv2.rectangle(texts.canvas, (left, base - line // 2), (left + line // 2, base), color, -1)
-        texts.put(text, [(left + line, base)], _WHITE)
+def _draw_scale(texts: Texts, view: View) -> None:
     length_m = 10
     right, base = view.width_px - 16 * OVERSAMPLING, view.height_px - 14 * OVERSAMPLING
     left = right - round(length_m * view.px_per_m)
