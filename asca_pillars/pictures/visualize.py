@@ -28,9 +28,11 @@ from asca_pillars.pictures.drawing import (
     Color,
     Image,
     Texts,
+    Trail,
     View,
     draw_color_bar,
     draw_legend,
+    mixed,
     subpixels,
 )
 
@@ -119,11 +121,14 @@ def draw_layers(
     *,
     width_px: int = 1000,
     room_for: NDArray[np.floating] | None = None,
+    trails: Sequence[Trail] = (),
+    ground_m: float | None = None,
 ) -> Image:
     """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend.
 
     Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR. With the same boxes (K, 7) as
-    `room_for` several pictures of a scan show the same part of it, whatever is drawn in each.
+    `room_for` several pictures of a scan show the same part of it, whatever is drawn in each. `trails` are where boxes
+    were before; colors begin at `ground_m`, or where the points say.
     """
     points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
@@ -135,7 +140,9 @@ def draw_layers(
     canvas = np.full((view.height_px, view.width_px, 3), BACKGROUND, np.uint8)
     texts = Texts(canvas, 0.42 * OVERSAMPLING)
     _draw_rings(texts, view, legend_rows=len(layers))
-    _draw_points(canvas, view, points)
+    _draw_points(canvas, view, points, ground_m)
+    for trail in trails:
+        _draw_trail(canvas, view, trail)
     for layer, layer_outlines in reversed(list(zip(layers, outlines, strict=True))):
         for outline in layer_outlines:
             _draw_footprint(canvas, view.pixels(outline), layer.color, layer.thickness_px)
@@ -197,11 +204,12 @@ def _in_range(points: NDArray[np.floating], ranges: Ranges) -> NDArray[np.bool_]
     return (x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max)
 
 
-def _draw_points(canvas: Image, view: View, points: NDArray[np.floating]) -> None:
+def _draw_points(canvas: Image, view: View, points: NDArray[np.floating], ground_m: float | None) -> None:
     if not len(points):
         return
     points = points[np.argsort(points[:, 2])]  # the highest last, on top
-    colors = height_rgb(points[:, 2], ground_height(points[:, 2]))[:, ::-1]
+    ground_m = ground_height(points[:, 2]) if ground_m is None else ground_m
+    colors = height_rgb(points[:, 2], ground_m)[:, ::-1]
     columns, rows = view.pixels(points[:, :2]).astype(np.int64).T
     for down in range(_POINT_PX):
         for right in range(_POINT_PX):
@@ -227,6 +235,15 @@ def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
     arrow = view.pixels(np.array([[1.3, 0], [-0.5, 0.8], [0, 0], [-0.5, -0.8]]))
     cv2.fillPoly(texts.canvas, [subpixels(arrow)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)
     texts.reserve(*arrow.min(axis=0), *arrow.max(axis=0))
+
+
+def _draw_trail(canvas: Image, view: View, trail: Trail) -> None:
+    """From its oldest place, faint, to its newest."""
+    pixels = view.pixels(trail.places_m[:, :2])
+    for number in range(1, len(pixels)):
+        color = mixed(BACKGROUND, trail.color, 0.15 + 0.85 * number / len(pixels))
+        ends = subpixels(pixels[number - 1 : number + 1])
+        cv2.polylines(canvas, [ends], False, color, 2 * OVERSAMPLING, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def _draw_footprint(canvas: Image, outline: NDArray[np.float64], color: Color, thickness: int) -> None:
