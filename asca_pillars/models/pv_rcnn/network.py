@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from asca_pillars.config.pillar import LossConfig
 from asca_pillars.config.pv_rcnn import PvRcnnModel
@@ -17,6 +17,7 @@ from asca_pillars.models.pillar.loss import detection_loss
 from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, VoxelBatch
 from asca_pillars.models.pv_rcnn.layers import FirstStageOutputs, PvRcnn, build_pv_rcnn
 from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
+from asca_pillars.models.trainable import Trainable
 from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
 from asca_pillars.models.two_stage.pillar_refiner import Refinements, zero_of_weights
 from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals, propose_anchors
@@ -39,13 +40,15 @@ class PvRcnnOutputs(NamedTuple):
     """Of each frame: in training those drawn, otherwise all."""
 
 
-class PvRcnnDetector(nn.Module):
+class PvRcnnDetector(Trainable):
     """PV-RCNN with its proposals, targets and loss.
 
     Args:
         model: its section of the configuration.
         network: made for it.
     """
+
+    preparation: VoxelPreparation
 
     def __init__(self, model: PvRcnnModel, network: PvRcnn) -> None:
         super().__init__()

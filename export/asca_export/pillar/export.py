@@ -36,7 +36,8 @@ from asca_pillars.base.files import WEIGHTS_FILE, atomic_directory
 from asca_pillars.base.system import cpu_model, default_threads, git_revision, package_versions
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import ModelConfig, pillar_spec
-from asca_pillars.models.checkpoint import Checkpoint, save_weights, weights_sha256
+from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.checkpoint_file import save_weights, weights_sha256
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.scans.measure_input import measure_expected_input
 

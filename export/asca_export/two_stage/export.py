@@ -18,7 +18,7 @@ from asca_deploy.two_stage.pipeline import RefinePipeline
 from asca_export import graphs
 from asca_export.int8 import MAX_LOGIT_ERROR, calibration_scans, logit_error, write_quantized
 from asca_export.pillar.export import draft_bundle, export_bundle, require_parity_scans, write_proven
-from asca_export.two_stage.first_stage import BundleFirstStage
+from asca_export.two_stage.first_stage import BundleFirstStage, is_checkpoint, open_exported
 from asca_export.two_stage.graphs import export_refine
 from asca_export.two_stage.neck_output import add_neck_output, add_neck_steps, scale_bev
 from asca_export.two_stage.parity import prove_refine_parity
@@ -27,8 +27,8 @@ from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.tree import pillar_spec
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector
-from asca_pillars.models.two_stage.open_first_stage import CHECKPOINT_SUFFIX, open_first_stage, with_first_stage
 from asca_pillars.ops.two_stage.first_stage import FirstStage
 
 
@@ -58,8 +58,8 @@ def export_refine_bundle(
     config, detector = checkpoint.config, checkpoint.detector
     if not isinstance(detector, RefineDetector):
         raise ExportError(f"model.kind {config.model.kind}: not a second stage")
-    model = with_first_stage(dataclasses.replace(detector.model, spec=pillar_spec(config)))
-    stage = open_first_stage(model.first_stage)
+    stage = open_exported(detector.model.first_stage)
+    model = with_first_stage(dataclasses.replace(detector.model, spec=pillar_spec(config)), stage)
     if calibration is not None:  # too few are told before the work, not after it
         calibration = calibration_scans(calibration, scans, model.spec).used
     with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, *BUNDLE_FOLDER) as folder:
@@ -150,7 +150,7 @@ def _first_bundle(
     calibration: Sequence[NDArray[np.float32]] | None = None,
 ) -> Path:
     """Folder of the first stage, with `calibration` in 8 bits; a checkpoint is exported to `temporary`."""
-    if Path(source).suffix != CHECKPOINT_SUFFIX:
+    if not is_checkpoint(source):
         return find_bundle(source if calibration is None else f"{source.rstrip('/')}_int8")
     export_bundle(load_checkpoint(source), temporary, scans, calibration=calibration, progress=progress)
     return temporary

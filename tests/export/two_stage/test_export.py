@@ -112,7 +112,8 @@ def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Pat
 def test_eight_bits_of_other_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bundle's 8-bit form goes by its name; another network may stand there."""
     monkeypatch.chdir(tmp_path)
-    export_bundle(tiny_checkpoint("channel"), "first", SCANS)
+    save_checkpoint(Path("first.ckpt"), tiny_checkpoint("channel"))
+    export_bundle(tiny_checkpoint("channel"), "first", SCANS, weights=Path("first.ckpt"))
     config = opened_config(Path("first"))
     torch.manual_seed(0)
     detector = build_model(config.model)
