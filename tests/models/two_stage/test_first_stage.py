@@ -13,7 +13,8 @@ import torch
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import shipped_bundles
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage.first_stage import BundleFirstStage, open_exported
 from asca_pillars.base.errors import BundleError, ConfigError, ExportError
 from asca_pillars.models.pillar.network import PillarDetector
@@ -36,7 +37,7 @@ POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pool
 def test_checkpoint_and_bundle_say_the_same(tmp_path: Path, network: dict[str, Any], spec: Any) -> None:
     checkpoint = tiny_checkpoint("channel", spec, **network)
     save_checkpoint(tmp_path / "first.ckpt", checkpoint)
-    export_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    export_pillar_bundle(checkpoint, tmp_path / "bundle", SCANS)
     in_torch, in_onnx = open_first_stage(str(tmp_path / "first.ckpt")), BundleFirstStage(tmp_path / "bundle")
     assert in_torch.spec == in_onnx.spec == spec
     assert in_torch.identity == in_onnx.identity
@@ -60,12 +61,14 @@ def test_the_same_weights_are_taken_from_any_file_and_others_are_refused(tmp_pat
     save_checkpoint(copy, checkpoint._replace(config=dataclasses.replace(checkpoint.config, name="copy")))
     bundles = [tmp_path / name for name in ("bundle", "again")]
     for folder, calibration in zip(bundles, (None, CALIBRATION), strict=True):
-        export_bundle(checkpoint, folder, SCANS, calibration=calibration, weights=first)
+        export_pillar_bundle(checkpoint, folder, SCANS, ExportOptions(calibration=calibration, weights=first))
     one, eight_bit = (load_pillar_bundle(folder) for folder in bundles)
     assert one.provenance.weights_sha256 == eight_bit.provenance.weights_sha256 and one.graphs != eight_bit.graphs
     model = with_first_stage(tiny_refine_model(first))
     assert model.first_stage_identity == one.provenance.weights_sha256
-    export_bundle(checkpoint, bundles[1], SCANS, trained_on="the same, exported again", weights=first)
+    export_pillar_bundle(
+        checkpoint, bundles[1], SCANS, ExportOptions(trained_on="the same, exported again", weights=first)
+    )
     for source in (copy, *bundles):
         moved = dataclasses.replace(model, first_stage=str(source))
         assert with_first_stage(moved) == moved
@@ -125,7 +128,7 @@ def test_bundles_whose_weights_cannot_be_taken(tmp_path: Path) -> None:
         open_first_stage("asca_smal")
     with pytest.raises(BundleError, match=r"asca_small_sim: holds no weights\.ckpt, .* --with-weights"):
         open_first_stage("asca_small_sim")
-    export_bundle(checkpoint, tmp_path / "bundle", SCANS, weights=tmp_path / "first.ckpt")
+    export_pillar_bundle(checkpoint, tmp_path / "bundle", SCANS, ExportOptions(weights=tmp_path / "first.ckpt"))
     shutil.copyfile(tmp_path / "first.ckpt", tmp_path / "bundle" / "weights.ckpt")
     with pytest.raises(BundleError, match=r"weights\.ckpt: is damaged, or of another bundle"):
         open_first_stage(str(tmp_path / "bundle"))
