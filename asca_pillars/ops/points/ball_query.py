@@ -3,7 +3,6 @@
 Index N, one past the last point, stands for nothing: whoever gathers rows appends a row of zeros.
 """
 
-import itertools
 import math
 from functools import lru_cache
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.kernels import load_kernels
-from asca_pillars.ops.points.columns import Columns, cells_of, require_points, sort_into_columns
+from asca_pillars.ops.points.columns import require_points, sort_into_columns
 
 KERNELS = "asca_pillars.ops.points.ball_kernels"
 # A column is a little narrower than a quarter of the radius: a ball has about 69 columns, and the first visited do not
@@ -20,8 +19,6 @@ KERNELS = "asca_pillars.ops.points.ball_kernels"
 _COLUMNS_PER_RADIUS = 4.01
 _COLUMNS_TO_FILL = 8
 _ROUNDING = 1e-3  # of a column: how far float32 may misplace a point that stands on a border
-_NEAREST = 3
-_PAIRS_AT_ONCE = 1 << 22
 
 
 def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, samples: int) -> NDArray[np.int32]:
@@ -46,8 +43,7 @@ def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, sam
     columns = sort_into_columns(xyz, radius_m / _COLUMNS_PER_RADIUS)
     offsets = _visiting_order(radius_m * float(columns.per_m))
     squared = np.float32(radius_m) * np.float32(radius_m)
-    kernels = load_kernels(KERNELS)
-    query = _ball_query if kernels is None else kernels.ball_query
+    query = load_kernels(KERNELS).ball_query
     return np.asarray(query(xyz, centers, columns, offsets, squared, samples, -(-samples // _COLUMNS_TO_FILL)))
 
 
@@ -61,12 +57,8 @@ def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[
         ValueError: another shape, or a coordinate that is not finite.
     """
     xyz, centers = require_points(points), require_points(queries)
-    kernels = load_kernels(KERNELS)
-    if kernels is None:
-        nearest, squared = _three_nearest(xyz, centers)
-    else:
-        column_m = math.sqrt(_area_m2(xyz) / max(len(xyz), 1)) + 1e-3  # about one point in each
-        nearest, squared = kernels.three_nearest(xyz, centers, sort_into_columns(xyz, column_m))
+    column_m = math.sqrt(_area_m2(xyz) / max(len(xyz), 1)) + 1e-3  # about one point in each
+    nearest, squared = load_kernels(KERNELS).three_nearest(xyz, centers, sort_into_columns(xyz, column_m))
     found = nearest < len(xyz)
     weights = np.where(found, 1 / (np.sqrt(squared) + np.float32(1e-8)), np.float32(0))
     total = weights.sum(axis=1, keepdims=True)
@@ -84,59 +76,6 @@ def _visiting_order(radius: float) -> NDArray[np.int32]:
     offsets = offsets[order].astype(np.int32)
     offsets.flags.writeable = False
     return offsets
-
-
-def _ball_query(
-    xyz: NDArray[np.float32],
-    centers: NDArray[np.float32],
-    columns: Columns,
-    offsets: NDArray[np.int32],
-    squared_radius: np.float32,
-    samples: int,
-    share: int,
-) -> NDArray[np.int32]:
-    ny, nx = columns.shape
-    row, column = cells_of(centers, columns).T
-    found = np.full((len(centers), samples), len(xyz), np.int32)
-    counts = np.zeros(len(centers), np.int64)
-    for first, (row_offset, column_offset) in itertools.product((True, False), offsets.tolist()):
-        rows, cols = row + row_offset, column + column_offset
-        asking = np.flatnonzero((counts < samples) & (rows >= 0) & (rows < ny) & (cols >= 0) & (cols < nx))
-        cell = rows[asking] * nx + cols[asking]
-        start, size = columns.starts[cell], np.diff(columns.starts)[cell]
-        query = np.repeat(asking, size)
-        place = np.arange(len(query)) - np.repeat(np.cumsum(size) - size, size) + np.repeat(start, size)
-        point = columns.order[place]
-        dx, dy, dz = (xyz[point, axis] - centers[query, axis] for axis in range(3))
-        inside = dx * dx + dy * dy + dz * dz < squared_radius
-        query, point = query[inside], point[inside]
-        now = (np.arange(len(query)) - np.searchsorted(query, query) < share) == first
-        query, point = query[now], point[now]
-        rank = counts[query] + np.arange(len(query)) - np.searchsorted(query, query)
-        np.add.at(counts, query, 1)
-        taken = rank < samples
-        found[query[taken], rank[taken]] = point[taken]
-    found[counts < samples] = np.sort(found[counts < samples], axis=1)
-    return np.where(np.arange(samples) < counts[:, None], found, found[:, :1])
-
-
-def _three_nearest(
-    xyz: NDArray[np.float32], centers: NDArray[np.float32]
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    nearest = np.full((len(centers), _NEAREST), len(xyz), np.int32)
-    squared = np.full((len(centers), _NEAREST), np.inf, np.float32)
-    there = min(_NEAREST, len(xyz))
-    step = max(1, _PAIRS_AT_ONCE // max(len(xyz), 1))
-    for start in range(0, len(centers) if there else 0, step):
-        part = slice(start, start + step)
-        dx, dy, dz = (xyz[None, :, axis] - centers[part, None, axis] for axis in range(3))
-        distance = dx * dx + dy * dy + dz * dz
-        for rank in range(there):
-            best = distance.argmin(axis=1)
-            nearest[part, rank] = best
-            squared[part, rank] = np.take_along_axis(distance, best[:, None], axis=1)[:, 0]
-            np.put_along_axis(distance, best[:, None], np.float32(np.inf), axis=1)
-    return nearest, squared
 
 
 def _area_m2(xyz: NDArray[np.float32]) -> float:

@@ -32,16 +32,8 @@ def read_map(rows: NDArray[Any], cells: NDArray[np.int32], weights: NDArray[np.f
 
     Cells are float32, or uint8 steps, of which the result is in steps too.
     """
-    kernels = load_kernels(KERNELS)
-    read = _read_map if kernels is None else kernels.read_map
+    read = load_kernels(KERNELS).read_map
     return np.asarray(read(np.ascontiguousarray(rows), np.ascontiguousarray(cells), np.ascontiguousarray(weights)))
-
-
-def _read_map(rows: NDArray[Any], cells: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    read = np.zeros((len(cells), rows.shape[1]), np.float32)
-    for corner in range(cells.shape[1]):
-        read += rows[cells[:, corner]] * weights[:, corner, None]
-    return read
 
 
 def _between(

@@ -52,9 +52,7 @@ def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
     widest = max(float(last) - float(first) for first, last in zip(low, high, strict=True))
     per_m = np.float32(1 / max(column_m, widest / (_MAX_COLUMNS - 1)))
     nx, ny = (int((last - first) * per_m) + 1 for first, last in zip(low, high, strict=True))
-    kernels = load_kernels(KERNELS)
-    sort = _sort if kernels is None else kernels.sort
-    order, starts = sort(xyz, low[0], low[1], per_m, ny, nx)
+    order, starts = load_kernels(KERNELS).sort(xyz, low[0], low[1], per_m, ny, nx)
     return Columns(order, starts, low, per_m, (ny, nx))
 
 
@@ -65,13 +63,3 @@ def cells_of(xyz: NDArray[np.float32], columns: Columns) -> NDArray[np.int64]:
         for axis, low in enumerate(columns.origin_m)
     )
     return np.floor(np.stack([along_y, along_x], axis=1)).astype(np.int64)
-
-
-def _sort(
-    xyz: NDArray[np.float32], x_low: np.float32, y_low: np.float32, per_m: np.float32, ny: int, nx: int
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    column = ((xyz[:, 0] - x_low) * per_m).astype(np.int64)
-    column += ((xyz[:, 1] - y_low) * per_m).astype(np.int64) * nx
-    starts = np.zeros(ny * nx + 1, np.int32)
-    np.cumsum(np.bincount(column, minlength=ny * nx), out=starts[1:])
-    return np.argsort(column, kind="stable").astype(np.int32), starts

@@ -1,15 +1,13 @@
-"""Operations on the host need neither torch nor numba."""
+"""Operations on the host need no torch."""
 
 import subprocess
 import sys
 
 CODE = """
 import importlib, pkgutil, sys
-sys.modules["numba"] = None
 import asca_pillars.ops
 for module in pkgutil.walk_packages(asca_pillars.ops.__path__, "asca_pillars.ops."):
-    if not module.name.endswith("kernels"):
-        importlib.import_module(module.name)
+    importlib.import_module(module.name)
 import asca_pillars.ops.two_stage.prepare
 import numpy as np
 from asca_pillars.ops.points.ball_query import ball_query
@@ -21,6 +19,6 @@ assert "torch" not in sys.modules
 """
 
 
-def test_without_torch_and_numba() -> None:
+def test_without_torch() -> None:
     result = subprocess.run([sys.executable, "-W", "error", "-c", CODE], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
