@@ -23,7 +23,7 @@ from asca_pillars.base.system import cpu_model
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.detection.decode import HeadMaps, rotated_nms
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.ops.pillar.map_pooling import map_cells
+from asca_pillars.ops.pillar.grid import map_cells
 from asca_pillars.ops.pillar.neck_rulebooks import NeckTableBuilder
 from asca_pillars.scans.input_check import check_input
 from asca_pillars.scans.scan_reader import read_scan

@@ -19,10 +19,9 @@ from asca_deploy import sample_scan_path
 from asca_pillars.base.system import cpu_model
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.ops.points.ball_query import ball_query, three_nearest
-from asca_pillars.ops.points.cube_neighbors import nearest_in_cubes
-from asca_pillars.ops.points.farthest_points import farthest_points, points_near_boxes
-from asca_pillars.ops.two_stage.roi_grid import roi_grid_points
+from asca_pillars.ops.points.neighbors import ball_query, nearest_in_cubes, three_nearest
+from asca_pillars.ops.points.sampling import farthest_points, points_near_boxes
+from asca_pillars.ops.two_stage.rois import roi_grid_points
 from asca_pillars.scans.scan_reader import read_scan
 from benchmarks.host_path import camera_view
 

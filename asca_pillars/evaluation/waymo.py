@@ -38,8 +38,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.overlap import iou_3d
 

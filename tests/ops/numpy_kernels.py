@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import FEATURES, evenly
-from asca_pillars.ops.points.columns import Columns, cells_of
+from asca_pillars.ops.points.sampling import Columns, cells_of
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, Voxels
-from asca_pillars.ops.sparse.convolution import Links, Shape
-from asca_pillars.ops.sparse.rulebook import CellMap
+from asca_pillars.ops.sparse.rulebooks import CellMap, Links, Shape
 
 _NEAREST = 3
 _PAIRS_AT_ONCE = _DISTANCES_AT_ONCE = 1 << 22
@@ -252,10 +251,7 @@ _KERNELS = SimpleNamespace(
         xyz[:, :3], centers[:, :3], *cube
     ),
 )
-_USERS = (
-    *("detection.decode", "ops.pillar.prepare", "ops.points.columns", "ops.points.farthest_points"),
-    *("ops.points.ball_query", "ops.points.bilinear", "ops.points.cube_neighbors"),
-)
+_USERS = "detection.decode", "ops.pillar.prepare", "ops.points.sampling", "ops.points.neighbors"
 
 
 class NumpyCellMap(CellMap):

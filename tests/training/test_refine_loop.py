@@ -23,7 +23,7 @@ from asca_pillars.models.two_stage.network import RefineDetector
 from asca_pillars.models.two_stage.preparation import LabeledProposals, move_proposed
 from asca_pillars.models.two_stage.refined_detector import refine
 from asca_pillars.ops.two_stage.first_stage import propose_on
-from asca_pillars.ops.two_stage.roi_targets import match_proposals
+from asca_pillars.ops.two_stage.rois import match_proposals
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
 from tests.models.two_stage.test_pillar_refiner import proposed_frame

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.evaluation.tracking.tracked_frames import TrackedFrame
 
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.evaluation.tracking.tracked_frames import TrackedFrame, counts_of_ids
 
 _Doubles = NDArray[np.float64]

@@ -134,7 +134,7 @@ class PillarDetector(Trainable):
     def pool(self, pillar_features: Tensor, batch: PillarBatch) -> tuple[Tensor, Tensor, Sequence[int]]:
         """Pillar features (P, C) -> features (M, C) and cells (M,) of the map, and how many each frame has.
 
-        See `ops.pillar.map_pooling`; without a pooled map pillars and cells are the same.
+        See `ops.pillar.grid`; without a pooled map pillars and cells are the same.
         """
         if self.grid.pools != (batch.pooling is not None) or isinstance(self.neck, RPNNeck) != (batch.neck is None):
             raise ValueError("the batch was placed for another map or neck; use `preparation.place` of this detector")

@@ -12,6 +12,7 @@ from asca_pillars.config.pillar import LossConfig
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.proposals import AnchorProposals, propose_anchors
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.pillar.loss import detection_loss
 from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, VoxelBatch
@@ -20,11 +21,10 @@ from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
 from asca_pillars.models.trainable import Trainable
 from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
 from asca_pillars.models.two_stage.pillar_refiner import Refinements, zero_of_weights
-from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals, propose_anchors
-from asca_pillars.ops.sparse.batching import stack_rows
+from asca_pillars.ops.sparse.rulebooks import stack_rows
 from asca_pillars.ops.two_stage.decode import reported_frames
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
-from asca_pillars.ops.two_stage.roi_targets import match_proposals, roi_targets, sample_rois
+from asca_pillars.ops.two_stage.rois import match_proposals, roi_targets, sample_rois
 
 _DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
 

@@ -24,7 +24,7 @@ from asca_pillars.models.two_stage.pillar_refiner import RefineInputs
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache, ProposalFiles
 from asca_pillars.models.two_stage.samples import RefineSample, collate_samples, sample_of
 from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
-from asca_pillars.ops.two_stage.roi_targets import match_proposals, sample_rois
+from asca_pillars.ops.two_stage.rois import match_proposals, sample_rois
 
 
 class PreparedRefinement(NamedTuple):

@@ -21,7 +21,7 @@ _BLOCK = 16  # cells of the grid that are looked at together
 
 
 def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, _Integers]:
-    """`numpy_kernels._sort_points`, by counting: (N, 4) -> indices (K,) of the points inside, cells (Q,), counts (Q,)."""
+    """`numpy_kernels._sort_points`, by counting: (N, 4) -> indices (K,) of the points inside, cells, counts (Q,)."""
     size = -(-grid.ny * grid.nx // _BLOCK) * _BLOCK
     # In one piece: glibc gives several pieces back to the system, and gets them page by page again for the next scan.
     memory = np.empty(5 * len(points) + size, np.uint32)

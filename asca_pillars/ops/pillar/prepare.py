@@ -14,7 +14,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.strict import Strict
 from asca_pillars.detection.decode import MOST
-from asca_pillars.detection.report import ScanCounts
+from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.ops.pillar.grid import PillarGrid
 
 KERNELS = "asca_pillars.ops.pillar.kernels"

@@ -7,7 +7,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import compiled, given, inner, written
-from asca_pillars.ops.points.columns import Columns, cells_of
+from asca_pillars.ops.points.sampling import Columns, cells_of
 
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int32]

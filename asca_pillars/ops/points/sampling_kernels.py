@@ -8,7 +8,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import compiled, given, inner, written
-from asca_pillars.ops.points.columns import Columns
+from asca_pillars.ops.points.sampling import Columns
 
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int32]

@@ -7,8 +7,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import compiled, given, written
-from asca_pillars.ops.sparse.convolution import Shape
 from asca_pillars.ops.sparse.kernels import bits_of, bits_set
+from asca_pillars.ops.sparse.rulebooks import Shape
 
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int64]

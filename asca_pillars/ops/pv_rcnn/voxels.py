@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.strict import Strict
-from asca_pillars.ops.sparse.convolution import Shape
-from asca_pillars.ops.sparse.rulebook import MAX_Z_CELLS, CellMap
+from asca_pillars.ops.sparse.rulebooks import MAX_Z_CELLS, CellMap, Shape
 
 KERNELS = "asca_pillars.ops.pv_rcnn.kernels"
 _TOLERANCE = 1e-2  # of a number of voxels: room for float dust and for sizes written with few digits

@@ -17,10 +17,10 @@ from asca_export.pillar.export import export_pillar_bundle
 from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage.first_stage import BundleFirstStage, open_exported
 from asca_pillars.base.errors import BundleError, ConfigError, ExportError
+from asca_pillars.detection.proposals import ProposalSettings
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
-from asca_pillars.ops.two_stage.proposals import ProposalSettings
 from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
 from tests.models.two_stage.tiny_refine import tiny_refine_model
 from tests.saved_checkpoint import save_checkpoint

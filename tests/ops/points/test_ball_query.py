@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.ball_query import ball_query, three_nearest
+from asca_pillars.ops.points.neighbors import ball_query, three_nearest
 from tests.ops.numpy_kernels import both_forms
 from tests.ops.points.clouds import CLOUDS, cloud
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.bilinear import bilinear_cells, read_map
+from asca_pillars.ops.points.sampling import bilinear_cells, read_map
 from tests.ops.numpy_kernels import both_forms
 
 

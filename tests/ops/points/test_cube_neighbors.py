@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.cube_neighbors import cube_cells_m, nearest_in_cubes
+from asca_pillars.ops.points.neighbors import cube_cells_m, nearest_in_cubes
 from tests.ops.numpy_kernels import both_forms
 from tests.ops.points.clouds import CLOUDS
 

@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.farthest_points import farthest_points, points_near_boxes
+from asca_pillars.ops.points.sampling import farthest_points, points_near_boxes
 from tests.ops.numpy_kernels import both_forms, by_numpy
 from tests.ops.points.clouds import CLOUDS, cloud
 

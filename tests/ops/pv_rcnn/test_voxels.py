@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, voxelize
-from asca_pillars.ops.sparse.rulebook import CellMap
+from asca_pillars.ops.sparse.rulebooks import CellMap
 from tests.ops import numpy_kernels
 
 GRID = VoxelGrid((1.0, 4.0), (-2.0, 1.2), (-1.5, 0.5), (0.3, 0.2, 0.1), max_points=3)

@@ -11,8 +11,7 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
-from asca_pillars.ops.sparse.convolution import Convolution, Shape, map_convolution
-from asca_pillars.ops.sparse.rulebook import CellMap
+from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
 from tests.ops.numpy_kernels import NumpyCellMap
 
 CONVOLUTIONS = (

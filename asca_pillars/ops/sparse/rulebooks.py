@@ -1,12 +1,14 @@
-"""The active cells of one lattice, and the tables that convolutions between two of them read.
+"""Sparse convolutions: which cells a kernel joins, the active cells of a lattice, and the rulebooks between two.
 
 A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row
 at which its column starts plus the number of bits set below it. No hash, no sort. Active cells are ordered by
-(y, x, z), z running fastest, which makes every table and every network output independent of threads and machine.
+(y, x, z), z running fastest, which makes every rulebook and every network output independent of threads and machine.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +16,81 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
-from asca_pillars.ops.sparse.convolution import Convolution, Links, Shape
+
+Shape = tuple[int, int, int]
+"""Cells along z, y, x; a map seen from above has one along z."""
+
+
+class Links(NamedTuple):
+    """What each tap joins a cell of one lattice with on another, axis by axis.
+
+    Tap (kz, ky, kx) joins cell (z, y, x) with (links.z[z, kz], links.y[y, ky], links.x[x, kx]), or with nothing where
+    one of them is -1.
+    """
+
+    z: NDArray[np.int64]
+    """(nz, kernel along z), as the other two along theirs."""
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """A convolution's geometry; tap (kz, ky, kx) is number (kz * kernel_y + ky) * kernel_x + kx, as PyTorch stores it.
+
+    Raises:
+        ConfigError: a size that is not positive, or a padding as large as the kernel.
+    """
+
+    kernel: Shape
+    stride: Shape
+    padding: Shape
+
+    def __post_init__(self) -> None:
+        for kernel, stride, padding in zip(self.kernel, self.stride, self.padding, strict=True):
+            if kernel < 1 or stride < 1 or not 0 <= padding < kernel:
+                raise ConfigError(
+                    f"a convolution with kernel {self.kernel}, stride {self.stride} and padding {self.padding}: kernel "
+                    "and stride must be at least 1, the padding less than the kernel"
+                )
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Cells of the output for an input of this shape."""
+        sizes = zip(shape, self.kernel, self.stride, self.padding, strict=True)
+        z, y, x = ((size + 2 * padding - kernel) // stride + 1 for size, kernel, stride, padding in sizes)
+        return z, y, x
+
+    @property
+    def taps(self) -> int:
+        """K, the kernel's cells."""
+        return math.prod(self.kernel)
+
+    def inputs(self, outputs: Shape, inputs: Shape) -> Links:
+        """From an output to the inputs that it reads, on lattices of these shapes."""
+        return _links(self, outputs, inputs, backward=False)
+
+    def outputs(self, inputs: Shape, outputs: Shape) -> Links:
+        """From an input to the outputs that read it."""
+        return _links(self, inputs, outputs, backward=True)
+
+
+def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convolution:
+    """Of a map seen from above: nothing happens along z."""
+    return Convolution((1, kernel, kernel), (1, stride, stride), (0, padding, padding))
+
+
+@lru_cache(maxsize=256)  # the same few for every map
+def _links(convolution: Convolution, shape: Shape, other: Shape, *, backward: bool) -> Links:
+    axes = []
+    for axis in range(3):
+        taps, stride, padding = np.arange(convolution.kernel[axis]), convolution.stride[axis], convolution.padding[axis]
+        places = np.arange(shape[axis])[:, None]
+        joined, rest = np.divmod(places + padding - taps, stride) if backward else (places * stride - padding + taps, 0)
+        exists = (rest == 0) & (joined >= 0) & (joined < other[axis])
+        axes.append(np.where(exists, joined, -1))
+        axes[-1].flags.writeable = False
+    return Links(*axes)
+
 
 KERNELS = "asca_pillars.ops.sparse.kernels"
 MAX_Z_CELLS = 64  # the bits of a column's mask
@@ -135,3 +211,21 @@ def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
     """The convolution from one map to another."""
     inputs = convolution.inputs(target.shape, source.shape)
     return Join(source, target, inputs, convolution.outputs(source.shape, target.shape))
+
+
+def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
+    """Tables (M_i, ...) of indices into features of `rows[i]` rows each -> one into all of them, (sum of M_i, ...).
+
+    What is missing, row rows[i], becomes row sum(rows).
+    """
+    starts, total = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32), sum(rows)
+    moved = [
+        np.where(table == count, np.int32(total), table + start)
+        for table, count, start in zip(tables, rows, starts[:-1], strict=True)
+    ]
+    return np.concatenate(moved)
+
+
+def stack_cells(cells: Sequence[NDArray[np.int32]], cells_per_frame: int) -> NDArray[np.int32]:
+    """Flat indices (M_i,) on each frame's map -> (sum of M_i,) on the maps of all frames, one after the other."""
+    return np.concatenate([each + np.int32(frame * cells_per_frame) for frame, each in enumerate(cells)])
