@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.cli.recording_results import Found
+from asca_deploy.recordings.results import Found
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan
 
 MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
