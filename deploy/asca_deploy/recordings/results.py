@@ -10,12 +10,12 @@ from typing import IO, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy import Detections
+from asca_deploy.recordings.journal import Journal
 from asca_deploy.tracker import MAX_SCAN_GAP_S, Tracker
 from asca_deploy.tracks import Tracks
-from asca_pillars.cli.recording_journal import Journal
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
+from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 
 _MIRROR = FrameChange(np.diag([1.0, -1.0, 1.0]), np.zeros(3))

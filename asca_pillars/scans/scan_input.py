@@ -1,31 +1,12 @@
-"""Scan files as the options of a command want them read, and the mounting of their sensor."""
+"""Scan files read as `ScanSettings` say, and the mounting of their sensor."""
 
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Literal
 
-from asca_pillars.base.errors import ConfigError
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, read_scan
 from asca_pillars.scans.scan_settings import ScanSettings, sample_points
 from asca_pillars.scans.stored_scans import FolderScale, folder_reflectance_scale
-
-
-def scan_settings(
-    *, sensor_height: str | None, axes: str, pose: Path | None, reflectance_scale: str, columns: int | None
-) -> ScanSettings:
-    """The options of that name, as typed.
-
-    Raises:
-        ConfigError: one cannot be used.
-    """
-    return ScanSettings(
-        sensor_height=None if sensor_height is None else _number(sensor_height, "--sensor-height"),
-        axes=axes,
-        pose=None if pose is None else str(pose),
-        reflectance_scale=_number(reflectance_scale, "--reflectance-scale"),
-        columns=columns,
-    )
 
 
 class ScanInput:
@@ -78,12 +59,3 @@ def said_of_scale(decided: FolderScale) -> list[str]:
 
 def _folder_and_suffix(path: Path) -> tuple[Path, str]:
     return path.parent, path.suffix.lower()
-
-
-def _number(text: str, option: str) -> Literal["auto"] | float:
-    if text == "auto":
-        return "auto"
-    try:
-        return float(text)
-    except ValueError:
-        raise ConfigError(f"{option} {text[:40]}: give a number or auto") from None

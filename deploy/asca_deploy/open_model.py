@@ -1,47 +1,40 @@
 """A model that is to be run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy import Detections, Detector
+from asca_deploy.detector import Detector
 from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.extras import require
 from asca_pillars.base.system import check_threads
-from asca_pillars.cli.extras import require
-from asca_pillars.cli.options import RuntimeOptions, Scores
-from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import ScoreThresholds
+from asca_pillars.evaluation.model import Model
 from asca_pillars.scans.mounting import Mounting
 
 
-@dataclass(frozen=True)
-class Model:
-    """A detector and what is to be known about it.
+@dataclass(frozen=True, kw_only=True)
+class RuntimeOptions:
+    """Which model runs, and how. The arguments of `Detector` by the same names."""
 
-    Attributes:
-        name: of the model.
-        detect: (N, 4) points -> detections, from `min_score` on.
-        spec: as the model was made, with its own thresholds.
-        camera_view: whether it expects only the points in the image.
-        about: where it comes from and where it runs, for the report.
-        unlike: for each scan that does not look like those of the training, the first reason.
-    """
-
-    name: str
-    detect: Callable[[NDArray[np.float32]], Detections]
-    spec: DetectorSpec
-    camera_view: bool
-    about: dict[str, Any]
-    unlike: list[str] = field(default_factory=list)
+    bundle: Path | None = None
+    provider: str = "cpu"
+    precision: str | None = None
+    threads: int | None = None
 
 
 def open_detector(
-    options: RuntimeOptions, score: Scores | None = None, mounting: Mounting | None = None, *, around: bool = False
+    options: RuntimeOptions,
+    score: ScoreThresholds | None = None,
+    mounting: Mounting | None = None,
+    *,
+    around: bool = False,
 ) -> Detector:
     """The detector of a bundle that is run as `options` say, from `score` on; None for the bundle's own thresholds.
 
@@ -107,35 +100,16 @@ def _open_bundle(options: RuntimeOptions, min_score: float, mounting: Mounting, 
 
 
 def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float, mounting: Mounting) -> Model:
-    provider, precision, threads = options.provider, options.precision, options.threads
     require("train")
-    import torch
+    from asca_pillars.models.scan_detector import open_checkpoint
 
-    from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.models.scan_detector import ScanDetector
-
+    provider, precision, threads = options.provider, options.precision, options.threads
     if threads is not None:
         check_threads(threads)
     if provider not in ("cpu", "cuda", "auto"):
         raise ConfigError(f"provider {provider} does not run checkpoints: choose cpu, cuda or auto, or give a bundle")
     if precision not in (None, "float32"):
         raise ConfigError(f"precision {precision} does not go with checkpoints: they run in float32; give a bundle")
-    if provider == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("provider cuda: PyTorch finds no CUDA device here; choose cpu")
-    device = "cpu" if provider == "cpu" or not torch.cuda.is_available() else "cuda"
-    if threads is not None:
-        torch.set_num_threads(threads)
-    loaded = load_checkpoint(path)
-    config, network = loaded.config, loaded.detector
-    about = {
-        "name": config.name,
-        "checkpoint": str(path),
-        "steps": loaded.steps,
-        "provider": f"torch {device}",
-        "threads": torch.get_num_threads(),
-        "min_score": min_score,
-    }
-    expected = loaded.expected_input
-    to_model = mounting.to_model(None if expected is None else expected.sensor_height_m)
-    detect = ScanDetector(network.to(device), config.model.spec.with_score_threshold(min_score), to_model)
-    return Model(config.name, detect, config.model.spec, config.data.camera_view, about)
+    opened = open_checkpoint(path, min_score, mounting, device=provider, threads=threads)
+    config = opened.config
+    return Model(config.name, opened.detector, config.model.spec, config.data.camera_view, opened.about)

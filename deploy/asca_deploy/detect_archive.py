@@ -11,19 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.console import Console
-from rich.progress import track
-
-from asca_deploy import Detector
 from asca_deploy.bundle import MANIFEST
+from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
-from asca_deploy.shipped import find_bundle
-from asca_pillars.base.errors import BundleError, ClusterError, ConfigError, ScanError
-from asca_pillars.base.files import atomic_path
-from asca_pillars.base.own_files import json_object, require_own
-from asca_pillars.base.schema import to_dict
-from asca_pillars.base.system import package_versions
-from asca_pillars.cli.detect_files import (
+from asca_deploy.open_model import RuntimeOptions, open_detector
+from asca_deploy.result_files import (
     COMMAND,
     RUN_FILE,
     UNREADABLE_FILE,
@@ -32,15 +24,20 @@ from asca_pillars.cli.detect_files import (
     remove_companions,
     scan_content,
 )
-from asca_pillars.cli.detect_tables import remark
-from asca_pillars.cli.extras import require
-from asca_pillars.cli.models import open_detector
-from asca_pillars.cli.options import RuntimeOptions, Scores
-from asca_pillars.cli.scan_input import ScanInput
+from asca_deploy.shipped import find_bundle
+from asca_pillars.base.errors import BundleError, ClusterError, ConfigError, ScanError
+from asca_pillars.base.extras import require
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.own_files import json_object, require_own
+from asca_pillars.base.progress import Progress, Remark, Reporter
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.system import package_versions
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
 from asca_pillars.data.boxes.detector_scope import detector_scope
+from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, read_scan
 from asca_pillars.scans.scan_settings import ScanSettings
 
@@ -59,6 +56,21 @@ class Counts(NamedTuple):
 
     detected: int
     unreadable: int
+
+
+@dataclass(frozen=True)
+class ArchiveResult:
+    """What `detect_archive` did.
+
+    Attributes:
+        counts: of all scans.
+        done_before: scans that an earlier run had done.
+        repeats: how often shards were begun again after their worker had died.
+    """
+
+    counts: Counts
+    done_before: int
+    repeats: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,50 +140,55 @@ def error_line(path: str, reason: str) -> str:
 
 def detect_archive(
     scans: Sequence[Path],
-    scan_input: ScanInput,
-    settings: ScanSettings,
-    options: RuntimeOptions,
     out: Path,
     *,
-    score: Scores | None,
-    around: bool,
     address: str,
-) -> None:
+    options: RuntimeOptions,
+    reading: ScanSettings,
+    score: ScoreThresholds | None = None,
+    around: bool = False,
+    progress: Progress | None = None,
+    remark: Remark | None = None,
+) -> ArchiveResult:
     """Detect in all scans on a cluster and write OUT/detections.jsonl; what an earlier run has done is not done again.
 
+    Args:
+        scans: files, see `name_scans`.
+        out: folder that every machine mounts at the same place.
+        address: of the cluster: HOST:PORT, auto, or local.
+        options: which model runs, and how.
+        reading: how the files are read and the sensor was mounted.
+        score: report detections from this score on, or by class; None: the thresholds of the model.
+        around: look in every direction, by turned passes.
+        progress: called while it is found out what an earlier run has done.
+        remark: called with what was decided for a folder.
+
     Raises:
-        AscaError: an option cannot be used, the cluster not be reached, or some scans not be read.
+        AscaError: an option cannot be used, the cluster not be reached, or no scan can be read.
     """
+    reporter = Reporter(progress, remark)
+    scan_input = ScanInput(reading, scans)
     require("cluster")
     if options.provider == "auto":
         raise ConfigError("--provider auto: each machine would choose its own; name one provider with --cluster")
     is_run = json_object("shard_size", "settings")
     claim(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
     require_own(out / SHARDS, COMMAND, {RUN_SETTINGS: is_run})
-    console = Console(markup=False)
     for line in scan_input.said:
-        remark(console, line)
-    job = _job(scan_input.mounting, settings.columns, options, out, score=score, around=around)
+        reporter.remark(line)
+    job = _job(scan_input.mounting, reading.columns, options, out, score=score, around=around)
     folder = ShardFolder(job.shards)
     wanted = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
     size = folder.claim(_results_depend_on(job, scans), wanted)
     shards = cut([(str(path), scan_input.scale(path)) for path in scans], size)
-    there = folder.done(track(shards, "Checking what is done", console=console, transient=True))
+    there = folder.done(reporter.track(shards, "Checking what is done"))
     todo = [shard for shard in shards if shard.name not in there]
     done = len(scans) - sum(len(shard.items) for shard in todo)
-    if done:
-        console.print(f"{done} scans were done by an earlier run", highlight=False)
     repeats = _work(job, folder, todo, done, address)
-    if repeats:
-        console.print(f"{repeats} shards were begun again after their worker had died", highlight=False)
     counts = merge(folder.lines(shards), out)
-    console.print(f"{counts.detected} scans: {out / RUN_FILE}", highlight=False, soft_wrap=True)
     if not counts.detected:
         raise ScanError(f"none of the {len(scans)} scans can be read; the reasons are in {out / UNREADABLE_FILE}")
-    if counts.unreadable:
-        raise ScanError(
-            f"{counts.unreadable} of {len(scans)} scans could not be read; they are named in {out / UNREADABLE_FILE}"
-        )
+    return ArchiveResult(counts, done, repeats)
 
 
 def merge(lines: Iterable[str], out: Path) -> Counts:
@@ -232,7 +249,13 @@ def _within(parts: Sequence[Shard], shard: Shard) -> Iterator[Shard]:
 
 
 def _job(
-    mounting: Mounting, columns: int | None, options: RuntimeOptions, out: Path, *, score: Scores | None, around: bool
+    mounting: Mounting,
+    columns: int | None,
+    options: RuntimeOptions,
+    out: Path,
+    *,
+    score: ScoreThresholds | None,
+    around: bool,
 ) -> DetectShard:
     bundle = find_bundle(options.bundle)
     spec = load_bundle(bundle).spec  # a damaged one is named here, not by every worker
@@ -272,7 +295,7 @@ def _results_depend_on(job: DetectShard, scans: Sequence[Path]) -> dict[str, obj
     }
 
 
-def _scores(job: DetectShard) -> Scores | None:
+def _scores(job: DetectShard) -> ScoreThresholds | None:
     return dict(job.score) if isinstance(job.score, tuple) else job.score
 
 

@@ -11,7 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from asca_pillars.cli.recording_results import Found
+from asca_deploy.recordings.results import Found
 from asca_pillars.pictures.colors import class_shares
 
 TOPIC = "/asca/boxes"

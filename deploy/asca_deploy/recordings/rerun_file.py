@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.cli.recording_results import Found
+from asca_deploy.recordings.results import Found
 from asca_pillars.pictures.colors import class_rgb
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan
 

@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy import ScanDetections
+from asca_deploy.scan_detections import ScanDetections
 from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.base.files import atomic_path, write_json, write_text
 from asca_pillars.base.input_files import require_content

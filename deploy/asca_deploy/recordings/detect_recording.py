@@ -1,4 +1,4 @@
-"""`asca detect` of a recording: scans of one topic in, boxes with time stamps and identities out."""
+"""Detection in a recording: scans of one topic in, boxes with time stamps and identities out."""
 
 import json
 from collections import Counter, deque
@@ -13,23 +13,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
-from asca_deploy import Detector, find_bundle
+from asca_deploy.detect_scans import DetectedScan, repairs
+from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
-from asca_deploy.tracker import Tracker
-from asca_pillars.base.errors import ConfigError, ScanError
-from asca_pillars.base.files import atomic_path
-from asca_pillars.base.schema import to_dict
-from asca_pillars.cli import detect_tables as show
-from asca_pillars.cli.detect_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
-from asca_pillars.cli.extras import require
-from asca_pillars.cli.foxglove_file import FoxgloveFile, is_own_mcap
-from asca_pillars.cli.models import open_detector
-from asca_pillars.cli.options import RuntimeOptions, Scores
-from asca_pillars.cli.recording_journal import JOURNAL_FILE, Journal, ScanResult, is_journal
-from asca_pillars.cli.recording_results import (
+from asca_deploy.open_model import RuntimeOptions, open_detector
+from asca_deploy.recordings.foxglove_file import FoxgloveFile, is_own_mcap
+from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
+from asca_deploy.recordings.rerun_file import RerunFile, is_own_rrd
+from asca_deploy.recordings.results import (
     Found,
     JsonLines,
     KittiTracks,
@@ -38,29 +30,63 @@ from asca_pillars.cli.recording_results import (
     said_of_stamps,
     tracked,
 )
-from asca_pillars.cli.rerun_file import RerunFile, is_own_rrd
-from asca_pillars.cli.scan_input import said_of_scale
-from asca_pillars.cli.writable_file import require_suffix, require_writable
+from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
+from asca_deploy.shipped import find_bundle
+from asca_deploy.tracker import Tracker
+from asca_pillars.base.errors import ConfigError, ScanError
+from asca_pillars.base.extras import require
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.progress import Progress, Remark, Reporter
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.writable_file import require_suffix, require_writable
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
+from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.odometry import Poses, read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.scans.scan_input import said_of_scale
 from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
 
 WEAK_SHARE = 0.7
 """Detections from this share of the lowest threshold on carry tracks on that better ones began."""
 
 
+_PLAIN = RuntimeOptions()
+_AS_TRAINED = ScanSettings()
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """What `detect_recording` found and wrote.
+
+    Attributes:
+        scans: with results.
+        boxes: number of boxes of each class in all scans.
+        files: that were written; the first one is detections.jsonl.
+        cpu_ms_per_scan: processor time of a scan; None if an earlier run had detected all of them.
+        problems: sentences about scans that could not be read and damaged parts of the recording; empty if there were
+            none.
+        remarks: what was decided, repaired or odd.
+    """
+
+    scans: int
+    boxes: dict[str, int]
+    files: tuple[Path, ...]
+    cpu_ms_per_scan: float | None
+    problems: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
-class RecordingTask:
-    """What is made of a recording; the options of `asca detect` by the same names."""
+class _Task:
+    """What is made of a recording; the arguments of `detect_recording` by the same names."""
 
     path: Path
     out: Path
-    score: Scores | None
+    score: ScoreThresholds | None
     around: bool
     topic: str | None
     track: bool
@@ -70,12 +96,61 @@ class RecordingTask:
     rerun: Path | None
 
 
-def detect_recording(task: RecordingTask, reading: ScanSettings, options: RuntimeOptions, console: Console) -> None:
+def detect_recording(
+    path: str | Path,
+    out: str | Path,
+    *,
+    topic: str | None = None,
+    track: bool = False,
+    odometry: str | None = None,
+    calib: Path | None = None,
+    foxglove: Path | None = None,
+    rerun: Path | None = None,
+    options: RuntimeOptions = _PLAIN,
+    reading: ScanSettings = _AS_TRAINED,
+    score: ScoreThresholds | None = None,
+    around: bool = False,
+    progress: Progress | None = None,
+    remark: Remark | None = None,
+) -> RecordingResult:
     """Detect in every scan of a topic and write the results; what a killed run had done is not done again.
 
+    Args:
+        path: of the recording: .mcap, .db3, .bag or the folder of a rosbag2.
+        out: folder for detections.jsonl and recording.json.
+        topic: of the scans; None: the only one of the recording.
+        track: give boxes identities and velocities over time.
+        odometry: with `track`, the topic of the car's poses; None: velocities are as the car sees them.
+        calib: KITTI calibration, for KITTI's tracking text in `out`.
+        foxglove: an .mcap to write for Foxglove.
+        rerun: an .rrd to write for the rerun viewer.
+        options: which model runs, and how.
+        reading: how the sensor was mounted.
+        score: report detections from this score on, or by class; None: the thresholds of the model.
+        around: look in every direction, by turned passes.
+        progress: called after each scan.
+        remark: called with each of the result's `remarks` as soon as it is known.
+
     Raises:
-        AscaError: something cannot be read or written; scans that cannot be read are skipped, and told at the end.
+        AscaError: something cannot be read or written; scans that cannot be read are skipped, see
+            `RecordingResult.problems`.
     """
+    task = _Task(
+        path=Path(path),
+        out=Path(out),
+        score=score,
+        around=around,
+        topic=topic,
+        track=track,
+        odometry=odometry,
+        calib=calib,
+        foxglove=foxglove,
+        rerun=rerun,
+    )
+    return _detect(task, reading, options, Reporter(progress, remark))
+
+
+def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporter: Reporter) -> RecordingResult:
     require("recordings")
     if task.rerun is not None:
         require("view")
@@ -101,21 +176,19 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
     if estimate is not None:
         said.append(f"sensor height: {estimate}")
     for line in said:
-        show.remark(console, line)
+        reporter.remark(line)
     births = _thresholds(options.bundle, task.score)
     least = WEAK_SHARE * min(births.values()) if task.track else task.score
     detector = open_detector(options, least, mounting, around=task.around)
     about = _about(task, reading, mounting, detector, topic.name, least)
     with Journal(task.out, about, detector.spec.class_names) as journal:
         if journal.done:
-            console.print(f"going on after the {journal.done} scans that {journal.path} holds", soft_wrap=True)
+            reporter.remark(f"going on after the {journal.done} scans that {journal.path} holds")
         if journal.differs:
-            console.print(
-                f"beginning anew: another run was killed here, with another {journal.differs}", soft_wrap=True
-            )
+            reporter.remark(f"beginning anew: another run was killed here, with another {journal.differs}")
         start = process_time()
         run = _Run(detector, scans, journal)
-        for _ in track(run.results(), "Detecting", topic.messages - journal.done, console=console):
+        for _ in reporter.track(run.results(), "Detecting", topic.messages, journal.done):
             pass
         seconds = process_time() - start
         tracker = Tracker(birth_score=births) if task.track else None
@@ -125,16 +198,22 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
             why = run.first() or (f": {recording.damage}" if recording.damage else "")
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{why}")
         if task.track:
-            _check_times(times_ns, task, topic.name, poses, console)
+            _check_times(times_ns, task, topic.name, poses, reporter)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
         scope = detector_scope(detector.spec, around=task.around)
         written, classes = _write(task, results, scans, calibration, scope, about)
         journal.remove()
-    boxes = ", ".join(f"{classes[name]} {name}" for name in detector.spec.class_names)
-    console.print(f"{written} scans, in all {boxes}", highlight=False)
-    _tell(task, run, seconds, console)
-    if told := [*sorted(filter(None, damages)), *run.skipped()]:
-        raise ScanError("; ".join(told))
+    for line in repairs(run.kept):
+        reporter.remark(line)
+    others = (None if task.calib is None else task.out / KITTI_FILE, task.foxglove, task.rerun)
+    return RecordingResult(
+        written,
+        {name: classes[name] for name in detector.spec.class_names},
+        (task.out / RUN_FILE, *(path for path in others if path is not None)),
+        1e3 * seconds / len(run.kept) if run.kept else None,
+        (*sorted(filter(None, damages)), *run.skipped()),
+        tuple(reporter.remarks),
+    )
 
 
 class _Run:
@@ -144,7 +223,7 @@ class _Run:
         self._detector, self._scans, self._journal = detector, scans, journal
         self._coming: deque[RecordedScan] = deque()
         self.troubles = [one.trouble for one in journal.results() if one.trouble] if journal.done else []
-        self.kept: list[show.Result] = []
+        self.kept: list[DetectedScan] = []
 
     def results(self) -> Iterator[None]:
         """One item for each scan that is in the journal now."""
@@ -162,7 +241,7 @@ class _Run:
                 )
             )
             where = self._scans.recording.path / str(scan.number)
-            self.kept.append(show.Result(where, scan.scan.notes, found.labels, found.report))
+            self.kept.append(DetectedScan(where, scan.scan.notes, found))
             yield
         yield from self._skip()
 
@@ -192,17 +271,17 @@ class _Run:
             yield
 
 
-def _thresholds(bundle: Path | None, score: Scores | None) -> dict[str, float]:
+def _thresholds(bundle: Path | None, score: ScoreThresholds | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track; ConfigError if it is none."""
     spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)
     return {one.name: one.score_threshold for one in spec.classes}
 
 
-def _check_times(times: Sequence[int], task: RecordingTask, topic: str, poses: Poses | None, console: Console) -> None:
+def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
     """Say that stamps are out of order or the odometry is too short; ScanError if it is of another time."""
     if stamps := said_of_stamps(times):
-        show.remark(console, f"{task.path}, {topic}: {stamps}")
+        reporter.remark(f"{task.path}, {topic}: {stamps}")
     if poses is None:
         return
     outside = [time for time in times if not poses.covers(time)]
@@ -213,16 +292,16 @@ def _check_times(times: Sequence[int], task: RecordingTask, topic: str, poses: P
     said = f"{task.path}, {task.odometry}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {share}"
     if len(outside) == len(times):
         raise ScanError(f"{said} are at other times, as of another clock; leave --odometry out")
-    show.remark(console, f"{said} lie outside, with wrong velocities over ground")
+    reporter.remark(f"{said} lie outside, with wrong velocities over ground")
 
 
 def _about(
-    task: RecordingTask,
+    task: _Task,
     reading: ScanSettings,
     mounting: Mounting,
     detector: Detector,
     topic: str,
-    least: Scores | None,
+    least: ScoreThresholds | None,
 ) -> dict[str, Any]:
     """All that detections depend on: a journal of anything else is not gone on with."""
     files = recording_files(task.path)
@@ -248,7 +327,7 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
 
 
 def _write(
-    task: RecordingTask,
+    task: _Task,
     results: Iterator[Found],
     scans: RecordedScans,
     calibration: Any,
@@ -283,14 +362,3 @@ def _write(
         handles.close()  # before the names are changed
     remove_companions(task.out, [ABOUT_FILE, *([] if calibration is None else [KITTI_FILE])])
     return scans_written, classes
-
-
-def _tell(task: RecordingTask, run: _Run, seconds: float, console: Console) -> None:
-    if run.kept:
-        console.print(f"{1e3 * seconds / len(run.kept):.1f} ms of CPU per scan")
-        for line in show.notes(run.kept):
-            show.remark(console, line)
-    written = [task.out / RUN_FILE, *(path for path in (task.foxglove, task.rerun) if path is not None)]
-    if task.calib is not None:
-        written.insert(1, task.out / KITTI_FILE)
-    console.print(f"Results: {', '.join(map(str, written))}", soft_wrap=True)

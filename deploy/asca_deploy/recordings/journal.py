@@ -15,13 +15,13 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from asca_deploy import Detections
+from asca_deploy.result_files import COMMAND
 from asca_pillars.base.errors import OutputError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.locks import only_writer
 from asca_pillars.base.own_files import require_no_link
 from asca_pillars.base.sealed_lines import sealed, unsealed
-from asca_pillars.cli.detect_files import COMMAND
+from asca_pillars.detection.detections import Detections
 
 JOURNAL_FILE = "detections.partial.jsonl"
 _LONGEST_HEAD_BYTES = 1 << 24
