@@ -112,7 +112,7 @@ def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float, moun
     import torch
 
     from asca_pillars.models.checkpoint import load_checkpoint
-    from asca_pillars.models.scan_detector import ScanDetector
+    from asca_pillars.models.trainable import ScanDetector
 
     if threads is not None:
         check_threads(threads)

@@ -145,7 +145,7 @@ def write_predictions(
     Args:
         folder: for NAME.txt of each frame, an empty file where nothing was found.
         split: the frames; their scans and calibrations are read, their labels are not.
-        detect: (N, 4) points -> detections, for instance `asca_deploy.Detector` or `models.scan_detector.ScanDetector`.
+        detect: (N, 4) points -> detections, for instance `asca_deploy.Detector` or `models.trainable.ScanDetector`.
         camera_view: give the detector only the points in the image, as it has seen in training.
         console: shows the progress.
 

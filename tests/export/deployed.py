@@ -9,7 +9,7 @@ import numpy as np
 
 from asca_deploy import Detector
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import ScanDetector
 from tests.export.tiny import SCANS
 
 _DETECT = """

@@ -13,7 +13,7 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_export.int8 import quantize_bundle
 from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import ScanDetector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 from tests.scenes import SPEC
 

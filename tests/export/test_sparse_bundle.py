@@ -19,7 +19,7 @@ from asca_export.proven_bundle import ExportOptions
 from asca_pillars.base.errors import ConfigError, ProviderError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import ScanDetector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 from tests.same_detections import same
 from tests.scenes import SPEC

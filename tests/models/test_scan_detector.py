@@ -7,7 +7,7 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import ScanDetector
 from tests.scenes import make_scene
 from tests.training.test_loop import CONFIG
 

@@ -12,8 +12,7 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.build import build_model
-from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.models.trainable import Movable, Trainable
+from asca_pillars.models.trainable import Movable, ScanDetector, Trainable
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, VARIANTS, batch, frame, tiny_detector
 from tests.models.two_stage.tiny_refine import opened_config, write_first_stage

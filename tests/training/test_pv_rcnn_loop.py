@@ -13,7 +13,7 @@ from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config, load_config, pillar_spec
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import ScanDetector
 from asca_pillars.training.loop import train
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SPEC, tiny_config
 from tests.scenes import write_dataset

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
-from asca_pillars.models.row_product import linear_rows
-from asca_pillars.models.table_conv import at_active_cells, table_conv
+from asca_pillars.models.map_backbone import convolution_block, joined_maps, upsampling
+from asca_pillars.models.sparse_conv import at_active_cells, linear_rows, table_conv
 from asca_pillars.ops.pillar.grid import HEAD_STRIDE, NECK_STRIDE
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTables
 

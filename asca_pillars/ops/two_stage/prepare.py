@@ -69,7 +69,7 @@ class GridNeighbors(NamedTuple):
 
 @dataclass(frozen=True)
 class RefineScan:
-    """One scan as the second stage takes it; `models.two_stage.pillar_refiner.RefineInputs` says what each array is."""
+    """One scan as the second stage takes it; `models.two_stage.layers.RefineInputs` says what each array is."""
 
     points: NDArray[np.float32]
     keypoints: NDArray[np.float32]

@@ -26,7 +26,7 @@ from asca_pillars.config.pillar import CpaReading
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import ScanDetector
 from asca_pillars.ops.pillar.prepare import PillarLimits
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.expected_input import ExpectedInput

@@ -22,7 +22,7 @@ from asca_pillars.models.pillar.preparation import (
     batch_pillars,
     batch_targets,
 )
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.trainable import ScanDetector
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder
 from tests.scenes import SPEC, make_scene
 
