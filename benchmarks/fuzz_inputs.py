@@ -20,7 +20,7 @@ from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.scans.mounting import read_pose
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.sim.simulation_configs import load_simulation_config
+from asca_pillars.sim.simulation import load_simulation_config
 from benchmarks.fuzz_recordings import read_recording, recording_seeds
 
 LABEL = "Car 0.00 0 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57"

@@ -16,8 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from asca_pillars.cli.run_command import run_command
-from asca_pillars.sim.simulation import simulate_frame
-from asca_pillars.sim.simulation_configs import load_simulation_config
+from asca_pillars.sim.simulation import load_simulation_config, simulate_frame
 
 NEAREST_M = 2.5  # nearer returns are mostly the own car's
 BANDS_M = (10, 20, 30, 50)

@@ -29,12 +29,11 @@ from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import in_image
 from asca_pillars.sim.annotation import label_camera_view
 from asca_pillars.sim.casting.raycast import cast
-from asca_pillars.sim.scalar_draws import draws_of
-from asca_pillars.sim.sensor.image_border import outside_image
 from asca_pillars.sim.sensor.lidar import draw_firings
 from asca_pillars.sim.sensor.returns import measure
-from asca_pillars.sim.simulation import RAY_KEYS, SimulationConfig, built_half_angle_rad, simulate_frame
+from asca_pillars.sim.simulation import RAY_KEYS, SimulationConfig, built_half_angle_rad, outside_image, simulate_frame
 from asca_pillars.sim.world.scene import build, draw_scene
+from asca_pillars.sim.world.streets import draws_of
 
 STAGES = ("scene", "bodies", "cast", "returns", "labels", "frame")
 VIEWS: tuple[Literal["camera", "full"], ...] = ("camera", "full")

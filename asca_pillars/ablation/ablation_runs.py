@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rich.progress import track
 
-from asca_pillars.ablation.family import Row
+from asca_pillars.ablation.variants import Row
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.files import write_json
 from asca_pillars.base.own_files import require_no_link, written_by

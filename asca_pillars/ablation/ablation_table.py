@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from asca_pillars.ablation.ablation_runs import Run
-from asca_pillars.ablation.family import Family
+from asca_pillars.ablation.variants import Family
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES
 from asca_pillars.evaluation.report_page import markdown_table
 

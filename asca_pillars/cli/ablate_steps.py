@@ -12,9 +12,7 @@ from rich.progress import track
 
 from asca_pillars.ablation.ablation_runs import Run
 from asca_pillars.ablation.ablation_table import Speed
-from asca_pillars.ablation.family import Family, Row
-from asca_pillars.ablation.pillar_variants import PILLARS
-from asca_pillars.ablation.two_stage_variants import TWO_STAGE
+from asca_pillars.ablation.variants import PILLARS, TWO_STAGE, Family, Row
 from asca_pillars.base.errors import ConfigError, DatasetError, TrainingError
 from asca_pillars.base.files import write_json
 from asca_pillars.base.locks import recover

@@ -20,7 +20,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.evaluation.boxes.box_predictions import BoxFrames, read_box_predictions, write_box_predictions
 from asca_pillars.evaluation.boxes.box_report import BoxProtocol, box_json, box_notes, box_report, box_tables
-from asca_pillars.evaluation.boxes.fixed_scores import fixed_scores
+from asca_pillars.evaluation.boxes.iou_metrics import fixed_scores
 from asca_pillars.evaluation.errors.error_frames import BoxErrorFrames
 from asca_pillars.evaluation.report_page import ReportPage
 

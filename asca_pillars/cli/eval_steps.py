@@ -28,9 +28,15 @@ from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kit
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames, write_predictions
 from asca_pillars.evaluation.report_page import ReportPage
-from asca_pillars.evaluation.waymo import waymo_detection
-from asca_pillars.evaluation.waymo_frames import evaluated_classes, waymo_frames
-from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
+from asca_pillars.evaluation.waymo import (
+    WaymoReport,
+    evaluated_classes,
+    waymo_detection,
+    waymo_frames,
+    waymo_json,
+    waymo_notes,
+    waymo_table,
+)
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.ops.pillar.grid import PillarGrid
 

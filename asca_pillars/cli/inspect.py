@@ -65,8 +65,8 @@ def inspect(
     from asca_pillars.cli.writable_file import require_writable
     from asca_pillars.config.tree import load_config
     from asca_pillars.data.inspection.findings import findings
-    from asca_pillars.data.inspection.input_cells import input_cells
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
+    from asca_pillars.data.inspection.measurements import input_cells
     from asca_pillars.data.open_split import open_split
 
     report_json = "asca inspect --json", json_object("config", "frames_in_split", "states_mounting", "findings")

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from rich.table import Table
 
 from asca_pillars.data.frames import NEIGHBOR_TYPES
-from asca_pillars.data.inspection.input_cells import InputCells
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread
+from asca_pillars.data.inspection.measurements import InputCells
 
 
 def types(inspection: Inspection, names: Sequence[str]) -> Table:

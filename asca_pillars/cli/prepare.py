@@ -38,12 +38,12 @@ def prepare(
     settings = load_config(config, override or ())
     console = Console(markup=False)
     if kitti_split:
-        from asca_pillars.data.kitti.train_val_split import write_train_val_lists
+        from asca_pillars.data.kitti.kitti_split import write_train_val_lists
 
         for path in write_train_val_lists(data):
             console.print(f"written: {path}", soft_wrap=True, highlight=False)
     require("train")
-    from asca_pillars.data.insertion.free_maps import prepare_free_spaces
+    from asca_pillars.data.insertion.free_space import prepare_free_spaces
     from asca_pillars.data.insertion.insert_objects import prepare_inserter
     from asca_pillars.data.open_split import open_split
 

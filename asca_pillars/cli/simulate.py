@@ -112,9 +112,8 @@ def simulate(
     from asca_pillars.cli.models import open_model
     from asca_pillars.cli.options import RuntimeOptions
     from asca_pillars.data.kitti import KittiSplit
-    from asca_pillars.sim.simulation import require_own_frames
+    from asca_pillars.sim.simulation import load_simulation_config, require_own_frames
     from asca_pillars.sim.simulation import simulate as write_frames
-    from asca_pillars.sim.simulation_configs import load_simulation_config
 
     if bundle is not None and like is None:
         raise ConfigError(f"--bundle {bundle} scores the objects of a real folder: give --like FOLDER, too")

@@ -7,10 +7,9 @@ from rich.console import Console
 from asca_pillars.base.own_files import ending_with, is_own_picture, json_object, require_no_link, require_own
 from asca_pillars.cli.models import open_model
 from asca_pillars.cli.options import RuntimeOptions
-from asca_pillars.sim.report.comparison import compare
+from asca_pillars.sim.report.comparison import compare, measure
 from asca_pillars.sim.report.like_for_like import MIN_SCORE, compare_like_for_like
 from asca_pillars.sim.report.like_tables import print_like, write_like
-from asca_pillars.sim.report.measured import measure
 from asca_pillars.sim.report.plots import write_plots
 from asca_pillars.sim.report.reference import kitti_reference
 from asca_pillars.sim.report.tables import PAGE_END, print_comparison, write_report

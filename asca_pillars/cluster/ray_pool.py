@@ -10,8 +10,7 @@ from typing import Any, Generic
 
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.base.system import default_threads, package_versions
-from asca_pillars.cluster.schedule import Outcome, Result
-from asca_pillars.cluster.shards import Shard
+from asca_pillars.cluster.shards import Outcome, Result, Shard
 
 LOCAL = "local"
 _OBJECT_STORE_BYTES = 100 * 2**20  # nothing but names and counts passes through it

@@ -11,8 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.base.locks import recover
 from asca_pillars.cluster.ray_pool import RayPool, connected
-from asca_pillars.cluster.schedule import Outcome, Result, work_off
-from asca_pillars.cluster.shards import Shard, cut
+from asca_pillars.cluster.shards import Outcome, Result, Shard, cut, work_off
 
 
 def run_shards(

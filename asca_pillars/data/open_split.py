@@ -1,10 +1,13 @@
-"""A dataset's list, by the layout of its folder."""
+"""Datasets by the layout of their folder: one of its lists, and the labels beside a scan."""
 
+from functools import lru_cache
 from pathlib import Path
 
-from asca_pillars.data.boxes.box_frames import DATASET_FILE
-from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.kitti import KittiSplit
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxSplit, frame_id_of
+from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels
 from asca_pillars.data.labeled_split import LabeledSplit
 
 
@@ -19,3 +22,35 @@ def open_split(root: str | Path, name: str = "training") -> LabeledSplit:
         ConfigError: dataset.yaml cannot be used.
     """
     return BoxSplit(root, name) if (Path(root) / DATASET_FILE).is_file() else KittiSplit(root, name)
+
+
+DEPTH = 6  # folders above a scan in which a dataset.yaml is looked for
+
+
+def labels_beside(scan: Path) -> NDArray[np.float32] | None:
+    """Labelled boxes (M, 7) in the scan's own frame, metres and radians; None if there are no labels.
+
+    ../label_2 and ../calib of a scan in a folder velodyne/, or a dataset.yaml above the scan whose scans it is one of.
+
+    Raises:
+        DatasetError, ConfigError: there are labels, but they are damaged.
+    """
+    if scan.parent.name == "velodyne":
+        label, calib = (scan.parent.parent / name / f"{scan.stem}.txt" for name in ("label_2", "calib"))
+        if label.is_file() and calib.is_file():
+            return boxes_from_objects(objects_3d(read_labels(label)), read_calibration(calib))
+    scan = scan.resolve()
+    for folder in scan.parents[:DEPTH]:
+        if not (folder / DATASET_FILE).is_file():
+            continue
+        split = _split(folder)
+        scans = split.scans_folder.resolve()
+        frame_id = frame_id_of(scan, scans) if scan.is_relative_to(scans) else ""
+        return split.records(frame_id).boxes if frame_id in split.frame_ids else None
+    return None
+
+
+@lru_cache(maxsize=1)
+def _split(root: Path) -> BoxSplit:
+    """Opened once for the scans of a folder."""
+    return BoxSplit(root)

@@ -31,17 +31,28 @@ cutoffs by the distribution of the scores get somewhat different figures.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, isfinite
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.targets import UNMATCHED, best_assignments
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
+from asca_pillars.evaluation.kitti.objects import FrameObjects
+from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares
+from asca_pillars.evaluation.kitti.score_threshold import DONT_CARE_SHARE
+from asca_pillars.evaluation.kitti.states import is_neighbor
+from asca_pillars.evaluation.predictions import FOLDED_KITTI_TYPES, ScoredFrames
+from asca_pillars.evaluation.report_page import TextTable
+from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import iou_3d
+from asca_pillars.scans.scan_reader import read_scan
 
 LEVELS = (1, 2)
 EVERYWHERE = (0.0, inf)
@@ -267,3 +278,191 @@ def _checked_class_names(truth: Sequence[WaymoTruth], detections: Sequence[Detec
         if not ((found.scores >= 0) & (found.scores <= 1)).all():
             raise ValueError(f"frame {index}: scores must lie within [0, 1]")
     return detections[0].class_names
+
+
+_LEVEL_2 = 2
+
+
+class WaymoFrames(NamedTuple):
+    """The arguments of `waymo_detection`: labels, detections and no-label zones of the same frames."""
+
+    truth: list[WaymoTruth]
+    detections: list[Detections]
+    no_label: list[NDArray[np.bool_]]
+
+
+def evaluated_classes(frames: ScoredFrames) -> tuple[str, ...]:
+    """KITTI's classes that occur, then the other ones that detections name or that KITTI does not know."""
+    labelled = {name.casefold(): name for frame in frames.truth for name in frame.types}
+    detected = {name.casefold(): name for frame in frames.detections for name in frame.types}
+    named = detected | labelled  # the spelling of the labels wins
+    official = [name for name in CLASS_NAMES if name.casefold() in named]
+    others = [key for key in named if key in detected or key not in FOLDED_KITTI_TYPES]
+    folded = {name.casefold() for name in (*CLASS_NAMES, "DontCare")}
+    return (*official, *sorted(named[key] for key in others if key not in folded))
+
+
+def waymo_frames(
+    frames: ScoredFrames, class_names: Sequence[str], split: KittiSplit | None, *, console: Console | None = None
+) -> WaymoFrames:
+    """Labels and detections of KITTI text in one upright frame, with levels and no-label zones.
+
+    Args:
+        frames: labels and predictions.
+        class_names: what is evaluated.
+        split: where the scans and calibrations are; None if there are none.
+        console: shows the progress.
+
+    Raises:
+        DatasetError, ScanError: a score outside [0, 1]; a scan or calibration that cannot be read.
+    """
+    result = WaymoFrames([], [], [])
+    pairs = list(zip(frames.truth, frames.detections, strict=True))
+    for truth, found in track(pairs, "Points in boxes", console=console, disable=console is None or split is None):
+        detections, no_label = _detections(truth, found, tuple(class_names))
+        result.truth.append(_truth(truth, class_names, split))
+        result.detections.append(detections)
+        result.no_label.append(no_label)
+    return result
+
+
+def upright_boxes(objects: FrameObjects) -> NDArray[np.float64]:
+    """(N, 7) x, y, z of the center, length, width, height, yaw; metres and radians, x forward, y left, z up."""
+    height, width, length = objects.dimensions_hwl.T
+    right, down, forward = objects.locations.T
+    yaw = wrap_angle(-objects.rotation_y - np.pi / 2)
+    return np.stack([forward, -right, height / 2 - down, length, width, height, yaw], axis=1)
+
+
+def _truth(objects: FrameObjects, class_names: Sequence[str], split: KittiSplit | None) -> WaymoTruth:
+    boxes, labels = upright_boxes(objects), _labels(objects, class_names)
+    boxes, labels = boxes[labels >= 0], labels[labels >= 0]
+    if split is None:
+        return WaymoTruth(boxes, labels, np.full(len(boxes), _LEVEL_2))
+    points = read_scan(split.scan_path(objects.frame_id)).points
+    right, down, forward = split.calibration(objects.frame_id).rect_from_lidar(points[:, :3]).T
+    inside = points_in_boxes(np.stack([forward, -right, -down], axis=1), boxes)
+    return WaymoTruth(boxes, labels, difficulty_levels(inside.sum(axis=0)))
+
+
+def _detections(
+    truth: FrameObjects, found: FrameObjects, class_names: tuple[str, ...]
+) -> tuple[Detections, NDArray[np.bool_]]:
+    """Those of the classes, D of them, and which (D,) lie in what stands for a no-label zone."""
+    labels = _labels(found, class_names)
+    known = labels >= 0
+    wrong = found.scores[known & ((found.scores < 0) | (found.scores > 1))]
+    if len(wrong):
+        raise DatasetError(
+            f"frame {found.frame_id}: score {wrong[0]:g}; Waymo's metric cuts off at 0, 0.01 .. 1: "
+            "scale the scores of the predictions to [0, 1]"
+        )
+    boxes, scores = upright_boxes(found)[known].astype(np.float32), found.scores[known].astype(np.float32)
+    zones = dont_care_shares(Frames.join([truth], [found]))[known] > DONT_CARE_SHARE
+    for label, name in enumerate(class_names):
+        own = labels[known] == label
+        neighbors = is_neighbor(truth, name) & (_labels(truth, class_names) < 0)
+        zones[own] |= np.any(iou_3d(boxes[own], upright_boxes(truth)[neighbors]) >= min_iou(name), axis=1)
+    return Detections(boxes, scores, labels[known], class_names), zones
+
+
+def _labels(objects: FrameObjects, class_names: Sequence[str]) -> NDArray[np.int64]:
+    """(N,) index of each object's class; -1 for another type, and for an object without a 3D box."""
+    index = {name.casefold(): label for label, name in enumerate(class_names)}
+    labels = np.array([index.get(name, -1) for name in objects.folded_types.tolist()], dtype=np.int64)
+    return np.where(objects.dimensions_hwl.min(axis=1, initial=np.inf) > 0, labels, -1)
+
+
+@dataclass(frozen=True)
+class WaymoReport:
+    """What was evaluated by Waymo's metric, and every number about it."""
+
+    subject: str
+    """The model or folder and the data, in words."""
+    frames: ScoredFrames
+    scores: Sequence[WaymoScore]
+    has_points: bool
+    """Whether scans told the levels."""
+    about: dict[str, Any]
+    """Model, command, machine and versions, for the JSON."""
+
+    @property
+    def title(self) -> str:
+        """The subject, and how many frames stand behind the numbers."""
+        return self.frames.titled(self.subject)
+
+
+def waymo_table(report: WaymoReport) -> TextTable:
+    """A row for every class and range, and the means over the classes; two columns for each level."""
+    rows = []
+    for name in dict.fromkeys(score.class_name for score in report.scores):
+        for span in RANGES_M:
+            own = [item for item in report.scores if (item.class_name, item.range_m) == (name, span)]
+            by_level = sorted(own, key=lambda item: item.level)
+            cells = [cell for item in by_level for cell in (_percent(item.ap), _percent(item.aph), str(item.objects))]
+            rows.append((name, _range_text(span), *cells))
+    for span in RANGES_M:
+        means = [mean_over_classes(report.scores, level, span) for level in LEVELS]
+        rows.append(("mean", _range_text(span), *(cell for ap, aph in means for cell in (_mean(ap), _mean(aph), ""))))
+    columns = [f"L{level}\n{what}" for level in LEVELS for what in ("AP", "APH", "objects")]
+    title = "AP and APH (%) of Waymo's metric at LEVEL_1 and LEVEL_2, 3D IoU 0.7 for vehicles and 0.5 for the others"
+    return TextTable(title, ("class", "distance", *columns), tuple(rows))
+
+
+def waymo_notes(report: WaymoReport) -> list[str]:
+    """What one must know to read the table."""
+    if report.has_points:
+        return []
+    return ["LEVEL_1 is not evaluated: levels come from the LiDAR points in the boxes; give --data ROOT with the scans"]
+
+
+def waymo_json(report: WaymoReport) -> dict[str, Any]:
+    """Everything in the report: a record for every class, level and range, and the means; percent."""
+    return {
+        "protocol": "waymo",
+        "subject": report.subject,
+        "frames": len(report.frames),
+        "frames_asked": report.frames.asked,
+        "frames_without_predictions": list(report.frames.without_predictions),
+        "shortage": report.frames.shortage,
+        "results": [
+            {
+                "class_name": item.class_name,
+                "level": item.level,
+                **_range_json(item.range_m),
+                "objects": item.objects,
+                "AP": item.ap,
+                "APH": item.aph,
+            }
+            for item in report.scores
+        ],
+        "means": [_mean_json(report, level, span) for level in LEVELS for span in RANGES_M],
+        "notes": waymo_notes(report),
+        **report.about,
+    }
+
+
+def _mean_json(report: WaymoReport, level: int, span: tuple[float, float]) -> dict[str, Any]:
+    ap, aph = (value if isfinite(value) else None for value in mean_over_classes(report.scores, level, span))
+    return {"level": level, **_range_json(span), "mAP": ap, "mAPH": aph}
+
+
+def _range_json(span: tuple[float, float]) -> dict[str, float | None]:
+    """JSON knows no infinity: a range without an end has null there."""
+    low_m, high_m = span
+    return {"low_m": low_m, "high_m": high_m if isfinite(high_m) else None}
+
+
+def _range_text(span: tuple[float, float]) -> str:
+    low_m, high_m = span
+    if isfinite(high_m):
+        return f"{low_m:g}-{high_m:g} m"
+    return f"{low_m:g}+ m" if low_m else "all"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _mean(value: float) -> str:
+    return _percent(value if isfinite(value) else None)

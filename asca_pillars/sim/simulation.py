@@ -9,6 +9,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.base.schema import parse
+from asca_pillars.base.settings import read_settings, shipped_configs
 from asca_pillars.base.strict import Strict
 from asca_pillars.cluster.run_shards import run_each
 from asca_pillars.data.kitti import (
@@ -20,6 +22,7 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
+from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH
 from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
@@ -32,12 +35,41 @@ from asca_pillars.sim.parallel import (
     require_own_simulation,
     write_once,
 )
-from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sensor.image_border import outside_image
 from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
 from asca_pillars.sim.sensor.returns import Returns, measure
 from asca_pillars.sim.world.scene import Scene, build, draw_scene
+from asca_pillars.sim.world.streets import draws_of
+
+MARGIN_PX = 3.0  # points are rounded to millimetres
+
+
+def outside_image(firings: Firings, calib: Calibration) -> npt.NDArray[np.bool_]:
+    """(K,C) firings all of whose returns lie beyond one border of the image, or behind the camera.
+
+    What lies beyond a border is a half space (x, y, z, 1) * plane > 0, so that a ray lies there if it does at the
+    nearest and at the farthest range.
+    """
+    u, v, depth = calib.p2 @ calib.rect_from_lidar_matrix
+    width, height = DEFAULT_IMAGE_SIZE_WH
+    planes = (
+        -u - MARGIN_PX * depth,
+        u - (width + MARGIN_PX) * depth,
+        -v - MARGIN_PX * depth,
+        v - (height + MARGIN_PX) * depth,
+    )
+    stretch = np.sqrt(1.0 + firings.slope**2)
+    ends_m = np.array(firings.lidar.range_m)[:, None] / stretch  # (2,K) horizontal distances
+    cos, sin = np.cos(firings.azimuth_rad), np.sin(firings.azimuth_rad)
+    phase = np.stack([np.cos(firings.phase_rad), np.sin(firings.phase_rad)], axis=1)
+    outside = np.zeros((len(firings.slope), len(cos)), bool)
+    for x, y, z, one in planes:
+        # Along a ray the product is start + rise * distance: positive at both ends if the rise exceeds -start / each.
+        start, rise = z * firings.origin_z_m + one, phase @ np.stack([x * cos + y * sin, y * cos - x * sin])
+        least = (-start / ends_m).max(axis=0) - z * firings.slope
+        outside |= rise > least[:, None]
+    return outside
+
 
 _SHARD_FRAMES = 20  # of a cluster's worker: a second or two
 
@@ -201,3 +233,22 @@ def _write_frame(root: Path, seed: int, config: SimulationConfig, index: int) ->
     write_once(split.calib_path(name), lambda path: write_calibration(path, frame.calibration))
     write_once(split.label_path(name), lambda path: write_labels(path, frame.objects))
     write_scan(split.scan_path(name), frame.points)
+
+
+KIND = "simulation"
+
+
+def load_simulation_config(path: str | None, view: str | None = None) -> SimulationConfig:
+    """Read a YAML file with `scene`, `lidar` and `field_of_view`, of each what differs from the defaults.
+
+    Args:
+        path: the file, or the name of one in configs/simulation/; None for the defaults, which imitate KITTI.
+        view: "full", "camera" or "around", which wins over the file.
+
+    Raises:
+        ConfigError: unreadable YAML, an unknown key anywhere (the nearest is named), an impossible value.
+    """
+    config = SimulationConfig() if path is None else read_settings(SimulationConfig, path, (), shipped_configs(KIND))
+    if view is None:
+        return config
+    return replace(config, field_of_view=parse(SimulationConfig, {"field_of_view": view}, "--view").field_of_view)

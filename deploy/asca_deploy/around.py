@@ -1,4 +1,7 @@
-"""Every direction with a model that looks ahead: the scan is turned before each pass, and the boxes are turned back.
+"""Every direction with a bundle that looks ahead: in one pass where its weights know every direction, else in several.
+
+A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolutions looks around with wider ones
+(`widened`). With others the scan is turned before each pass, and the boxes are turned back:
 
     pass 0: ahead     pass 1: left     pass 2: behind     pass 3: right
 
@@ -11,15 +14,18 @@ sees nearest to straight ahead, where the model has seen the most in training.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_deploy.bundle import Bundle, PillarBundle
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.decode import nms_by_class
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.scans.ground_height import fit_ground_plane
 
 CAMERA_FIELD_RAD = math.pi / 4
@@ -30,6 +36,31 @@ GROUND_POINTS = 10_000
 """Of a scan that its ground is looked for in: the normal is then that of all points to some hundredths of a degree."""
 _HALF_TURN_RAD = math.pi
 _STEP_RAD = math.radians(1)
+
+
+def widened(bundle: Bundle) -> Bundle:
+    """The bundle with ranges that reach in every direction as far as its own do in one, where its graphs allow it.
+
+    They do with a sparse neck, which reads rulebooks instead of a map, on even pillars, if the weights were trained on
+    whole revolutions. Other bundles are returned as they are. `max_pillars` grows with the area.
+    """
+    if not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "dense" or bundle.expected_input.camera_view:
+        return bundle
+    spec, grid = bundle.spec, bundle.spec.grid
+    if grid.zones > 1 or spec.anchor_places != "cells":
+        return bundle
+    reach = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
+    x_end, y_end = (_fitting_range(reach, pillar_m) for pillar_m in (grid.v_max_m, grid.v_y_m))
+    square = replace(grid, x_range_m=(-x_end, x_end), y_range_m=(-y_end, y_end))
+    share = math.prod(square.map_shape) / math.prod(grid.map_shape)
+    limits = replace(spec.limits, max_pillars=math.ceil(spec.limits.max_pillars * share))
+    return replace(bundle, spec=replace(spec, grid=square, limits=limits))
+
+
+def _fitting_range(reach_m: float, pillar_m: float) -> float:
+    """The shortest range from `reach_m` on that pillars of this size fill as the network's strides need it."""
+    step_m = NECK_STRIDE * pillar_m
+    return round(math.ceil(reach_m / step_m - 1e-6) * step_m, 6)
 
 
 def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...]:

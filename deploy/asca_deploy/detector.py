@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
-from asca_deploy.around import about_ground, merge, ranges_around, turns_around
+from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widened
 from asca_deploy.bundle import Bundle
 from asca_deploy.manifest import load_bundle
 from asca_deploy.open_pipeline import open_pipeline
@@ -85,8 +85,9 @@ class Detector:
             bundle's.
         mounting: how the scans' frame lies to the model's. Points come and boxes go in the scans' own frame. None: the
             scans are as those of the training.
-        view: "ahead", or "around" for every direction: as many turned passes as the model's field of view needs
-            (`self.passes`), merged. Each costs what a scan ahead costs.
+        view: "ahead", or "around" for every direction: one pass with wider ranges where the model was trained on whole
+            revolutions (`asca_deploy.around`), else as many turned passes as its field of view needs, merged.
+            `self.passes` says how many; each turned one costs what a scan ahead costs.
 
     Raises:
         BundleError: the bundle is missing, damaged or made for another version.
@@ -111,7 +112,10 @@ class Detector:
         self.threads = check_threads(threads)
         check_onnxruntime()
         providers.require(provider, precision or "float32")
-        self.bundle: Bundle = load_bundle(self.folder)
+        if view not in get_args(View):
+            raise ConfigError(f"view {view}: give {' or '.join(get_args(View))}")
+        manifest = load_bundle(self.folder)
+        self.bundle: Bundle = widened(manifest) if view == "around" else manifest
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
         self.pipeline, self.provider, self.precision, self.candidates = open_pipeline(
@@ -120,8 +124,6 @@ class Detector:
         self.pipeline.spec = self.spec
         if self.candidates:
             _log.info(auto.summary(self.runs_on, self.candidates))
-        if view not in get_args(View):
-            raise ConfigError(f"view {view}: give {' or '.join(get_args(View))}")
         if not isinstance(mounting, Mounting | None):
             raise ConfigError(f"mounting {mounting!r:.40}: give Mounting(...), such as Mounting(sensor_height_m=1.8)")
         expected = self.bundle.expected_input

@@ -13,7 +13,7 @@ import yaml
 
 from asca_pillars.ablation import ablation_runs
 from asca_pillars.ablation.ablation_runs import finish_runs, runs
-from asca_pillars.ablation.pillar_variants import VARIANTS
+from asca_pillars.ablation.variants import VARIANTS
 from asca_pillars.base.errors import AscaError, ConfigError, TrainingError
 from asca_pillars.base.own_files import written_by
 from asca_pillars.base.schema import to_dict

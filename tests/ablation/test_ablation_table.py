@@ -1,7 +1,7 @@
 """The ablation's tables against numbers that can be worked out by hand."""
 
 from asca_pillars.ablation.ablation_table import Speed, tables
-from asca_pillars.ablation.pillar_variants import PILLARS
+from asca_pillars.ablation.variants import PILLARS
 
 
 def _result(car: float, pedestrian: float, cyclist: float | None) -> dict:

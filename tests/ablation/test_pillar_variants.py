@@ -2,7 +2,7 @@
 
 import pytest
 
-from asca_pillars.ablation.pillar_variants import VARIANTS, Variant
+from asca_pillars.ablation.variants import VARIANTS, Variant
 from asca_pillars.base.settings import shipped_configs
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import load_config

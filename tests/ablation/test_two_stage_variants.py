@@ -8,7 +8,7 @@ import pytest
 import torch
 import yaml
 
-from asca_pillars.ablation.two_stage_variants import BASE, TWO_STAGE
+from asca_pillars.ablation.variants import BASE, TWO_STAGE
 from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.ablate import ablate

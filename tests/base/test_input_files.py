@@ -22,7 +22,7 @@ from asca_pillars.scans.find_scans import SCAN_SUFFIXES, find_scans
 from asca_pillars.scans.mounting import read_pose
 from asca_pillars.scans.recordings.open_recording import open_recording
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.sim.simulation_configs import load_simulation_config
+from asca_pillars.sim.simulation import load_simulation_config
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"4d7a" * 16 + b"\nsize 131072\n"
 

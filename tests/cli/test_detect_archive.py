@@ -17,8 +17,7 @@ from asca_pillars.cli import detect_archive as archive
 from asca_pillars.cli import extras
 from asca_pillars.cli.detect import detect
 from asca_pillars.cli.detect_files import UNREADABLE_FILE
-from asca_pillars.cluster.schedule import Outcome
-from asca_pillars.cluster.shards import Shard
+from asca_pillars.cluster.shards import Outcome, Shard
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.deploy.conftest import make_scan, write_bundle
 

@@ -12,8 +12,7 @@ import pytest
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.cluster import ray_pool
 from asca_pillars.cluster.run_shards import run_each, run_shards
-from asca_pillars.cluster.schedule import work_off
-from asca_pillars.cluster.shards import Shard, cut
+from asca_pillars.cluster.shards import Shard, cut, work_off
 
 pytest.importorskip("ray", reason="needs pip install -e '.[cluster]'")
 

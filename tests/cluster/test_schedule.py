@@ -8,8 +8,7 @@ from typing import Literal
 import pytest
 
 from asca_pillars.base.errors import BundleError
-from asca_pillars.cluster.schedule import TRIES, Outcome, work_off
-from asca_pillars.cluster.shards import Shard, cut
+from asca_pillars.cluster.shards import TRIES, Outcome, Shard, cut, work_off
 
 
 class MadeUpPool:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_pillars.config.tree import AugmentConfig
-from asca_pillars.data.corruption import FEWEST_POINTS, corrupt_objects, lose_reflectance
+from asca_pillars.data.augment import FEWEST_POINTS, corrupt_objects, lose_reflectance
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.scenes import make_scene
 

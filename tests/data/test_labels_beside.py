@@ -8,7 +8,7 @@ import pytest
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.labels_beside import labels_beside
+from asca_pillars.data.open_split import labels_beside
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import write_dataset
 

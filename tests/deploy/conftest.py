@@ -137,9 +137,13 @@ def sparse_backbone_graph() -> onnx.ModelProto:
 
 
 def write_bundle(
-    folder: Path, uses_counts: bool = True, active_cells: MaskRule | None = None, spec: PillarSpec = SPEC
+    folder: Path,
+    uses_counts: bool = True,
+    active_cells: MaskRule | None = None,
+    spec: PillarSpec = SPEC,
+    expected_input: ExpectedInput = EXPECTED_INPUT,
 ) -> Path:
-    """A valid bundle in `folder`, with a rule of active cells one with a sparse neck; `spec` has the grid of SPEC."""
+    """A valid bundle in `folder`, with a rule of active cells one with a sparse neck, else with the grid of SPEC."""
     folder.mkdir(parents=True)
     onnx.save(encoder_graph(uses_counts), folder / "encoder.onnx")
     onnx.save(sparse_backbone_graph() if active_cells else backbone_graph(), folder / "backbone.onnx")
@@ -163,7 +167,7 @@ def write_bundle(
         graphs={},
         parity=None,
         quantization=None,
-        expected_input=EXPECTED_INPUT,
+        expected_input=expected_input,
         expected_input_from="training",
         provenance=provenance,
         license="Apache-2.0",

@@ -1,6 +1,7 @@
 """Scans in other frames, and every direction, with the tiny bundle: which boxes come back and where."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,11 @@ from asca_deploy.around import about_ground, turns_around
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.scans.ground_height import fit_ground_plane
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan
-from tests.deploy.conftest import EXPECTED_INPUT, make_scan
+from tests.deploy.conftest import EXPECTED_INPUT, SPEC, make_scan, write_bundle
 
 Points = NDArray[np.float32]
 TRAINED_M = 1.75  # the middle of EXPECTED_INPUT.ground_z_m
@@ -154,3 +156,31 @@ def test_an_unknown_view(tiny_bundle: Path) -> None:
 
 def _rest(found: Detections) -> tuple:
     return found.scores, found.labels, found.class_names
+
+
+def test_weights_of_whole_revolutions_look_around_in_one_pass(tmp_path: Path, revolution: Points) -> None:
+    """As the bundle does that was exported with the wider ranges."""
+    grid = PillarGrid(x_range_m=(0.0, 8.96), y_range_m=(-1.28, 2.56), v_max_m=0.16, zones=1)
+    wide_grid = replace(grid, x_range_m=(-8.96, 8.96), y_range_m=(-8.96, 8.96))
+    roomy = replace(SPEC, limits=replace(SPEC.limits, max_pillars=4000))
+    narrow, wide = (
+        Detector(write_bundle(tmp_path / name, active_cells="sub", spec=replace(roomy, grid=own)), view="around")
+        for name, own in (("narrow", grid), ("wide", wide_grid))
+    )
+    assert narrow.passes == wide.passes == 1
+    found, same_found = narrow(revolution), wide(revolution)
+    assert len(found) > 20
+    assert (found.boxes[:, 0] < -2).any()
+    assert same(found, same_found)
+    assert found.ranges == same_found.ranges == wide_grid.ranges
+
+
+def test_views_of_a_camera_dense_necks_and_pillars_of_several_sizes_are_turned(tmp_path: Path) -> None:
+    def passes(folder: Path) -> int:
+        return Detector(folder, view="around").passes
+
+    even = replace(SPEC, grid=replace(SPEC.grid, x_range_m=(0.0, 8.96), v_max_m=0.16, zones=1))
+    seen = replace(EXPECTED_INPUT, camera_view=True)
+    assert passes(write_bundle(tmp_path / "camera", active_cells="sub", spec=even, expected_input=seen)) > 1
+    assert passes(write_bundle(tmp_path / "zones", active_cells="sub")) > 1
+    assert passes(write_bundle(tmp_path / "dense")) > 1

@@ -11,7 +11,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.kitti.kitti_labels import KittiObject
 from asca_pillars.evaluation.kitti.objects import frame_objects
 from asca_pillars.evaluation.predictions import ScoredFrames, read_truth
-from asca_pillars.evaluation.waymo_frames import evaluated_classes, upright_boxes, waymo_frames
+from asca_pillars.evaluation.waymo import evaluated_classes, upright_boxes, waymo_frames
 from asca_pillars.geometry.boxes import corners
 from asca_pillars.geometry.overlap import iou_3d
 from tests.evaluation.kitti.kitti_objects import CAR, DONT_CARE, beside, hit

@@ -5,8 +5,15 @@ from math import inf
 
 from asca_pillars.evaluation.kitti.objects import frame_objects
 from asca_pillars.evaluation.predictions import ScoredFrames
-from asca_pillars.evaluation.waymo import LEVELS, RANGES_M, WaymoScore
-from asca_pillars.evaluation.waymo_report import WaymoReport, waymo_json, waymo_notes, waymo_table
+from asca_pillars.evaluation.waymo import (
+    LEVELS,
+    RANGES_M,
+    WaymoReport,
+    WaymoScore,
+    waymo_json,
+    waymo_notes,
+    waymo_table,
+)
 
 EMPTY = frame_objects("0", [])
 

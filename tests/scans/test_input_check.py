@@ -19,8 +19,7 @@ from asca_pillars.scans.input_check import InputWarning, _percentile, check_inpu
 from asca_pillars.scans.measure_input import measure_expected_input
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.sim.simulation import simulate_frame
-from asca_pillars.sim.simulation_configs import load_simulation_config
+from asca_pillars.sim.simulation import load_simulation_config, simulate_frame
 
 Points = NDArray[np.float32]
 GRID = PillarGrid(x_range_m=(0.0, 23.04), y_range_m=(-7.68, 10.24))

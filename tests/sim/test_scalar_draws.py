@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.sim.scalar_draws import draws_of
+from asca_pillars.sim.world.streets import draws_of
 
 numbers = st.floats(-1e3, 1e3)
 shares = st.lists(st.floats(0.01, 1.0), min_size=1, max_size=9)

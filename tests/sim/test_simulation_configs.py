@@ -6,8 +6,7 @@ import pytest
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.settings import shipped_configs
-from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
-from asca_pillars.sim.simulation_configs import KIND, load_simulation_config
+from asca_pillars.sim.simulation import KIND, SimulationConfig, load_simulation_config, simulate_frame
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / KIND).glob("*.yaml"))
 

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from asca_pillars.base.schema import parse, to_dict
-from asca_pillars.data.boxes.box_frames import find_frames
-from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.boxes.box_split import BoxDataset, find_frames
 from asca_pillars.data.importing.foreign_values import LeftOut
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.scans.scan_settings import ScanSettings

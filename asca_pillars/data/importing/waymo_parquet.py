@@ -18,9 +18,8 @@ from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.files import atomic_path, portable_name, write_text
-from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
-from asca_pillars.data.boxes.box_split import BoxDataset
+from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
 from asca_pillars.data.importing.foreign_values import LeftOut, numbers, text_of, whole_number
 from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
 from asca_pillars.data.importing.parquet_rows import parquet_rows

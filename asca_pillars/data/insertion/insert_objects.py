@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.config.tree import DataConfig, InsertConfig
 from asca_pillars.data.frames import LabeledFrame, other_spelling
-from asca_pillars.data.insertion.free_maps import load_free_space
 from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
-from asca_pillars.data.insertion.free_space import FreeSpace
+from asca_pillars.data.insertion.free_space import FreeSpace, load_free_space
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, StoredObject, prepare_database
 from asca_pillars.data.insertion.prepared import prepared_folder
 from asca_pillars.data.labeled_split import LabeledSplit

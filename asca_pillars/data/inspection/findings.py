@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 from asca_pillars.data.frames import other_spelling
 from asca_pillars.data.inspection.box_conventions import better_convention
-from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
+from asca_pillars.data.inspection.measurements import InspectedSpec, input_cells
 from asca_pillars.scans.input_check import TOLERANCE_M
 
 # From these shares on something is a mistake or costs recall; KITTI and the simulator stay well below all of them.

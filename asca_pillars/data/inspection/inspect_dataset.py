@@ -15,8 +15,14 @@ from rich.progress import track
 from asca_pillars.base.errors import DatasetError, ScanError
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.inspection.box_conventions import ConventionFit, convention_fits
-from asca_pillars.data.inspection.input_cells import InspectedSpec, input_cells
-from asca_pillars.data.inspection.measurements import FrameMeasure, MatchOutcome, ScanMeasure, measure_frame
+from asca_pillars.data.inspection.measurements import (
+    FrameMeasure,
+    InspectedSpec,
+    MatchOutcome,
+    ScanMeasure,
+    input_cells,
+    measure_frame,
+)
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.yaw_units import doubt_of_yaws

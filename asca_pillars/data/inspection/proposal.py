@@ -13,7 +13,7 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config
 from asca_pillars.data.inspection.findings import FEWEST_BOXES
-from asca_pillars.data.inspection.input_cells import InspectedSpec
+from asca_pillars.data.inspection.measurements import InspectedSpec
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.geometry.boxes import points_in_boxes

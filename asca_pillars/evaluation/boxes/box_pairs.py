@@ -1,12 +1,8 @@
-"""Detections of one class beside the objects of it, best score first, and the greedy matching of both.
-
-Each detection, from the highest score down, takes the closest object of its frame that no better one has taken, if that
-is close enough. Detections of equal score keep their order. What decides depends on higher scores alone, so that one
-matching serves every score threshold and every band of distance or direction.
-"""
+"""Detections of one class matched greedily to its objects, best score first; bands of distance and direction."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,3 +110,47 @@ def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Clo
         tuple(rows[row] for row in order),
         np.concatenate([*excuse, np.zeros(0)])[order],
     )
+
+
+Band = Callable[[NDArray[np.floating]], NDArray[np.bool_]]
+"""(N, 7) boxes -> (N,) which centers it holds."""
+
+
+def _distance(low_m: float, high_m: float) -> Band:
+    def inside(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+        away = np.hypot(boxes[:, 0], boxes[:, 1])
+        return (away >= low_m) & (away < high_m)
+
+    return inside
+
+
+def _direction(low_rad: float, high_rad: float) -> Band:
+    def inside(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+        turned = np.abs(np.arctan2(boxes[:, 1], boxes[:, 0]))
+        return (turned >= low_rad) & (turned < high_rad)
+
+    return inside
+
+
+BANDS: dict[str, Band] = {
+    "all": _distance(0, inf),
+    "0-30 m": _distance(0, 30),
+    "30-50 m": _distance(30, 50),
+    "50+ m": _distance(50, inf),
+    "ahead": _direction(0, pi / 4),
+    "beside": _direction(pi / 4, 3 * pi / 4),
+    "behind": _direction(3 * pi / 4, inf),
+}
+"""By horizontal distance from the sensor, and by direction: 45 degrees either way of straight ahead, of straight
+behind, and what is between."""
+
+
+def in_band(pairs: BoxPairs, matched: NDArray[np.int64], band: str) -> tuple[NDArray[np.bool_], NDArray[np.bool_], int]:
+    """Which detections (N,) a band counts and which of them are hits (N,), and how many objects it holds.
+
+    An object takes its detection along: only what matches nothing is judged by where it stands itself.
+    """
+    counted, hits = BANDS[band](pairs.found), matched != UNMATCHED
+    held = BANDS[band](pairs.objects)
+    counted[hits] = held[matched[hits]]
+    return counted, hits, int(held.sum())

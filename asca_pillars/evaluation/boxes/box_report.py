@@ -9,10 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 from asca_pillars.evaluation.boxes.argoverse_metrics import ArgoverseScore, argoverse_scores
-from asca_pillars.evaluation.boxes.bands import BANDS
+from asca_pillars.evaluation.boxes.box_pairs import BANDS
 from asca_pillars.evaluation.boxes.box_predictions import BoxFrames
-from asca_pillars.evaluation.boxes.fixed_scores import MATCH_M, FixedScore
-from asca_pillars.evaluation.boxes.iou_average_precision import IOUS, IouScore, iou_scores
+from asca_pillars.evaluation.boxes.iou_metrics import IOUS, MATCH_M, FixedScore, IouScore, iou_scores
 from asca_pillars.evaluation.boxes.nuscenes_metrics import DISTANCES_M, NuScenesScore, nuscenes_scores
 from asca_pillars.evaluation.report_page import TextTable
 

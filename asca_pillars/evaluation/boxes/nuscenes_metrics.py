@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.evaluation.boxes.bands import BANDS, in_band
-from asca_pillars.evaluation.boxes.box_pairs import BoxPairs, Doubles, EvaluatedFrame, pair_class
+from asca_pillars.evaluation.boxes.box_pairs import BANDS, BoxPairs, Doubles, EvaluatedFrame, in_band, pair_class
 from asca_pillars.geometry.boxes import wrap_angle
 
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)

@@ -1,8 +1,9 @@
-"""The report of the error analysis: errors.json, errors.md and errors.html in one folder."""
+"""The report of the error analysis: errors.json, errors.md and errors.html with tables that can be sorted."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,162 @@ from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.base.strict import Strict
 from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
-from asca_pillars.evaluation.errors.error_page import error_page
 from asca_pillars.evaluation.errors.error_summary import DatasetErrors, match_frames, summarize
 from asca_pillars.evaluation.errors.error_tables import PRINTED_NOTES, error_notes, error_tables, group_tables
-from asca_pillars.evaluation.errors.worst_cases import draw_cases, worst_cases
-from asca_pillars.evaluation.report_page import ReportPage
+from asca_pillars.evaluation.errors.worst_cases import VIEW_TITLES, Case, CaseSection, draw_cases, worst_cases
+from asca_pillars.evaluation.report_page import ReportPage, TextTable
 from asca_pillars.scans.find_scans import visible_files
+
+_STYLE = """
+:root { color-scheme: light dark; --text: #1b1f24; --page: #fff; --soft: #59636e; --line: #d1d9e0; --pane: #f4f6f8;
+  --far: #b3bcc6; --near: #1f5fbf; --bright: #d97706; --label: #12803c; --detection: #c2188b; }
+@media (prefers-color-scheme: dark) { :root { --text: #e6edf3; --page: #0d1117; --soft: #9aa4af; --line: #30363d;
+  --pane: #161b22; --far: #4a535d; --near: #79b8ff; --bright: #ffb454; --label: #56d364; --detection: #ff7ac6; } }
+body { font: 14px/1.45 system-ui, sans-serif; margin: 1.5rem auto; max-width: 110rem; padding: 0 1rem;
+  color: var(--text); background: var(--page); }
+h2 { margin-top: 2.5rem; border-bottom: 1px solid var(--line); }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 12px; font-variant-numeric: tabular-nums; }
+th, td { padding: .2rem .5rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
+th.name, td.name { text-align: left; }
+tr.first td { border-top: 2px solid var(--soft); }
+summary { cursor: pointer; font-weight: 600; margin: 1rem 0; }
+th button { all: unset; cursor: pointer; font-weight: 600; }
+th button:focus-visible { outline: 2px solid var(--near); }
+.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(34rem, 1fr)); gap: 1rem; }
+a { color: var(--near); }
+figure { margin: 0; }
+figcaption, .notes, .legend { color: var(--soft); font-size: 12px; }
+figcaption b { color: var(--text); }
+svg { width: 100%; height: auto; }
+svg svg { overflow: hidden; }
+path, polygon { fill: none; stroke-linecap: round; }
+.pane { fill: var(--pane); }
+.far { stroke: var(--far); stroke-width: 6; }
+.near { stroke: var(--near); stroke-width: 9; }
+.bright { stroke: var(--bright); stroke-width: 11; }
+.ground { stroke: var(--line); stroke-width: 2; }
+.label { stroke: var(--label); stroke-width: 5; }
+.detection { stroke: var(--detection); stroke-width: 5; }
+.other { stroke-width: 2; stroke-dasharray: 10 8; }
+.legend span { font-weight: 600; }
+"""
+_SCRIPT = """
+const number = text => {
+  const value = parseFloat(text.replace(/^[^0-9+-]*/, ''));
+  return isNaN(value) ? -Infinity : value;
+};
+document.querySelectorAll('th button').forEach(button => button.addEventListener('click', () => {
+  const cell = button.parentElement, table = cell.closest('table'), column = cell.cellIndex;
+  const up = cell.getAttribute('aria-sort') === 'descending';
+  table.querySelectorAll('th').forEach(one => one.removeAttribute('aria-sort'));
+  cell.setAttribute('aria-sort', up ? 'ascending' : 'descending');
+  const text = row => row.cells[column].textContent;
+  const order = cell.className === 'name'
+    ? (a, b) => text(a).localeCompare(text(b))
+    : (a, b) => number(text(a)) - number(text(b));
+  table.querySelectorAll('tr.first').forEach(row => row.classList.remove('first'));
+  [...table.tBodies[0].rows].sort((a, b) => (up ? 1 : -1) * order(a, b)).forEach(row => table.tBodies[0].append(row));
+}));
+document.querySelector('#order').addEventListener('change', event => {
+  const [key, sign] = event.target.value.split(' ');
+  document.querySelectorAll('.grid').forEach(grid => [...grid.children]
+    .sort((a, b) => Number(sign) * (a.dataset[key] - b.dataset[key])).forEach(one => grid.append(one)));
+});
+"""
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+_ORDERS = {
+    "error -1": "worst first",
+    "score -1": "highest score first",
+    "distance 1": "nearest first",
+    "points -1": "most points first",
+    "frame 1": "by frame",
+}
+
+
+def error_page(
+    title: str,
+    tables: Sequence[TextTable],
+    more: Sequence[TextTable],
+    notes: Sequence[str],
+    sections: Sequence[CaseSection],
+) -> str:
+    """The page as HTML.
+
+    Args:
+        title: what was evaluated.
+        tables: as they are printed.
+        more: tables that are folded away.
+        notes: definitions.
+        sections: cases with pictures (`worst_cases.draw_cases`).
+    """
+    names = dict.fromkeys(section.class_name for section in sections)
+    links = " · ".join(f'<a href="#{_anchor(name)}">{escape(name)}</a>' for name in names)
+    orders = "".join(f'<option value="{value}">{text}</option>' for value, text in _ORDERS.items())
+    views = ", ".join(VIEW_TITLES)
+    parts = [
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+        f"<title>{escape(title)}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{escape(title)}</h1><p>Pictures: {links}</p>",
+        *map(_table, tables),
+        "<details><summary>By distance, occlusion, points and neighbors</summary>",
+        *map(_table, more),
+        "</details>",
+        f'<ul class="notes">{"".join(f"<li>{escape(note)}</li>" for note in notes)}</ul>',
+        '<h2>Pictures</h2><p><label>Order <select id="order">',
+        f"{orders}</select></label></p>",
+        f'<p class="legend">Each place {views}, in one scale. Seen from above, the line of sight points up; '
+        "from the side, away from the sensor is to the right. "
+        '<span style="color:var(--label)">label</span>, <span style="color:var(--detection)">detection</span>, others '
+        'dashed; <span style="color:var(--near)">points</span> in the box and, from the side and the sensor, at its '
+        'depth; <span style="color:var(--bright)">bright ones</span> (reflectance of 0.5 or more).</p>',
+    ]
+    seen: set[str] = set()
+    for section in sections:
+        if section.class_name not in seen:
+            seen.add(section.class_name)
+            parts.append(f'<h2 id="{_anchor(section.class_name)}">{escape(section.class_name)}</h2>')
+        figures = "".join(map(_figure, section.cases))
+        parts.append(f'<h3>{escape(section.title)}</h3><div class="grid">{figures}</div>')
+    return "\n".join([*parts, f"<script>{_SCRIPT}</script></body></html>", ""])
+
+
+def _anchor(class_name: str) -> str:
+    return f"class-{escape(class_name.replace(' ', '-'), quote=True)}"
+
+
+def _table(table: TextTable) -> str:
+    kinds = ["name" if column < table.left else "number" for column in range(len(table.columns))]
+    head = "".join(
+        f'<th class="{kind}" scope="col"><button>{escape(title)}</button></th>'
+        for kind, title in zip(kinds, table.columns, strict=True)
+    )
+    before = ("", *(row[0] for row in table.rows[:-1]))
+    first = [row[0] != name for row, name in zip(table.rows, before, strict=True)]
+    body = "".join(
+        f"<tr{' class=first' if starts else ''}>{_cells(kinds, row)}</tr>"
+        for starts, row in zip(first, table.rows, strict=True)
+    )
+    return (
+        f'<h3>{escape(table.title)}</h3><div class="wide"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def _cells(kinds: Sequence[str], row: Sequence[str]) -> str:
+    return "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in zip(kinds, row, strict=True))
+
+
+def _figure(case: Case) -> str:
+    data = f'data-error="{case.error:g}" data-score="{case.score:g}" data-distance="{case.distance_m:g}" '
+    data += f'data-points="{case.points}" data-frame="{case.frame}"'
+    score = f"score {case.score:.2f}, " if case.score else ""
+    place = f"{score}{case.distance_m:.0f} m, {case.points} points"
+    texts = "; ".join(map(escape, case.texts))
+    return f"<figure {data}>{case.svg}<figcaption><b>{escape(case.frame_id)}</b> {place}; {texts}</figcaption></figure>"
+
 
 JSON, MARKDOWN, PAGE = "errors.json", "errors.md", "errors.html"
 _COMMAND = "asca eval"

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 
-from asca_pillars.evaluation.errors.block_bootstrap import BLOCK_FRAMES, MIN_BLOCKS
 from asca_pillars.evaluation.errors.box_errors import CORRECTIONS, FALSE_KINDS, LOCALIZATION_IOU, least_iou
 from asca_pillars.evaluation.errors.error_summary import (
+    BLOCK_FRAMES,
     CLEAR_RANGE_M,
     CLEAR_TRUNCATION,
     LARGELY_OCCLUDED,
     MAIN_GROUPS,
+    MIN_BLOCKS,
     SIDE_ON_DEG,
     WITHOUT_MEDIANS,
     ClassErrors,

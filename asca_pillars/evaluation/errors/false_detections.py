@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.insertion.clusters import cluster_labels
-from asca_pillars.data.insertion.ground_fit import Ground
+from asca_pillars.data.insertion.ground_fit import Ground, cluster_labels
 
 FEW_POINTS = 20
 TALL_M = 2.3

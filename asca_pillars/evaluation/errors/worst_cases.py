@@ -1,20 +1,178 @@
-"""The worst of each kind of error, to be looked at: false detections, missed objects, and boxes with large errors."""
+"""The worst of each kind of error as pictures (SVG): false detections, missed objects and boxes with large errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from asca_pillars.data.insertion.ground_fit import fit_ground
-from asca_pillars.evaluation.errors.block_bootstrap import BLOCK_FRAMES
+from asca_pillars.data.insertion.ground_fit import Ground, fit_ground
 from asca_pillars.evaluation.errors.box_errors import RESIDUALS, DetectionMatch, ObjectMatch, box_residuals
-from asca_pillars.evaluation.errors.crops import DrawnBox, crop_svg
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
-from asca_pillars.evaluation.errors.error_summary import Matches, view_of
-from asca_pillars.evaluation.errors.false_detections import Surroundings
+from asca_pillars.evaluation.errors.error_summary import BLOCK_FRAMES, Matches, view_of
+from asca_pillars.evaluation.errors.false_detections import BRIGHT_REFLECTANCE, Surroundings
+from asca_pillars.geometry.boxes import footprints
+
+MAX_POINTS = 1200  # of a pane; more are thinned out
+VIEW_TITLES = ("from above", "from the side", "from the sensor")
+_LOW_M, _HIGH_M = -0.5, 3.3  # heights that are drawn
+_GROUND_M = 0.15
+_GAP_CM = 20
+_Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnBox:
+    """A box (7,), sensor at the origin, and whose it is; `main` is what the picture is about."""
+
+    box: _Doubles
+    kind: Literal["label", "detection"]
+    main: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Pane:
+    """Points (N, 2) in metres, to the right and up, and outlines in the same axes.
+
+    Attributes:
+        low, high: (2,) corners of what is shown.
+        near: (N,) points that belong to what the picture is about; the others are pale.
+        bright: (N,) points of a high reflectance.
+        outlines: each with its class of style.
+    """
+
+    points: _Doubles
+    low: tuple[float, float]
+    high: tuple[float, float]
+    near: NDArray[np.bool_]
+    bright: NDArray[np.bool_]
+    outlines: Sequence[tuple[str, _Doubles]]
+
+
+def crop_svg(points: NDArray[np.float32], ground: Ground | None, boxes: Sequence[DrawnBox]) -> str:
+    """Three views of the surroundings of the first box, an <svg> element with lengths in centimetres.
+
+    From above the line of sight points up. From the side the first box's ray-facing axis points to the right, and only
+    what lies within its width is strong. From the sensor what lies within its depth is strong.
+
+    Args:
+        points: (N, 4) x, y, z in metres, the sensor at the origin, and reflectance.
+        ground: under them; without it the first box's bottom.
+        boxes: to be drawn; the first one is in the middle.
+    """
+    middle = boxes[0].box
+    reach = max(2.5, middle[3] / 2 + 2.0)
+    close = points[(np.abs(points[:, :2] - middle[:2]) < 1.5 * reach).all(axis=1)].astype(np.float64)
+    floor = middle[2] - middle[5] / 2
+    if ground is not None:
+        floor = float(ground.heights(middle[None, :2])[0])
+        above = close[:, 2] - ground.heights(close[:, :2])
+    else:
+        above = close[:, 2] - floor
+    offset, height = close[:, :2] - middle[:2], close[:, 2] - floor
+    sight = middle[:2] / max(float(np.hypot(middle[0], middle[1])), 1e-6)
+    heading = np.array([np.cos(middle[6]), np.sin(middle[6])])
+    axis = -heading if heading @ sight < 0 else heading
+    bright, standing = close[:, 3] >= BRIGHT_REFLECTANCE, above > _GROUND_M
+    half = middle[3:5] / 2
+    along, across = offset @ axis, offset @ _right_of(axis)
+    depth, right = offset @ sight, offset @ _right_of(sight)
+    inside = (np.abs(along) < half[0] + 0.3) & (np.abs(across) < half[1] + 0.3)
+    corners = [footprints(one.box[None])[0] - middle[:2] for one in boxes]
+    upwards = np.stack([_right_of(sight), sight], axis=1)
+    outlines = [(_style(one), place @ upwards) for one, place in zip(boxes, corners, strict=True)]
+    outlines += [(_style(one), _arrow(one, middle) @ upwards) for one in boxes]
+    panes = [
+        _Pane(
+            np.stack([right, depth], axis=1)[standing],
+            (-reach, -reach),
+            (reach, reach),
+            inside[standing],
+            bright[standing],
+            outlines,
+        )
+    ]
+    half_depth = abs(sight @ axis) * half[0] + abs(sight @ _right_of(axis)) * half[1] + 0.5
+    for direction, horizontal, strong in (
+        (axis, along, np.abs(across) < half[1] + 0.3),
+        (_right_of(sight), right, np.abs(depth) < half_depth),
+    ):
+        outlines = [
+            (_style(one), _upright(place @ direction, one.box, floor))
+            for one, place in zip(boxes, corners, strict=True)
+            if one.main
+        ]
+        heights = np.stack([horizontal, height], axis=1)
+        panes.append(_Pane(heights, (-reach, _LOW_M), (reach, _HIGH_M), strong & standing, bright, outlines))
+    return _svg(panes, round(100 * reach))
+
+
+def _right_of(direction: _Doubles) -> _Doubles:
+    return np.array([direction[1], -direction[0]])
+
+
+def _style(one: DrawnBox) -> str:
+    return f"{one.kind}{'' if one.main else ' other'}"
+
+
+def _arrow(one: DrawnBox, middle: _Doubles) -> _Doubles:
+    """(2, 2) from the box's center to a little beyond its front."""
+    heading = np.array([np.cos(one.box[6]), np.sin(one.box[6])])
+    start = one.box[:2] - middle[:2]
+    return np.stack([start, start + heading * (one.box[3] / 2 + 0.25)])
+
+
+def _upright(horizontal: _Doubles, box: _Doubles, floor: float) -> _Doubles:
+    """(4, 2) rectangle of a box seen from the side, from its corners' places (4,) to the right."""
+    left, right = float(horizontal.min()), float(horizontal.max())
+    bottom, top = (float(box[2] + side * box[5] / 2 - floor) for side in (-1, 1))
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+
+
+def _svg(panes: Sequence[_Pane], reach_cm: int) -> str:
+    width = 2 * reach_cm
+    tall = max(round(100 * (pane.high[1] - pane.low[1])) for pane in panes)
+    total = len(panes) * width + (len(panes) - 1) * _GAP_CM
+    parts = [f'<svg viewBox="0 0 {total} {tall}" role="img">']
+    for number, pane in enumerate(panes):
+        own_tall = round(100 * (pane.high[1] - pane.low[1]))
+        left, top = number * (width + _GAP_CM), tall - own_tall
+        parts.append(f'<svg x="{left}" y="{top}" width="{width}" height="{own_tall}">')
+        parts.append(f'<rect class="pane" width="{width}" height="{own_tall}"/>')
+        if pane.low[1] == _LOW_M:
+            ground = round(100 * pane.high[1])
+            parts.append(f'<path class="ground" d="M0 {ground}h{width}"/>')
+        shown = ((pane.points > pane.low) & (pane.points < pane.high)).all(axis=1)
+        for style, mask in (
+            ("far", ~pane.near),
+            ("near", pane.near & ~pane.bright),
+            ("bright", pane.near & pane.bright),
+        ):
+            if path := _dots(pane, shown & mask):
+                parts.append(f'<path class="{style}" d="{path}"/>')
+        parts += [
+            f'<polygon class="{style}" points="{" ".join(f"{x},{y}" for x, y in _pixels(pane, outline))}"/>'
+            for style, outline in pane.outlines
+        ]
+        parts.append("</svg>")
+    return "".join([*parts, "</svg>"])
+
+
+def _dots(pane: _Pane, mask: NDArray[np.bool_]) -> str:
+    """A path of dots, each a line of no length with round ends."""
+    pixels = np.unique(_pixels(pane, pane.points[mask]), axis=0)
+    step = -(-len(pixels) // MAX_POINTS)
+    return "".join(f"M{x} {y}h0" for x, y in pixels[:: max(step, 1)])
+
+
+def _pixels(pane: _Pane, places: _Doubles) -> NDArray[np.int64]:
+    """Metres (N, 2) as whole centimetres from the upper left corner."""
+    return np.round(100 * np.stack([places[:, 0] - pane.low[0], pane.high[1] - places[:, 1]], axis=1)).astype(np.int64)
+
 
 FALSE_CASES, MISSED_CASES, BOX_CASES = 24, 12, 6
 

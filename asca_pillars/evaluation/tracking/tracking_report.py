@@ -15,11 +15,17 @@ from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import NamedRecords
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
-from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame, stated_scope
+from asca_pillars.evaluation.boxes.box_predictions import predictions_by_frame, stated_scope
 from asca_pillars.evaluation.report_page import TextTable
-from asca_pillars.evaluation.tracking.clear_mot import ClearMot, clear_mot
-from asca_pillars.evaluation.tracking.hota import Hota, hota
-from asca_pillars.evaluation.tracking.tracked_frames import Boxes, TrackedFrame, tracked_frame
+from asca_pillars.evaluation.tracking.tracking_metrics import (
+    Boxes,
+    ClearMot,
+    Hota,
+    TrackedFrame,
+    clear_mot,
+    hota,
+    tracked_frame,
+)
 from asca_pillars.scans.find_scans import natural_order
 
 CLEAR_IOU = 0.25

@@ -1,12 +1,223 @@
-"""Parked bicycles and motorcycles, which KITTI does not label, and motorcyclists; x ahead, wheels on z = 0."""
+"""Bicycles with their riders, parked ones and motorcycles, which KITTI does not label; x ahead, wheels on z = 0."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from asca_pillars.sim.bodies.bicycles import bicycle
-from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, limbs, rotated
+from asca_pillars.sim.bodies.primitives import (
+    Floats,
+    Limb,
+    Primitives,
+    Surface,
+    cuboids,
+    draw_cloth,
+    draw_skin,
+    ellipsoids,
+    jointed,
+    limbs,
+    quads,
+    rotated,
+)
 from asca_pillars.sim.bodies.vehicles import wheels
+
+_SEGMENTS = 12  # of a wheel's circle
+_RIM = 0.70  # inner over outer radius of tire and rim together
+MUDGUARD_SHARE, RACK_SHARE, REFLECTOR_SHARE = 0.8, 0.7, 0.8
+STRIPED_TIRE_SHARE, VEST_SHARE = 0.25, 0.1  # with a ring of foil on the sidewalls; riders with foil on their jacket
+REFLECTOR = Surface(2.5, 0.5)  # sends the light back where it came from
+
+
+def _circle() -> Floats:
+    """Quadrilaterals (segments,4,3) from each point of the unit circle to the next and back."""
+    angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+    ring = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
+    a, b = ring[:-1], ring[1:]
+    return np.stack([a, b, b, a], 1)
+
+
+_CIRCLE = _circle()
+# Of a wheel's tread, its tire's side and its spokes: how far each corner lies from the hub, and aside of the wheel.
+_SHARE_OF_RADIUS = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, _RIM, _RIM], [_RIM, _RIM, 0.0, 0.0]])[:, None, :, None]
+_ASIDE = np.zeros((3, 1, 4, 3))
+_ASIDE[0, 0, :, 1] = 0.035, 0.035, -0.035, -0.035
+
+
+class _Frame(NamedTuple):
+    """Where a bicycle's parts meet, metres."""
+
+    wheel_radius: float
+    hub_x: float  # of the front wheel; the rear one mirrors it
+    head: tuple[float, float, float]
+    crank: tuple[float, float, float]
+    post: tuple[float, float, float]  # below the saddle
+
+
+def _frame(length: float) -> _Frame:
+    radius = float(np.clip(0.19 * length, 0.26, 0.35))
+    hub_x = length / 2 - radius
+    return _Frame(radius, hub_x, (hub_x - 0.22, 0.0, 0.80), (-0.08, 0.0, 0.30), (-0.26, 0.0, 0.80))
+
+
+def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -> Primitives:
+    """A bicycle: wheels, frame, handlebar, saddle; mostly mudguards, a rack, lamps and reflectors.
+
+    They grow by `footprint_m`, the width of a laser's beam there.
+    """
+    frame = _frame(length)
+    paint = float(np.exp(rng.uniform(np.log(0.03), np.log(0.5))))
+    parts = [_wheels(rng, frame), _tubes(rng, frame, paint)]
+    rows: list[tuple[float, ...]] = []
+    if rng.random() < RACK_SHARE:
+        rows.append((-frame.hub_x - 0.02, 0, 2 * frame.wheel_radius + 0.06, 0.42, 0.13, 0.04, 0, paint, 0.4, 0))
+    if rng.random() < MUDGUARD_SHARE:  # and a guard before the chain
+        rows.append((-0.5 * frame.hub_x, -0.05, 0.24, 0.9 * frame.hub_x, 0.03, 0.13, 0, paint, 0.4, 0))
+        parts.append(_mudguards(frame, Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.6)))), 0.4)))
+    if rng.random() < REFLECTOR_SHARE:
+        lamps = ((frame.hub_x - 0.1, 0.78), (-frame.hub_x - frame.wheel_radius + 0.04, 0.62))
+        more = footprint_m
+        rows += [(x, 0, z - more / 2, 0.04 + more, 0.05 + more, 0.05 + more, 0, *REFLECTOR.row) for x, z in lamps]
+        rows += [
+            (
+                hub + 0.6 * frame.wheel_radius * np.cos(turn),
+                0,
+                frame.wheel_radius * (1 + 0.6 * np.sin(turn)) - 0.03,
+                0.03 + more,
+                0.03,
+                0.03 + more,
+                0,
+                *REFLECTOR.row,
+            )
+            for hub in (frame.hub_x, -frame.hub_x)
+            for turn in rng.uniform(0, 2 * np.pi, 2)
+        ]
+    saddle = ellipsoids([(frame.post[0] - 0.05, 0, 0.96)], [(0.15, 0.09, 0.06)], np.array([[0.15, 0.3, 0.0]]))
+    return Primitives.join([*parts, cuboids(rows), saddle])
+
+
+def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
+    """Tires with their rims, and spokes as disks that let many rays through."""
+    rubber = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.3)))), 0.3)
+    sidewall = Surface(float(rng.uniform(0.45, 0.95)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
+    spokes = Surface(float(rng.uniform(0.05, 0.3)), 0.2, float(rng.uniform(0.5, 0.75)))
+    faces = frame.wheel_radius * _CIRCLE * _SHARE_OF_RADIUS + _ASIDE
+    hubs = np.array([[frame.hub_x, 0.0, frame.wheel_radius], [-frame.hub_x, 0.0, frame.wheel_radius]])
+    corners = faces + hubs[:, None, None, None]
+    table = np.stack([rubber.row, sidewall.row, spokes.row])[None, :, None]
+    return quads(corners, np.broadcast_to(table, (*corners.shape[:3], 3)))
+
+
+def _mudguards(frame: _Frame, surface: Surface) -> Primitives:
+    """Strips above the rear halves of both wheels."""
+    angle = np.deg2rad(np.linspace(40.0, 190.0, 6))
+    arc = (frame.wheel_radius + 0.02) * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
+    side = np.array([0.0, 0.045, 0.0])
+    drop = np.array([[0.95, 1.0, 0.95]])  # they bend down at their sides, where a ray from aside meets them
+    left, right = arc + side, arc - side
+    edges = ((left, right), (left, arc * drop + side), (right, arc * drop - side))
+    faces = np.concatenate([np.stack([one[:-1], one[1:], other[1:], other[:-1]], 1) for one, other in edges])
+    hubs = np.array([[frame.hub_x, 0.0, frame.wheel_radius], [-frame.hub_x, 0.0, frame.wheel_radius]])
+    return quads(faces + hubs[:, None, None], surface)
+
+
+def _tubes(rng: np.random.Generator, frame: _Frame, paint: float) -> Primitives:
+    """Frame and handlebar."""
+    head, crank, post, radius = frame.head, frame.crank, frame.post, frame.wheel_radius
+    rear, front = (-frame.hub_x, 0.0, radius), (frame.hub_x, 0.0, radius)
+    bar = head[0] - 0.06
+    tubes = [
+        (head, crank),
+        (post, crank),
+        (head, post),
+        (post, rear),
+        (crank, rear),
+        (head, front),
+        (head, (bar, 0, 1.02)),
+        (post, (post[0] - 0.04, 0, 0.95)),
+        ((bar, 0.29, 1.03), (bar, -0.29, 1.03)),
+    ]
+    radii = np.full((len(tubes), 2), float(rng.uniform(0.034, 0.05)))
+    surface = np.tile([paint, 0.4, 0.0], (len(tubes), 1))
+    return limbs([t[0] for t in tubes], [t[1] for t in tubes], radii, surface, (0.0, 1.0, 0.0))
+
+
+def cyclist_body(
+    rng: np.random.Generator, height: float, width: float, length: float, footprint_m: float = 0.0
+) -> Primitives:
+    """A bicycle and its rider, upright to bent over.
+
+    `height` is that of the head above the ground, `footprint_m` as for `bicycle`.
+    """
+    neck = np.array([-0.28 + rng.uniform(0.05, 0.42), 0.0, height - 0.27])
+    crown = draw_cloth(rng, 1)[0]  # hair or a helmet
+    head = ellipsoids(
+        [(neck[0] + 0.06, 0, height - 0.13), (neck[0] + 0.03, 0, height - 0.115)],
+        [(0.12, 0.09, 0.125), (0.13, 0.10, 0.115)],
+        np.stack([draw_skin(rng), crown]),
+    )
+    return Primitives.join(
+        [
+            bicycle(rng, length, footprint_m),
+            _rider(rng, neck, width, _frame(length).hub_x - 0.28),
+            head,
+            _luggage(rng, neck, length),
+        ]
+    )
+
+
+def _rider(rng: np.random.Generator, neck: Floats, width: float, bar_x: float) -> Primitives:
+    """Trunk, arms and legs between saddle, pedals and handlebar."""
+    upper, lower, shoe = draw_cloth(rng, 3, dark_share=0.25)
+    bulk = float(rng.uniform(1.2, 1.55))
+    shoulder = float(np.clip(0.36 * width, 0.17, 0.26))
+    hips = np.array([-0.28, 0.0, 0.99])
+    pedal = rng.uniform(0, 2 * np.pi)
+    grip = float(np.clip(0.45 * width, 0.2, 0.29))
+    rows: list[Limb] = [
+        (_offset(hips, 0, 0, -0.05), _offset(neck, 0, 0, -0.04), shoulder, 0.125 * bulk, upper),
+        (_offset(hips, -0.02, 0, -0.06), _offset(hips, 0.06, 0, 0.08), 0.16 * bulk, 0.13 * bulk, lower),
+    ]
+    if rng.random() < VEST_SHARE:
+        foil = np.array([rng.uniform(0.5, 1.1), 0.3, 0.0])
+        middle = 0.5 * (hips + neck)
+        rows.append((_offset(middle, 0, 0, -0.06), _offset(middle, 0.02, 0, 0.08), 1.04 * shoulder, 0.14 * bulk, foil))
+    if rng.random() < 0.4:  # a jacket that hangs over the hips
+        rows.append((_offset(hips, -0.06, 0, -0.12), 0.5 * (hips + neck), 0.19 * bulk, 0.15 * bulk, upper))
+    for side in (1.0, -1.0):
+        turn = pedal + (np.pi if side > 0 else 0.0)
+        foot = np.array([-0.08 + 0.17 * np.cos(turn), side * 0.11, 0.30 + 0.17 * np.sin(turn)])
+        middle = 0.5 * (hips + foot)
+        knee = np.array([middle[0] + 0.24, side * 0.13, middle[2] + 0.08])
+        hand = np.array([bar_x, side * grip, 1.05])
+        elbow = _offset(0.5 * (neck + hand), -0.04, side * 0.10, -0.06)
+        rows += [
+            (_offset(hips, 0, side * 0.09, 0), knee, 0.08 * bulk, 0.088 * bulk, lower),
+            (knee, foot, 0.058 * bulk, 0.064 * bulk, lower),
+            (_offset(foot, -0.09, 0, 0), _offset(foot, 0.16, 0, 0), 0.055, 0.055, shoe),
+            (_offset(neck, 0, side * shoulder, -0.05), elbow, 0.052 * bulk, 0.055 * bulk, upper),
+            (elbow, hand, 0.043 * bulk, 0.043 * bulk, upper),
+        ]
+    return jointed(rows)
+
+
+def _offset(joint: Floats, along: float, sideways: float, up: float) -> Floats:
+    return joint + np.array([along, sideways, up])
+
+
+def _luggage(rng: np.random.Generator, neck: Floats, length: float) -> Primitives:
+    """A rucksack, panniers, a basket, a child behind the saddle, or nothing."""
+    what = rng.random()
+    if what < 0.26:
+        return ellipsoids([(neck[0] - 0.24, 0, neck[2] - 0.2)], [(0.13, 0.16, 0.22)], draw_cloth(rng, 1))
+    if what < 0.48:
+        bag = np.repeat(draw_cloth(rng, 1), 2, axis=0)
+        return ellipsoids([(-0.55, y, 0.55) for y in (0.17, -0.17)], [(0.20, 0.10, 0.20)] * 2, bag)
+    if what < 0.60:
+        return cuboids([(length / 2 - 0.45, 0, 0.8, 0.28, 0.36, 0.26, 0, 0.3, 0.3, 0.4)])
+    if what < 0.66:
+        seat = [(-0.56, 0, 0.92), (-0.58, 0, 1.26)]
+        return ellipsoids(seat, [(0.15, 0.16, 0.26), (0.10, 0.09, 0.12)], draw_cloth(rng, 2))
+    return Primitives.join([])
 
 
 def parked_bicycle_body(rng: np.random.Generator) -> Primitives:

@@ -1,4 +1,4 @@
-"""The height and the material of the ground (compiled by numba)."""
+"""Rays against the ground, each of which walks down to it; its height and material (compiled by numba; see `rays`)."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.base.compiling import cached
-from asca_pillars.sim.casting.windows import PLAIN
+from asca_pillars.sim.casting.rays import PLAIN, NearestHits, Rays, ray_chance
 
 Floats = npt.NDArray[np.float64]
 
@@ -180,3 +180,210 @@ def highest_within(relief: Floats, along_m: float) -> Floats:
     for ring in range(1, len(highest)):
         highest[ring] = max(highest[ring], highest[ring - 1])
     return highest
+
+
+Bools = npt.NDArray[np.bool_]
+
+GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
+CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
+LOW_M = 0.45  # less high it looks where its neighbor met the ground
+MET_M, SAME_M = 0.001, 0.0003  # a ray so near to the ground, or so little below it, has met it
+START_M, REACH_M = 1.5, 85.0
+GRASS_SALT = 900_000_000
+
+
+class Descent(NamedTuple):
+    """A ray over the ground, and where it was on its way down.
+
+    It was above at `near_m`, and at `reach_m` below (or beyond its limit); `clear_m` is the last place at which it,
+    and all before, was CLEAR_M above the ground.
+    """
+
+    near_m: float
+    above_m: float
+    reach_m: float
+    gap_m: float
+    clear_m: float
+
+
+class GroundRay(NamedTuple):
+    """A ray from (0, 0, up) that falls by -slope per metre towards (dx, dy)."""
+
+    up: float
+    slope: float
+    dx: float
+    dy: float
+
+
+@cached(inline="always", **PLAIN)
+def gap_at(ray: GroundRay, reach: float, street: Street, relief: Floats, z_m: float) -> float:
+    """Height in metres of a ray above the ground, relief (R, R), at a horizontal distance."""
+    return ray.up + ray.slope * reach - ground_height(reach * ray.dx, reach * ray.dy, street, relief, z_m)
+
+
+@cached(**PLAIN)
+def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: float) -> float:
+    """How many metres a ray of this height and slope stays above everything, in whatever direction.
+
+    `highest` (rings,) is the highest relief in each ring of cells around the car.
+    """
+    start, ring = START_M, 0
+    while ring + 1 < len(highest) and up + slope * start > z_m + highest[ring] + rise:
+        # Up to the far edge of this ring of cells the ray stays above everything.
+        meet = (z_m + highest[ring] + rise - up) / slope if slope < 0.0 else 1e9
+        start = max(start, min(meet, (ring + 1) * RELIEF_STEP_M))
+        if meet <= (ring + 1) * RELIEF_STEP_M:
+            break
+        ring += 1
+    return start
+
+
+@cached(inline="always", **PLAIN)
+def descend(
+    ray: GroundRay,
+    start: float,
+    clear: float,
+    expected: float,
+    limit: float,
+    street: Street,
+    relief: Floats,
+    z_m: float,
+) -> Descent:
+    """Walk down a ray until it is below the ground, relief (R, R), or beyond `limit`, metres.
+
+    A neighboring ray was high above everything up to `clear`, and met the ground at `expected` (0: nowhere): this one
+    begins there, and looks there first once it is low.
+    """
+    near, reach, above = clear, clear, 0.0
+    gap = gap_at(ray, reach, street, relief, z_m)
+    if gap < CLEAR_M and clear > start:
+        near, reach = start, start
+        gap = gap_at(ray, reach, street, relief, z_m)
+    clear, descending = start, max(-ray.slope, 0.0)
+    far_above = descending > 0.03  # flatter rays graze crests that a neighbor may just have missed
+    while gap > 0.0 and reach < limit:
+        near, above = reach, gap
+        far_above &= gap >= CLEAR_M
+        if far_above:
+            clear = reach
+        if gap < LOW_M and near < expected < near + 2.0 * gap / max(descending, 0.01):
+            reach, expected = min(expected, limit), 0.0
+        else:
+            # Ground steeper than this is a kerb or a bank, which is wider than the step that passes its foot.
+            # On flat ground half of the way down is quicker; kerbs are lower than what is left above them then.
+            step = max(gap / (0.22 + descending), 0.04 + 0.006 * near)
+            if descending > 0.0:
+                step = max(step, min(0.5 * gap / descending, 3.0))
+            reach = near + step
+        gap = gap_at(ray, reach, street, relief, z_m)
+    return Descent(near, above, reach, gap, clear)
+
+
+@cached(inline="always", **PLAIN)
+def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: float) -> tuple[float, float]:
+    """Distance at which a ray meets the ground, relief (R, R), between above it and below, and the gap left, metres.
+
+    False position, halving the weight of an end that stays.
+    """
+    near, above, reach, gap = way.near_m, way.above_m, way.reach_m, way.gap_m
+    left = gap
+    for _ in range(10):
+        if reach - near < 0.004 or above <= 0.0 or left > -SAME_M:
+            break
+        middle = near + (reach - near) * above / (above - gap)
+        here = gap_at(ray, middle, street, relief, z_m)
+        if abs(here) < MET_M:
+            return middle, here
+        if here > 0.0:
+            near, above, gap = middle, here, 0.5 * gap
+        else:
+            reach, gap, above, left = middle, here, 0.5 * above, here
+    return reach, left
+
+
+@cached(inline="always", **PLAIN)
+def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relief: Floats, z_m: float) -> float:
+    """Cosine of the angle at which a ray meets the ground, relief (R, R), of this height in metres there."""
+    x, y, step = reach * ray.dx, reach * ray.dy, 0.05
+    gx = (ground_height(x + step, y, street, relief, z_m) - height) / step
+    gy = (ground_height(x, y + step, street, relief, z_m) - height) / step
+    gx, gy = min(max(gx, -3.0), 3.0), min(max(gy, -3.0), 3.0)
+    facing = abs(ray.slope - gx * ray.dx - gy * ray.dy)
+    return facing / (np.sqrt(1.0 + gx * gx + gy * gy) * np.sqrt(1.0 + ray.slope**2))
+
+
+@cached(**PLAIN)
+def are_needed(outside: Bools, owner: npt.NDArray[np.int32], k: int, first: int, last: int) -> bool:
+    """Whether it matters what ground columns [first, last) of ring k meet.
+
+    It does for an object, which the ground may hide, and beside a ray that is asked for, which may lean over an edge;
+    outside (K, C) is a mask as in `Rays`, owner (K, C) an index as in `NearestHits`.
+    """
+    rings, columns = outside.shape
+    for j in range(first, last):
+        if owner[k, j] >= 0:
+            return True
+    for row in range(max(k - 1, 0), min(k + 2, rings)):
+        for j in range(first - 1, last + 1):
+            if not outside[row, (j + columns) % columns]:
+                return True
+    return False
+
+
+@cached(**PLAIN)
+def cast_ground(
+    street: Street, relief: Floats, materials: Floats, z_m: float, rays: Rays, nearest: NearestHits, key: int
+) -> None:
+    """Walk every ray down to the ground and keep the hit where nothing was nearer.
+
+    Street, relief (R, R), materials (6,), which are reflectances, and z_m in metres are as in `Ground`.
+    """
+    # Taken out of their tuples once: numba counts references at every access.
+    slopes, origins, cos_phase, sin_phase = rays.slope, rays.origin_z_m, rays.cos_phase, rays.sin_phase
+    cos_azimuth, sin_azimuth, number = rays.cos_azimuth, rays.sin_azimuth, rays.number
+    rho, cosine, reflectance, owner = nearest.rho_m, nearest.cosine, nearest.reflectance, nearest.owner
+    outside, columns = rays.outside, len(number)
+    highest = highest_within(relief, street.along_m)
+    rough = street.rough_m
+    group = max(int(GROUP_DEG / 360.0 * rays.columns_per_turn), 1)
+    for k in range(len(slopes)):
+        up, slope, cos, sin = origins[k], slopes[k], cos_phase[k], sin_phase[k]
+        start = first_distance(up, slope, highest, street.rise_m, z_m)
+        # What a neighbor met holds for this ray, too. Neighbors come in small groups, so that a ray does not depend on
+        # whether those far from it are cast.
+        clear, expected = start, 0.0
+        last, needed = 0, False
+        for j in range(columns):
+            if j == last:
+                clear, expected = start, 0.0
+                last += 1
+                while last < columns and number[last] % group and number[last] == number[last - 1] + 1:
+                    last += 1
+                needed = are_needed(outside, owner, k, j, last)
+            if not needed:
+                continue
+            x, y = cos_azimuth[j], sin_azimuth[j]
+            ray = GroundRay(up, slope, x * cos - y * sin, y * cos + x * sin)
+            limit = min(rho[k, j], REACH_M)
+            way = descend(ray, start, clear, expected, limit, street, relief, z_m)
+            clear, expected = way.clear_m, 0.0
+            if way.gap_m > 0.0:
+                continue
+            reach, left = meeting(ray, way, street, relief, z_m)
+            if reach >= limit:
+                continue
+            expected = reach
+            facing = facing_of(ray, reach, up + slope * reach - left, street, relief, z_m)
+            material = ground_material(reach * ray.dx, reach * ray.dy, street)
+            if material == VERGE:
+                # Blades of grass end the ray before the soil does, and stand up to it.
+                reach -= rough * ray_chance(key, k, number[j], GRASS_SALT) ** 2 / max(0.12, abs(slope))
+                facing = max(facing, 0.08)
+                if reach < START_M:
+                    continue
+            elif material == RAIL:
+                facing = max(facing, 0.3)
+            rho[k, j] = reach
+            owner[k, j] = GROUND
+            cosine[k, j] = min(max(facing, 0.004), 1.0)
+            reflectance[k, j] = materials[material]

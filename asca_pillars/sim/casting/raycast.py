@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from asca_pillars.sim.bodies.primitives import Primitives
 from asca_pillars.sim.casting.ellipsoidcast import cast_ellipsoids
-from asca_pillars.sim.casting.grounddescent import cast_ground
+from asca_pillars.sim.casting.groundcast import cast_ground
 from asca_pillars.sim.casting.rays import NOTHING, no_hits, rays_of
 from asca_pillars.sim.casting.trianglecast import cast_triangles
 from asca_pillars.sim.sensor.lidar import Firings

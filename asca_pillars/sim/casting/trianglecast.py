@@ -6,8 +6,19 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.base.compiling import cached
-from asca_pillars.sim.casting.rays import NearestHits, RayLimits, Rays
-from asca_pillars.sim.casting.windows import PLAIN, TURN, Window, columns_of, keep, ray_chance, rings_of, window_of
+from asca_pillars.sim.casting.rays import (
+    PLAIN,
+    TURN,
+    NearestHits,
+    RayLimits,
+    Rays,
+    Window,
+    columns_of,
+    keep,
+    ray_chance,
+    rings_of,
+    window_of,
+)
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

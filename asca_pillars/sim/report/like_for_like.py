@@ -1,22 +1,339 @@
-"""A simulated folder beside a labelled real one, object by object and cluster by cluster."""
+"""A simulated folder beside a labelled real one: objects at like distance, view and occlusion, and clusters."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.data.kitti import Calibration, KittiSplit, boxes_from_objects, in_image
+from asca_pillars.data.insertion.ground_fit import fit_ground
+from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image
 from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
+from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.sim.report.look_alikes import NEIGHBORS, LikeRow, compare_objects
-from asca_pillars.sim.report.object_records import ObjectRecord, record_objects, seen_objects
 from asca_pillars.sim.report.reference import CLASSES
-from asca_pillars.sim.report.unlabelled_clusters import Cluster, FiringRow, find_clusters, firing_rows
+
+BRIGHT = 0.5  # reflectance from which on a return is bright: plates, lamps, reflectors, pale paint
+PILLAR_M = 0.16
+LOWEST, WHEELS, MIDDLE = (0.0, 0.12), (0.12, 0.30), (0.50, 0.70)  # zones, in shares of the box's height
+SCORED_IOU = 0.25  # BEV IoU from which on a detection of the class is one of the object
+
+_Points = NDArray[np.float32]
+
+
+class ObjectRecord(NamedTuple):
+    """A labelled object and its returns.
+
+    Attributes:
+        class_name: one of CLASSES.
+        distance_m: horizontal, from the sensor.
+        view_deg: 0..90 between the heading and the line of sight; 90 is seen from the side.
+        occluded: KITTI's state, 0..3.
+        points: returns in the box, at least 1.
+        lowest, wheels, middle: shares of them in the zones LOWEST, WHEELS and MIDDLE of the height.
+        length_m: how much of the box's length they cover.
+        bright: share of them with a reflectance of BRIGHT or more.
+        pillars: cells of PILLAR_M that hold one.
+        score: of the best detection of its class there; 0 for none, NaN without a detector.
+    """
+
+    class_name: str
+    distance_m: float
+    view_deg: float
+    occluded: int
+    points: float
+    lowest: float
+    wheels: float
+    middle: float
+    length_m: float
+    bright: float
+    pillars: float
+    score: float
+
+
+def record_objects(
+    points: _Points, objects: Sequence[KittiObject], boxes: NDArray[np.float32], found: Detections | None
+) -> list[ObjectRecord]:
+    """Records of the objects of CLASSES that have returns.
+
+    Args:
+        points: (N, 4) of the scan, LiDAR frame.
+        objects: M labels with a 3D box.
+        boxes: (M, 7) of these, LiDAR frame.
+        found: what a detector finds in the scan, if one was asked.
+    """
+    inside = points_in_boxes(points, boxes)
+    return [
+        _record(item.type, item.occluded, box, points[mask], found)
+        for item, box, mask in zip(objects, boxes.astype(np.float64), inside.T, strict=True)
+        if item.type in CLASSES and mask.any()
+    ]
+
+
+def seen_objects(objects: Sequence[KittiObject]) -> list[KittiObject]:
+    """Those with a 3D box that the image shows."""
+    return [item for item in objects if item.has_box_3d and item.bbox[2] > item.bbox[0]]
+
+
+def _record(
+    name: str, occluded: int, box: NDArray[np.float64], points: _Points, found: Detections | None
+) -> ObjectRecord:
+    x, y, z, _, _, height, yaw = box
+    aside = abs(float(wrap_angle(yaw - np.arctan2(y, x))))
+    up = (points[:, 2] - (z - height / 2)) / height
+    along = (points[:, 0] - x) * np.cos(yaw) + (points[:, 1] - y) * np.sin(yaw)
+    cells = np.unique(np.floor(points[:, :2] / PILLAR_M).astype(np.int64), axis=0)
+    lowest, wheels, middle = (float(np.mean((up >= low) & (up < high))) for low, high in (LOWEST, WHEELS, MIDDLE))
+    return ObjectRecord(
+        class_name=name,
+        distance_m=float(np.hypot(x, y)),
+        view_deg=float(np.rad2deg(min(aside, np.pi - aside))),
+        occluded=max(occluded, 0),
+        points=float(len(points)),
+        lowest=lowest,
+        wheels=wheels,
+        middle=middle,
+        length_m=float(np.ptp(along)),
+        bright=float(np.mean(points[:, 3] >= BRIGHT)),
+        pillars=float(len(cells)),
+        score=float("nan") if found is None else _score(name, box, found),
+    )
+
+
+def _score(name: str, box: NDArray[np.float64], found: Detections) -> float:
+    of_class = found[np.array([other == name for other in found.names], bool)]
+    if not len(of_class):
+        return 0.0
+    overlap = bev_iou(box[None].astype(np.float32), of_class.boxes)[0]
+    return float(np.max(of_class.scores * (overlap >= SCORED_IOU), initial=0.0))
+
+
+NEIGHBORS = 30
+DISTANCE_SPAN, VIEW_SPAN_DEG, OCCLUSION_SPAN = 0.15, 15.0, 0.5  # the first is of the logarithm
+POINTS_SPAN = 0.25  # of the logarithm
+ALL = "All"
+MEASURES = {
+    "points": "points",
+    "pillars": "pillars of 0.16 m",
+    "lowest": "points in the lowest 12 %",
+    "wheels": "points at 12-30 % of height",
+    "middle": "points at 50-70 % of height",
+    "length_m": "length covered (m)",
+    "bright": "bright returns (>= 0.5)",
+    "score": "score",
+}
+_COUNTS = ("points", "pillars")
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class LikeRow:
+    """One measure of one class.
+
+    Attributes:
+        class_name: or ALL.
+        measure: a key of MEASURES.
+        objects: real ones that were compared.
+        real, simulated: means over the objects, and over the means of their look-alikes; of counts, geometric means,
+            because near objects have a thousand times the returns of far ones.
+        ratio: real / simulated, and the interval that holds it with 95 %.
+        percentile: mean percentile of the real objects among their look-alikes, and its standard error.
+    """
+
+    class_name: str
+    measure: str
+    objects: int
+    real: float
+    simulated: float
+    ratio: float
+    ratio_interval: tuple[float, float]
+    percentile: float
+    percentile_error: float
+
+
+def compare_objects(real: Sequence[ObjectRecord], simulated: Sequence[ObjectRecord]) -> list[LikeRow]:
+    """Rows of each class that both sides have (of scores one of all classes, too)."""
+    rows, scores = [], []
+    for name in CLASSES:
+        ours = [record for record in real if record.class_name == name]
+        theirs = [record for record in simulated if record.class_name == name]
+        if not ours or len(theirs) < NEIGHBORS:
+            continue
+        alike, of_like_points = look_alikes(ours, theirs), look_alikes(ours, theirs, like_points=True)
+        for measure in MEASURES:
+            value = np.array([getattr(record, measure) for record in ours])
+            among = np.array([getattr(record, measure) for record in theirs])
+            among = among[of_like_points if measure == "score" else alike]
+            if np.isfinite(value).all() and np.isfinite(among).all():
+                rows.append(_row(name, measure, value, among))
+                if measure == "score":
+                    scores.append((value, among))
+    if len(scores) > 1:
+        rows.append(_row(ALL, "score", *(np.concatenate(side) for side in zip(*scores, strict=True))))
+    return rows
+
+
+def look_alikes(
+    real: Sequence[ObjectRecord], simulated: Sequence[ObjectRecord], *, like_points: bool = False
+) -> NDArray[np.int64]:
+    """Indices (R, NEIGHBORS) of each real object's look-alikes among simulated ones of its class."""
+    from_real, from_simulated = _place(real, like_points), _place(simulated, like_points)
+    away = np.linalg.norm(from_real[:, None] - from_simulated[None], axis=2)
+    return np.argsort(away, axis=1, kind="stable")[:, :NEIGHBORS]
+
+
+def percentiles(value: NDArray[np.float64], among: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Percentile 0..1 of each value (R,) among (R, K); ties count half."""
+    below, same = (among < value[:, None]).mean(axis=1), (among == value[:, None]).mean(axis=1)
+    return np.asarray(below + 0.5 * same)
+
+
+def _place(records: Sequence[ObjectRecord], like_points: bool) -> NDArray[np.float64]:
+    """Where objects lie among others (N, 3 or 4), in the spans that count alike."""
+    columns = [
+        [np.log(record.distance_m) / DISTANCE_SPAN for record in records],
+        [record.view_deg / VIEW_SPAN_DEG for record in records],
+        [record.occluded / OCCLUSION_SPAN for record in records],
+    ]
+    if like_points:
+        columns.append([np.log(record.points) / POINTS_SPAN for record in records])
+    return np.array(columns).T
+
+
+def _row(name: str, measure: str, value: NDArray[np.float64], among: NDArray[np.float64]) -> LikeRow:
+    counts = measure in _COUNTS
+    ours, theirs = (np.log(value), np.log(among).mean(axis=1)) if counts else (value, among.mean(axis=1))
+    draws = np.random.default_rng(0).integers(len(value), size=(_DRAWS, len(value)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        drawn = _ratio(ours[draws].mean(axis=1), theirs[draws].mean(axis=1), counts)
+        ratio = float(_ratio(ours.mean(), theirs.mean(), counts))
+    low, high = np.nanpercentile(drawn, (2.5, 97.5)) if np.isfinite(drawn).any() else (np.nan, np.nan)
+    rank = percentiles(value, among)
+    error = max(float(rank.std()), 1 / np.sqrt(12)) / np.sqrt(len(rank))  # few objects may agree by chance
+    real, simulated = (float(np.exp(side.mean()) if counts else side.mean()) for side in (ours, theirs))
+    interval = float(low), float(high)
+    return LikeRow(name, measure, len(value), real, simulated, ratio, interval, float(rank.mean()), error)
+
+
+def _ratio(
+    ours: NDArray[np.float64] | np.float64, theirs: NDArray[np.float64] | np.float64, logarithms: bool
+) -> NDArray[np.float64]:
+    return np.asarray(np.exp(ours - theirs) if logarithms else ours / theirs)
+
+
+PERSON_HEIGHT_M, THIN_M = (0.9, 2.2), 1.0
+BRIGHT_MEAN = 0.45
+FIRING_SCORE = 0.4
+KINDS = {
+    "person": "person-sized (0.9-2.2 m tall, < 1 m wide)",
+    "tall": "tall and thin (> 2.2 m tall, < 1 m wide)",
+    "bright": "bright ones of these (mean reflectance >= 0.45)",
+}
+_CELL_M = 0.25
+_FOOT_M = 0.2  # lower returns may be ground, and join what stands on it
+_MIN_POINTS = 10  # fewer have no shape
+_NEAR_M = 0.7  # from a cluster's middle to that of a box that fires at it
+_AROUND_LABEL_M = 0.4
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A cluster of returns: middle, height above the ground and the longer side of its footprint in metres."""
+
+    x_m: float
+    y_m: float
+    height_m: float
+    width_m: float
+    reflectance: float
+    fires: bool
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The keys of KINDS that it belongs to."""
+        if self.width_m >= THIN_M or self.height_m < PERSON_HEIGHT_M[0]:
+            return ()
+        size = "person" if self.height_m <= PERSON_HEIGHT_M[1] else "tall"
+        return (size, "bright") if self.reflectance >= BRIGHT_MEAN else (size,)
+
+
+@dataclass(frozen=True)
+class FiringRow:
+    """Clusters of one kind: how many per frame, and the share of them that fire with its standard error."""
+
+    kind: str
+    frames: int
+    clusters: int
+    share: float
+    error: float
+
+    @property
+    def per_frame(self) -> float:
+        """Clusters of this kind in one frame, on average."""
+        return self.clusters / self.frames
+
+
+def find_clusters(
+    points: NDArray[np.float32], ignored: NDArray[np.bool_], labelled: NDArray[np.float32], found: Detections
+) -> list[Cluster]:
+    """Clusters of at least _MIN_POINTS returns above the ground that touch no labelled box, widened a little.
+
+    Args:
+        points: (N, 4), LiDAR frame.
+        ignored: (N,) mask of points in DontCare areas, whose objects are not labelled.
+        labelled: (M, 7) boxes of everything that has a label, LiDAR frame.
+        found: what the detector finds.
+    """
+    ground = fit_ground(points)
+    if ground is None:
+        return []
+    above = points[:, 2] - ground.heights(points[:, :2].astype(np.float64))
+    wide = labelled + np.array([0, 0, 0, 1, 1, 1, 0], np.float32) * 2 * _AROUND_LABEL_M
+    standing = (above > _FOOT_M) & ~ignored & ~points_in_boxes(points, wide).any(axis=1)
+    body, height = points[standing], above[standing]
+    if not len(body):
+        return []
+    label = connected(body[:, :2])
+    order = np.argsort(label, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+    persons = np.array([name in ("Pedestrian", "Cyclist") for name in found.names], bool)
+    firing = found.boxes[persons & (found.scores >= FIRING_SCORE), :2]
+    return [_cluster(body[part], height[part], firing) for part in parts if len(part) >= _MIN_POINTS]
+
+
+def connected(xy_m: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Numbers (N,) of the groups of points (N, 2) whose cells of _CELL_M touch."""
+    cell = np.floor(xy_m / _CELL_M).astype(np.int64)
+    cell -= cell.min(axis=0)
+    raster = np.zeros(cell.max(axis=0) + 1, np.uint8)
+    raster[cell[:, 0], cell[:, 1]] = 1
+    _, groups = cv2.connectedComponents(raster, connectivity=8)
+    return np.asarray(groups[cell[:, 0], cell[:, 1]], np.int64)
+
+
+def firing_rows(clusters: Sequence[Cluster], frames: int) -> list[FiringRow]:
+    """A row of each kind."""
+    rows = []
+    for kind in KINDS:
+        fires = np.array([cluster.fires for cluster in clusters if kind in cluster.kinds], bool)
+        count = len(fires)
+        share = float(fires.mean()) if count else float("nan")
+        # Laplace's estimate in the error alone: none of a few is not a share of 0 for certain.
+        likely = (fires.sum() + 1) / (count + 2)
+        rows.append(FiringRow(kind, frames, count, share, float(np.sqrt(likely * (1 - likely) / max(count, 1)))))
+    return rows
+
+
+def _cluster(points: NDArray[np.float32], height: NDArray[np.float64], firing: NDArray[np.float32]) -> Cluster:
+    (x, y), sides, _ = cv2.minAreaRect(np.ascontiguousarray(points[:, :2]))
+    near = np.hypot(firing[:, 0] - x, firing[:, 1] - y) < _NEAR_M
+    return Cluster(x, y, float(height.max()), max(sides), float(points[:, 3].mean()), bool(near.any()))
+
 
 Detect = Callable[[NDArray[np.float32]], Detections]
 MAX_FRAMES = 400

@@ -10,12 +10,19 @@ from rich.table import Table
 
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.sim.report.like_for_like import LikeForLike
-from asca_pillars.sim.report.look_alikes import ALL, MEASURES, NEIGHBORS, LikeRow
+from asca_pillars.sim.report.like_for_like import (
+    ALL,
+    FIRING_SCORE,
+    KINDS,
+    MEASURES,
+    NEIGHBORS,
+    FiringRow,
+    LikeForLike,
+    LikeRow,
+)
 from asca_pillars.sim.report.plots import new_figure, save_figure
 from asca_pillars.sim.report.reference import CLASSES
 from asca_pillars.sim.report.tables import PAGE_END
-from asca_pillars.sim.report.unlabelled_clusters import FIRING_SCORE, KINDS, FiringRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

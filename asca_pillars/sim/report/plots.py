@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.own_files import PICTURE_SOFTWARE
-from asca_pillars.sim.report.comparison import BARRED_RANGES_M, RATIO_BAR, Comparison
-from asca_pillars.sim.report.distance import coarse
-from asca_pillars.sim.report.measured import Measured
+from asca_pillars.sim.report.comparison import BARRED_RANGES_M, RATIO_BAR, Comparison, Measured, coarse
 from asca_pillars.sim.report.reference import (
     BAND_M,
     BANDS,

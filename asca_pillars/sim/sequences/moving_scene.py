@@ -1,17 +1,189 @@
-"""A street on which the car and the road users move, at any moment of a sequence."""
+"""A street on which the car and the road users move along straight ways at constant speed."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.geometry.overlap import paired_bev_touch
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sequences.ways import Going, Way, draw_ways, held_footprints
-from asca_pillars.sim.world.placement import Placer, Target
+from asca_pillars.sim.world.ground import Ground
+from asca_pillars.sim.world.placement import ON_FOOT, Placer, Target
 from asca_pillars.sim.world.scene import KEPT_CLEAR_M, Scene, draw_scene
 
 Floats = npt.NDArray[np.float64]
+
+TRAVEL_M = 60.0  # the car's longest way: the scene's street is 170 m long, and the sensor sees 80 m
+RING_M = 230.0  # traffic that leaves the street at one end comes back, as somebody else, at the other
+LANE_M = 3.0
+# Speeds, metres per second: of traffic by the kind of street, on crossing roads, of riders and walkers.
+FLOW_MPS = {"residential": (4.0, 9.0), "urban": (5.0, 12.0), "rural": (8.0, 18.0), "campus": (3.0, 8.0)}
+CROSSING_MPS, RIDING_MPS, WALKING_MPS = (3.0, 8.0), (2.5, 6.5), (0.8, 1.8)
+STANDING_SHARE = 0.15  # of lanes whose traffic waits, and of walkers and riders
+WALK_M = 25.0  # a walker stops so far from where it was placed
+EGO_M = (4.6, 2.2)  # length and width of the car
+# What is added to a footprint's length and width before two of them may not touch.
+APART_M, PEOPLE_APART_M = 0.5, -0.2
+STEP_S = 0.1
+_HELD_M = 12.0
+
+
+@dataclass(frozen=True)
+class Way:
+    """A straight way through the world.
+
+    Attributes:
+        x_m, y_m: where it is in the middle of the sequence, or would be if it had not stopped.
+        heading_rad: where it goes.
+        speed_mps: while it goes.
+        from_m, to_m: it starts and stops so far along its heading from there.
+        ring: it goes round RING_M of the street instead.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float = 0.0
+    from_m: float = -np.inf
+    to_m: float = np.inf
+    ring: bool = False
+
+    def at(self, times_s: Floats) -> "Places":
+        """Where it is at times (T,), seconds from the middle of the sequence."""
+        gone = np.asarray(times_s, float) * self.speed_mps
+        way = np.clip(gone, self.from_m, self.to_m)
+        x, y = self.x_m + way * np.cos(self.heading_rad), self.y_m + way * np.sin(self.heading_rad)
+        laps = np.zeros(len(way), np.int64)
+        if self.ring:
+            laps = np.floor(x / RING_M + 0.5).astype(np.int64)
+            x = x - RING_M * laps
+        speed = np.where((way == gone) & (self.speed_mps > 0), self.speed_mps, 0.0)
+        return Places(np.column_stack([x, y]), way, speed, laps)
+
+
+class Places(NamedTuple):
+    """A way at T moments."""
+
+    xy_m: Floats
+    """(T, 2)."""
+    gone_m: Floats
+    """(T,) along the way, from its middle."""
+    speed_mps: Floats
+    """(T,) now."""
+    laps: npt.NDArray[np.int64]
+    """(T,) how often it has left the street."""
+
+
+class Going(NamedTuple):
+    """An object and its way."""
+
+    target: Target
+    way: Way
+
+
+def draw_ways(
+    targets: list[Target], ground: Ground, kind: str, duration_s: float, rng: np.random.Generator
+) -> tuple[Way, list[Going]]:
+    """The way of the car, and those of the objects that never touch the car or each other.
+
+    An object whose way is not free stands still; one that is in the way even then is left out.
+
+    Args:
+        targets: as they were placed.
+        ground: a straight street along x.
+        kind: of the street, for the speed of its traffic.
+        duration_s: of the sequence.
+        rng: of the sequence.
+    """
+    flow: dict[tuple[int, float], float] = {}
+    limit = TRAVEL_M / duration_s
+    lane = _lane(0.0, ground)
+    ego = Way(0.0, 0.0, 0.0, min(float(rng.uniform(*FLOW_MPS[kind])), limit))
+    flow[lane, 0.0] = ego.speed_mps
+    times = np.arange(-duration_s / 2, duration_s / 2 + STEP_S, STEP_S)
+    taken = [_footprints(ego, times, (*EGO_M, 0.0), APART_M)]
+    drawn = [_way(target, ground, kind, flow, rng) for target in targets]
+    kept: dict[int, Going] = {}
+    # What cannot move comes first: it has no other choice.
+    for index in sorted(range(len(targets)), key=lambda index: drawn[index].speed_mps > 0):
+        target = targets[index]
+        x, y, _, *size, yaw = target.box
+        apart = PEOPLE_APART_M if target.type in ON_FOOT else APART_M
+        drawn_way = drawn[index]
+        # Traffic does not stop in its lane: what follows would run into it.
+        for way in (drawn_way,) if drawn_way.ring else (drawn_way, Way(x, y, yaw)):
+            own = _footprints(way, times, size, apart)
+            if not any(_touch(own, other) for other in taken):
+                taken.append(own)
+                kept[index] = Going(target, way)
+                break
+    return ego, [kept[index] for index in sorted(kept)]
+
+
+def held_footprints(way: Way, size: tuple[float, float], duration_s: float) -> list[tuple[float, ...]]:
+    """Footprints x, y, length, width, yaw, metres, that cover all of a way during a sequence."""
+    length, width = size
+    half = way.speed_mps * duration_s / 2
+    low, high = max(-half, way.from_m), min(half, way.to_m)
+    if way.ring:
+        low, high = -way.x_m * np.cos(way.heading_rad) - RING_M / 2, -way.x_m * np.cos(way.heading_rad) + RING_M / 2
+    pieces = max(int(np.ceil((high - low) / _HELD_M)), 1)
+    edges = np.linspace(low, high, pieces + 1)
+    cos, sin = np.cos(way.heading_rad), np.sin(way.heading_rad)
+    return [
+        (way.x_m + (a + b) / 2 * cos, way.y_m + (a + b) / 2 * sin, b - a + length, width, way.heading_rad)
+        for a, b in pairwise(edges.tolist())
+    ]
+
+
+def _way(
+    target: Target, ground: Ground, kind: str, flow: dict[tuple[int, float], float], rng: np.random.Generator
+) -> Way:
+    """A way that fits what the object does; the other objects are not looked at."""
+    x, y, yaw = float(target.box[0]), float(target.box[1]), float(target.box[6])
+    still, waits = Way(x, y, yaw), rng.random() < STANDING_SHARE
+    along = 0.0 if np.cos(yaw) > 0 else np.pi
+    aside = y - ground.to_lidar(0.0, 0.0)[1]  # from the middle of the road
+    if target.going == "lane":
+        key = (_lane(y, ground), along)
+        if key not in flow:
+            flow[key] = 0.0 if waits else float(rng.uniform(*FLOW_MPS[kind]))
+        return Way(x, y, along, flow[key], ring=True)
+    if target.going == "crossing":
+        return still if waits else Way(x, y, yaw, float(rng.uniform(*CROSSING_MPS)))
+    edge = max(abs(aside), ground.half_width_m + ground.pavement_m + 0.3)
+    if target.going == "riding" and abs(np.sin(yaw)) < 0.5:
+        # Along the street all of it has to be free, so that riders keep to the pavement.
+        side = float(np.sign(aside)) * min(abs(aside), ground.half_width_m + max(ground.pavement_m, 1.0))
+        return still if waits else Way(x, y - aside + side, along, float(rng.uniform(*RIDING_MPS)), ring=True)
+    if target.going in ("riding", "walking") and not waits:
+        speed = float(rng.uniform(*(RIDING_MPS if target.going == "riding" else WALKING_MPS)))
+        ends = np.sort((np.array([-edge, edge]) - aside) / (np.sin(yaw) or 1e-9))
+        low, high = np.clip(ends, -WALK_M, WALK_M)
+        return Way(x, y, yaw, speed, float(low), float(high))
+    return still
+
+
+def _lane(y_m: float, ground: Ground) -> int:
+    return int(np.floor((y_m - ground.to_lidar(0.0, 0.0)[1]) / LANE_M))
+
+
+def _footprints(way: Way, times_s: Floats, size: npt.ArrayLike, apart_m: float) -> Floats:
+    """(T, 7) boxes, of which only what is seen from above counts."""
+    boxes = np.zeros((len(times_s), 7))
+    boxes[:, :2] = way.at(times_s).xy_m
+    boxes[:, 3:6] = size
+    boxes[:, 3:5] = np.maximum(boxes[:, 3:5] + apart_m, 0.1)
+    boxes[:, 6] = way.heading_rad
+    return boxes
+
+
+def _touch(a: Floats, b: Floats) -> bool:
+    near = np.hypot(*(a[:, :2] - b[:, :2]).T) < (np.hypot(*a[0, 3:5]) + np.hypot(*b[0, 3:5])) / 2
+    return bool(near.any() and paired_bev_touch(a[near], b[near]).any())
+
 
 FAR_M = 115.0  # beyond it an object is out of every sensor's reach
 MAX_RELIEF_M = 0.5  # the car does not pitch, so that its street has to be level

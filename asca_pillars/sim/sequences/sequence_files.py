@@ -20,8 +20,8 @@ import yaml
 
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import require_own_file, starting_with
-from asca_pillars.data.boxes.box_frames import DATASET_FILE
 from asca_pillars.data.boxes.box_records import FIELDS
+from asca_pillars.data.boxes.box_split import DATASET_FILE
 from asca_pillars.data.kitti import in_image, write_image_set
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
@@ -34,10 +34,10 @@ from asca_pillars.sim.parallel import (
     require_own_simulation,
     write_once,
 )
-from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
 from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
 from asca_pillars.sim.simulation import SimulationConfig, take_scan
+from asca_pillars.sim.world.streets import draws_of
 
 RATE_HZ = 10.0
 _DATASET = yaml.safe_dump({"labels": "labels", "columns": 4, "reflectance_scale": 1.0})

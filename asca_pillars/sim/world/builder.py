@@ -9,7 +9,7 @@ from asca_pillars.base.compiling import cached
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, prisms
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.occupied import Occupied
+from asca_pillars.sim.world.placement import Occupied
 
 Floats = npt.NDArray[np.float64]
 Material = tuple[float, float, float]  # reflectance, gloss, transparency

@@ -7,19 +7,16 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.sim.bodies import bicycles, cycles, heavy, people, shape_noise, styles, vehicles
+from asca_pillars.sim.bodies import cycles, people, shape_noise, styles, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
-from asca_pillars.sim.scalar_draws import draws_of
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.builder import Builder
-from asca_pillars.sim.world.clutter import scatter
+from asca_pillars.sim.world.clutter import fill_gaps, hide_partly, scatter
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.occupied import Occupied
-from asca_pillars.sim.world.placement import Placer, Target
+from asca_pillars.sim.world.placement import Occupied, Placer, Target
 from asca_pillars.sim.world.roadside import line_streets
-from asca_pillars.sim.world.screens import fill_gaps, hide_partly
-from asca_pillars.sim.world.streets import draw_ground, draw_kind
+from asca_pillars.sim.world.streets import draw_ground, draw_kind, draws_of
 
 # Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
 KEPT_CLEAR_M = 6.0, 4.0
@@ -136,19 +133,19 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark, footprint)
     elif name == "Truck":
         bus = rng.random() < 0.15
-        body = (heavy.bus_body if bus else heavy.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
+        body = (vehicles.bus_body if bus else vehicles.truck_body)(rng, length - 0.1, width - 0.08, height - 0.1)
     elif name == "Tram":
-        body = heavy.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
+        body = vehicles.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
     elif name == "Misc" and width < 1.0 and 1.4 < length < 2.5 and height > 1.35:
         body = cycles.motorcyclist_body(rng, height - 0.08, length - 0.06)
     elif name == "Misc":
-        body = heavy.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
+        body = vehicles.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
     elif name == "Pedestrian":
         body = people.pedestrian_body(rng, height - 0.05, width, length, target.walked_m)
     elif name == "Person_sitting":
         body = people.sitting_body(rng, height - 0.05)
     else:
-        body = bicycles.cyclist_body(rng, height - 0.08, width, length - 0.04, footprint)
+        body = cycles.cyclist_body(rng, height - 0.08, width, length - 0.04, footprint)
     most = float(rng.uniform(*config.warp_m))
     if name in ("Pedestrian", "Person_sitting", "Cyclist"):
         body = shape_noise.scaled(body, rng.uniform((0.94, 0.94, 0.98), (1.06, 1.06, 1.02)))

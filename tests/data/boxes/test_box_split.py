@@ -122,7 +122,7 @@ def test_prepare_makes_the_maps_that_training_reads(
     """Without a camera nothing is cut to its view, whatever `data.camera_view` is by default."""
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     prepare(tmp_path / "own.yaml", data=root, workers=1)
-    monkeypatch.setattr("asca_pillars.data.insertion.free_maps.find_free_space", lambda _: pytest.fail("again"))
+    monkeypatch.setattr("asca_pillars.data.insertion.free_space.find_free_space", lambda _: pytest.fail("again"))
     monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
     insert = replace(CONFIG.augment, insert=InsertConfig("rs_aug", objects=4))
     inserter = open_frames(root, replace(CONFIG, augment=insert), training=True).inserter

@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.cluster import DBSCAN
 
-from asca_pillars.data.insertion.clusters import CLUSTER_MIN_POINTS, cluster_boxes, cluster_labels
-from asca_pillars.data.insertion.ground_fit import Ground
+from asca_pillars.data.insertion.ground_fit import CLUSTER_MIN_POINTS, Ground, cluster_boxes, cluster_labels
 from asca_pillars.geometry.boxes import points_in_boxes
 
 CELL_M = 0.25

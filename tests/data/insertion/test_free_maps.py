@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.data.insertion import free_maps
-from asca_pillars.data.insertion.free_maps import load_free_space, prepare_free_spaces
-from asca_pillars.data.insertion.free_space import FreeSpace, find_free_space
+from asca_pillars.data.insertion import free_space as free_maps
+from asca_pillars.data.insertion.free_space import FreeSpace, find_free_space, load_free_space, prepare_free_spaces
 from asca_pillars.data.kitti import KittiSplit, in_image
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.insertion.simple_streets import street, write_streets

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPoint, Point, Polygon
 
-from asca_pillars.data.insertion.clusters import cluster_boxes
 from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace, _azimuth_bin, find_free_space
-from asca_pillars.data.insertion.ground_fit import fit_ground
+from asca_pillars.data.insertion.ground_fit import cluster_boxes, fit_ground
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
 from tests.data.insertion.simple_streets import AZIMUTHS_RAD, LEVEL, cast, stand, street
 

@@ -290,7 +290,7 @@ def test_prepare_leaves_nothing_for_training_to_compute(
     assert f"{4 * FRAMES} objects of {FRAMES} frames" in capsys.readouterr().out
     made = {file: file.stat().st_mtime_ns for file in (tmp_path / "prepared").rglob("*.n*")}
     assert len(made) == FRAMES + 2
-    find = "asca_pillars.data.insertion.free_maps.find_free_space"
+    find = "asca_pillars.data.insertion.free_space.find_free_space"
     monkeypatch.setattr(find, lambda _: pytest.fail("computed again"))
     monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
     settings_ = config("rs_aug")

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.evaluation.boxes.argoverse_metrics import argoverse_scores
-from asca_pillars.evaluation.boxes.bands import BANDS
-from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
-from asca_pillars.evaluation.boxes.fixed_scores import fixed_scores
-from asca_pillars.evaluation.boxes.iou_average_precision import IOUS, IouScore, iou_scores
+from asca_pillars.evaluation.boxes.box_pairs import BANDS, EvaluatedFrame
+from asca_pillars.evaluation.boxes.iou_metrics import IOUS, IouScore, fixed_scores, iou_scores
 from asca_pillars.evaluation.boxes.nuscenes_metrics import nuscenes_scores
 from tests.evaluation.boxes import box_brute_force as brute
 

@@ -9,8 +9,7 @@ import pytest
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.evaluation.boxes.box_predictions import read_box_predictions
-from asca_pillars.evaluation.boxes.predicted_frames import predictions_by_frame
+from asca_pillars.evaluation.boxes.box_predictions import predictions_by_frame, read_box_predictions
 
 BOX = {"class": "Car", "y_m": 0, "z_m": 0, "length_m": 4, "width_m": 2, "height_m": 1.5, "yaw_rad": 0, "score": 0.9}
 TIMES_S = {f"{number:06d}": 1.7e9 + number / 10 for number in range(6)}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.errors.block_bootstrap import BLOCK_FRAMES, DRAWS, MIN_BLOCKS, resamples
+from asca_pillars.evaluation.errors.error_summary import BLOCK_FRAMES, DRAWS, MIN_BLOCKS, resamples
 
 FRAMES = 60
 

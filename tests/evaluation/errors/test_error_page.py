@@ -7,10 +7,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from asca_pillars.data.insertion.ground_fit import fit_ground
-from asca_pillars.evaluation.errors.crops import DrawnBox, crop_svg
-from asca_pillars.evaluation.errors.error_page import error_page
+from asca_pillars.evaluation.errors.error_report import error_page
 from asca_pillars.evaluation.errors.error_summary import match_frames
-from asca_pillars.evaluation.errors.worst_cases import BOX_CASES, draw_cases, worst_cases
+from asca_pillars.evaluation.errors.worst_cases import BOX_CASES, DrawnBox, crop_svg, draw_cases, worst_cases
 from asca_pillars.evaluation.report_page import TextTable
 from tests.evaluation.errors.made_frames import GROUND_Z_M, MadeFrames, column, frame, ground
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.tracking.clear_mot import ClearMot, clear_mot
-from asca_pillars.evaluation.tracking.tracked_frames import Boxes, tracked_frame
+from asca_pillars.evaluation.tracking.tracking_metrics import Boxes, ClearMot, clear_mot, tracked_frame
 from tests.evaluation.tracking.test_hota import frame
 
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.evaluation.tracking.hota import ALPHAS, hota
-from asca_pillars.evaluation.tracking.tracked_frames import TrackedFrame
+from asca_pillars.evaluation.tracking.tracking_metrics import ALPHAS, TrackedFrame, hota
 
 
 def frame(objects: list[int], found: list[int], similarity: list | np.ndarray | None = None) -> TrackedFrame:

@@ -5,9 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.tracking.clear_mot import clear_mot
-from asca_pillars.evaluation.tracking.hota import hota
-from asca_pillars.evaluation.tracking.tracked_frames import TrackedFrame
+from asca_pillars.evaluation.tracking.tracking_metrics import TrackedFrame, clear_mot, hota
 from asca_pillars.geometry.overlap import iou_3d
 
 trackeval_clear = pytest.importorskip("trackeval.metrics.clear")

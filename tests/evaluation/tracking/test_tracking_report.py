@@ -21,7 +21,7 @@ from asca_pillars.evaluation.tracking.tracking_report import (
     tracking_report,
 )
 from asca_pillars.sim.sequences.sequence_files import simulate_sequences
-from asca_pillars.sim.simulation_configs import load_simulation_config
+from asca_pillars.sim.simulation import load_simulation_config
 from tests.earlier_evaluation import earlier_predictions
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")

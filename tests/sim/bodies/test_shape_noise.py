@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from asca_pillars.sim.bodies.bicycles import cyclist_body
+from asca_pillars.sim.bodies.cycles import cyclist_body
 from asca_pillars.sim.bodies.primitives import Primitives
-from asca_pillars.sim.bodies.profiles import HATCHBACK
 from asca_pillars.sim.bodies.shape_noise import darkened, scaled, warped
+from asca_pillars.sim.bodies.styles import HATCHBACK
 from asca_pillars.sim.bodies.vehicles import car_body
 
 

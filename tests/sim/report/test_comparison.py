@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from asca_pillars.sim.report.comparison import Comparison, Row, compare
-from asca_pillars.sim.report.measured import Measured, measure
+from asca_pillars.sim.report.comparison import Comparison, Measured, Row, compare, measure
 from asca_pillars.sim.report.plots import write_plots
 from asca_pillars.sim.report.reference import kitti_reference
 from asca_pillars.sim.report.tables import print_comparison, to_markdown, write_report

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import jensenshannon
 
-from asca_pillars.sim.report.distance import coarse, jensen_shannon, noise_of_points, noise_of_units
+from asca_pillars.sim.report.comparison import coarse, jensen_shannon, noise_of_points, noise_of_units
 
 
 def test_distance_by_hand() -> None:

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.kitti import objects_from_boxes
-from asca_pillars.sim.report.comparison import compare
-from asca_pillars.sim.report.fit_statistics import COLUMNS, WINDOW_RETURNS, fits_of, object_fits, window_returns
-from asca_pillars.sim.report.measured import Measured
+from asca_pillars.sim.report.comparison import Measured, compare
+from asca_pillars.sim.report.label_statistics import COLUMNS, WINDOW_RETURNS, fits_of, object_fits, window_returns
 from asca_pillars.sim.report.reference import CLASSES, Fit, kitti_reference
 from asca_pillars.sim.report.scan_statistics import ScanRecord
 from asca_pillars.sim.report.tables import fits_table

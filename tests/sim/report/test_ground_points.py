@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from asca_pillars.sim.report.ground_points import ground_mask, most_common_ground
+from asca_pillars.sim.report.scan_statistics import ground_mask, most_common_ground
 from tests.sim.report.made_up import GROUND_Z_M, rings
 
 

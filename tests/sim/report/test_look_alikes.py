@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from asca_pillars.sim.report.look_alikes import ALL, NEIGHBORS, LikeRow, compare_objects, look_alikes, percentiles
-from asca_pillars.sim.report.object_records import ObjectRecord
+from asca_pillars.sim.report.like_for_like import (
+    ALL,
+    NEIGHBORS,
+    LikeRow,
+    ObjectRecord,
+    compare_objects,
+    look_alikes,
+    percentiles,
+)
 
 
 def objects(name: str, count: int, seed: int, *, more: float = 1.0, score: float = 0.0) -> list[ObjectRecord]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.base.errors import DatasetError, ScanError
-from asca_pillars.sim.report.measured import Measured, measure
+from asca_pillars.sim.report.comparison import Measured, measure
 from asca_pillars.sim.report.scan_statistics import fit_cars, ring_counts
 from tests.sim.report.made_up import CAR_LAW, COLUMNS, GROUND_Z_M, SENSOR, rings, write_set
 

@@ -5,7 +5,7 @@ import pytest
 
 from asca_pillars.data.kitti import KittiObject, objects_from_boxes
 from asca_pillars.detection.detections import Detections
-from asca_pillars.sim.report.object_records import record_objects, seen_objects
+from asca_pillars.sim.report.like_for_like import record_objects, seen_objects
 from tests.scenes import CALIBRATION
 
 NAMES = ("Car", "Pedestrian")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.detection.detections import Detections
-from asca_pillars.sim.report.unlabelled_clusters import connected, find_clusters, firing_rows
+from asca_pillars.sim.report.like_for_like import connected, find_clusters, firing_rows
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
 NONE = np.zeros((0, 7), np.float32)

@@ -5,8 +5,15 @@ import pytest
 import shapely
 
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sequences.moving_scene import FAR_M, draw_moving_scene
-from asca_pillars.sim.sequences.ways import EGO_M, RING_M, TRAVEL_M, Way, held_footprints
+from asca_pillars.sim.sequences.moving_scene import (
+    EGO_M,
+    FAR_M,
+    RING_M,
+    TRAVEL_M,
+    Way,
+    draw_moving_scene,
+    held_footprints,
+)
 from asca_pillars.sim.world.placement import ON_FOOT
 from tests.geometry.test_overlap import polygon
 

@@ -5,10 +5,8 @@ import pytest
 
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.habits import Habits, Neighbor
-from asca_pillars.sim.world.occupied import Occupied
-from asca_pillars.sim.world.placement import Placer, Target
+from asca_pillars.sim.world.placement import Occupied, Placer, Target, draw_size
 from asca_pillars.sim.world.scene import KEPT_CLEAR_M, draw_scene, place_objects
-from asca_pillars.sim.world.sizes import draw_size
 from asca_pillars.sim.world.streets import draw_ground
 
 

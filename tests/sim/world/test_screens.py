@@ -7,10 +7,9 @@ from asca_pillars.sim.casting.raycast import cast
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
 from asca_pillars.sim.world.builder import Builder
-from asca_pillars.sim.world.occupied import Occupied
-from asca_pillars.sim.world.placement import Target
+from asca_pillars.sim.world.clutter import fill_gaps, hide_partly
+from asca_pillars.sim.world.placement import Occupied, Target
 from asca_pillars.sim.world.scene import Scene, build, draw_calibration
-from asca_pillars.sim.world.screens import fill_gaps, hide_partly
 from asca_pillars.sim.world.streets import draw_ground
 
 

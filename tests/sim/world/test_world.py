@@ -10,10 +10,9 @@ from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
 from asca_pillars.sim.world.builder import Builder, Stretch
 from asca_pillars.sim.world.clutter import SHARES, scatter
-from asca_pillars.sim.world.facades import building, close_view
 from asca_pillars.sim.world.ground import Ground, draw_relief, make_street
-from asca_pillars.sim.world.occupied import Occupied
-from asca_pillars.sim.world.roadside import LININGS, line_streets
+from asca_pillars.sim.world.placement import Occupied
+from asca_pillars.sim.world.roadside import LININGS, building, close_view, line_streets
 from asca_pillars.sim.world.scene import draw_scene
 from asca_pillars.sim.world.streets import KINDS, draw_ground
 from asca_pillars.sim.world.vegetation import shrub, wood

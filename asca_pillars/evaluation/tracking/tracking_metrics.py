@@ -1,0 +1,199 @@
+"""Tracking metrics: HOTA (Luiten et al., IJCV 129, 2021) and CLEAR MOT (Bernardin, Stiefelhagen, EURASIP JIVP 2008)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
+from asca_pillars.geometry.overlap import iou_3d
+
+_Integers = NDArray[np.int64]
+_Doubles = NDArray[np.float64]
+
+IGNORED_IOU = 0.25
+"""A box that takes a label which is not counted, by so much overlap, is not counted either."""
+
+
+class TrackedFrame(NamedTuple):
+    """One class in one frame: M labelled and N found identities, none twice."""
+
+    objects: _Integers
+    """(M,)."""
+    found: _Integers
+    """(N,)."""
+    similarity: _Doubles
+    """(M, N) in 0..1: 3D IoU."""
+
+
+class Boxes(NamedTuple):
+    """K boxes of one class in one frame, with their identities."""
+
+    boxes: NDArray[np.float32]
+    """(K, 7), LiDAR frame."""
+    ids: _Integers
+    """(K,)."""
+
+
+def tracked_frame(labels: Boxes, counted: NDArray[np.bool_], found: Boxes) -> TrackedFrame:
+    """Compare the boxes of a frame, without labels that are not counted and without the boxes that found those.
+
+    Args:
+        labels: M of one class.
+        counted: (M,) mask; False for objects of which a detector cannot be asked, hidden or out of its reach.
+        found: N of the same class.
+    """
+    similarity = iou_3d(labels.boxes, found.boxes)
+    holders = best_assignments(np.where(similarity >= IGNORED_IOU, similarity, 0.0).T)[-1]
+    of_ignored = holders[~counted & (holders != UNMATCHED)]
+    kept = np.ones(len(found.ids), bool)
+    kept[of_ignored] = False
+    return TrackedFrame(labels.ids[counted], found.ids[kept], similarity[np.ix_(counted, kept)])
+
+
+def counts_of_ids(frames: Sequence[TrackedFrame]) -> tuple[dict[int, int], dict[int, int]]:
+    """In how many frames each labelled and each found identity is."""
+    counts: tuple[dict[int, int], dict[int, int]] = ({}, {})
+    for frame in frames:
+        for own, ids in zip(counts, (frame.objects, frame.found), strict=True):
+            for number in ids.tolist():
+                own[number] = own.get(number, 0) + 1
+    return counts
+
+
+Pair = tuple[int, int]
+
+ALPHAS = np.arange(1, 20) / 20
+_EPSILON = 1e-3  # of the paper's matching score: parts the three aims
+_ROUNDING = 1e-9  # similarities that are a threshold but for rounding reach it
+
+
+class Hota(NamedTuple):
+    """Means over ALPHAS, 0 to 1; NaN where there is neither a label nor a box."""
+
+    hota: float
+    det_a: float
+    ass_a: float
+    loc_a: float
+
+
+def hota(sequences: Sequence[Sequence[TrackedFrame]]) -> Hota:
+    """HOTA of one class over several sequences, whose identities have nothing to do with each other."""
+    numbered = [_renumbered(frames, index) for index, frames in enumerate(sequences)]
+    frames = [frame for own in numbered for frame in own]
+    objects, found = counts_of_ids(frames)
+    if not objects and not found:
+        return Hota(*[float("nan")] * 4)
+    scores = np.array([_at(alpha, frames, objects, found) for alpha in ALPHAS])
+    return Hota(*scores.mean(axis=0).tolist())
+
+
+def _at(
+    alpha: float, frames: Sequence[TrackedFrame], objects: dict[int, int], found: dict[int, int]
+) -> tuple[float, float, float, float]:
+    """HOTA, DetA, AssA and LocA at one threshold."""
+    could_match = _pairs(frames, [frame.similarity >= alpha - _ROUNDING for frame in frames])
+    association = {pair: _association(pair, count, objects, found) for pair, count in could_match.items()}
+    matched: list[NDArray[np.bool_]] = []
+    similarities = 0.0
+    for frame in frames:
+        allowed = frame.similarity >= alpha - _ROUNDING
+        score = np.zeros(frame.similarity.shape)
+        for row, column in zip(*np.nonzero(allowed), strict=True):
+            pair = int(frame.objects[row]), int(frame.found[column])
+            score[row, column] = 1 / _EPSILON + association[pair] + _EPSILON * frame.similarity[row, column]
+        holders = best_assignments(score)[-1]
+        mask = np.zeros(score.shape, bool)
+        held = np.flatnonzero(holders != UNMATCHED)
+        mask[holders[held], held] = True
+        matched.append(mask)
+        similarities += float(frame.similarity[mask].sum())
+    counts = _pairs(frames, matched)
+    tp = sum(counts.values())
+    everything = sum(objects.values()) + sum(found.values()) - tp  # TP + FN + FP
+    total = sum(count * _association(pair, count, objects, found) for pair, count in counts.items())
+    return (
+        float(np.sqrt(total / everything)),
+        tp / everything,
+        total / tp if tp else 0.0,
+        similarities / tp if tp else 1.0,
+    )
+
+
+def _association(pair: Pair, both: int, objects: dict[int, int], found: dict[int, int]) -> float:
+    return both / (objects[pair[0]] + found[pair[1]] - both)
+
+
+def _pairs(frames: Sequence[TrackedFrame], masks: Sequence[NDArray[np.bool_]]) -> dict[Pair, int]:
+    """How often each pair of identities is in the masks (M, N) of the frames."""
+    counts: dict[Pair, int] = {}
+    for frame, mask in zip(frames, masks, strict=True):
+        rows, columns = np.nonzero(mask)
+        for pair in zip(frame.objects[rows].tolist(), frame.found[columns].tolist(), strict=True):
+            counts[pair] = counts.get(pair, 0) + 1
+    return counts
+
+
+def _renumbered(frames: Sequence[TrackedFrame], sequence: int) -> list[TrackedFrame]:
+    """Identities that no other sequence has."""
+    return [
+        frame._replace(objects=frame.objects + (sequence << 40), found=frame.found + (sequence << 40))
+        for frame in frames
+    ]
+
+
+class ClearMot(NamedTuple):
+    """Counts over all frames."""
+
+    labels: int
+    matches: int
+    false_boxes: int
+    identity_switches: int
+    fragmentations: int
+
+    @property
+    def misses(self) -> int:
+        """Labelled boxes that nothing was matched with."""
+        return self.labels - self.matches
+
+    @property
+    def mota(self) -> float:
+        """At most 1, may be negative; NaN without labels."""
+        wrong = self.misses + self.false_boxes + self.identity_switches
+        return 1.0 - wrong / self.labels if self.labels else float("nan")
+
+
+def clear_mot(sequences: Sequence[Sequence[TrackedFrame]], threshold: float) -> ClearMot:
+    """The counts of one class over several sequences, matched from this similarity on."""
+    total = np.zeros(5, np.int64)
+    for frames in sequences:
+        last: dict[int, int] = {}  # object -> identity that it was last matched with
+        matched_before: dict[int, int] = {}  # the same, of the frame before alone
+        seen_before: dict[int, bool] = {}  # object -> matched in the last frame that it is labelled in
+        for frame in frames:
+            matches = _matches(frame, matched_before, threshold)
+            for number in frame.objects.tolist():
+                own = matches.get(number)
+                if own is not None:
+                    total[3] += number in last and last[number] != own
+                    total[4] += number in last and not seen_before[number]
+                    last[number] = own
+                seen_before[number] = own is not None
+            total[:3] += len(frame.objects), len(matches), len(frame.found) - len(matches)
+            matched_before = matches
+    return ClearMot(*total.tolist())
+
+
+def _matches(frame: TrackedFrame, before: dict[int, int], threshold: float) -> dict[int, int]:
+    """Object -> identity."""
+    similarity = np.where(frame.similarity >= threshold, frame.similarity, 0.0)
+    kept = np.array([[before.get(one) == other for other in frame.found.tolist()] for one in frame.objects.tolist()])
+    if similarity.size:
+        kept = kept.reshape(similarity.shape) & (similarity > 0)
+        similarity[kept.any(axis=1)] = 0.0
+        similarity[:, kept.any(axis=0)] = 0.0
+        similarity[kept] = 1.0
+    holders = best_assignments(similarity)[-1]
+    held = np.flatnonzero(holders != UNMATCHED)
+    return dict(zip(frame.objects[holders[held]].tolist(), frame.found[held].tolist(), strict=True))
