@@ -43,21 +43,47 @@ def upsampling(in_channels: int, channels: int, stride: int) -> nn.Sequential:
     )
 
 
-def joined_maps(
-    features: Tensor,
-    blocks: Sequence[nn.Module] | nn.ModuleList,
-    deblocks: Iterable[nn.Module],
-    attention: Iterable[nn.Module] | None = None,
-) -> Tensor:
-    """Block after block, each upsampled, side by side: (B, C, H, W) -> (B, channels of all, H', W').
+class MapBackbone(nn.Module):
+    """Blocks on a map, each upsampled to the head's resolution and concatenated (SECOND, PointPillars, PV-RCNN).
 
-    With `attention` a module after each block, before its upsampling and the next block.
+    Args:
+        in_channels: of the map.
+        block_channels: output channels of each block.
+        block_convs: stride-1 convolutions after each block's first one.
+        upsample_channels: output channels of each upsampling.
+        strides: of each block's first convolution.
+        head_stride: of the head's map.
+        attention: a module after each block, before its upsampling and the next block; None for none.
     """
-    maps = []
-    for block, attend, deblock in zip(blocks, attention or [nn.Identity()] * len(blocks), deblocks, strict=True):
-        features = attend(block(features))
-        maps.append(deblock(features))
-    return torch.cat(maps, dim=1)
+
+    def __init__(
+        self,
+        in_channels: int,
+        block_channels: Sequence[int],
+        block_convs: Sequence[int],
+        upsample_channels: int,
+        *,
+        strides: Sequence[int],
+        head_stride: int = 1,
+        attention: Iterable[nn.Module] | None = None,
+    ) -> None:
+        super().__init__()
+        self.blocks, self.deblocks, stride = nn.ModuleList(), nn.ModuleList(), 1
+        self.attention = None if attention is None else nn.ModuleList(attention)
+        for channels, convs, step in zip(block_channels, block_convs, strides, strict=True):
+            stride *= step
+            self.blocks.append(convolution_block(in_channels, channels, convs, stride=step))
+            self.deblocks.append(upsampling(channels, upsample_channels, stride // head_stride))
+            in_channels = channels
+        self.out_channels = upsample_channels * len(self.blocks)
+
+    def forward(self, canvas: Tensor) -> Tensor:
+        """Unitless (B, C, H, W) -> (B, out_channels, H / head_stride, W / head_stride)."""
+        maps, attention = [], self.attention or [nn.Identity()] * len(self.blocks)
+        for block, attend, deblock in zip(self.blocks, attention, self.deblocks, strict=True):
+            canvas = attend(block(canvas))
+            maps.append(deblock(canvas))
+        return torch.cat(maps, dim=1)
 
 
 def _normed(convolution: nn.Module, channels: int) -> list[nn.Module]:

@@ -6,16 +6,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.config.pv_rcnn import Attention, PvRcnnModel
+from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.map_backbone import (
     NORM_EPS,
     NORM_MOMENTUM,
+    MapBackbone,
     SSDHead,
     as_map,
-    convolution_block,
-    joined_maps,
-    upsampling,
 )
 from asca_pillars.models.pv_rcnn.keypoints import AdaptiveScales, AuthorsDeformation, PaperDeformation, Surroundings
 from asca_pillars.models.pv_rcnn.preparation import VoxelBatch, deformed_balls
@@ -123,39 +121,6 @@ class VoxelBackbone(nn.Module):
 
 POINT_CHANNELS = 4  # x, y, z, reflectance
 _BLOCK_STRIDES = (1, 2)
-
-
-class MapBackbone(nn.Module):
-    """The backbone on the map seen from above (section 3.1): two blocks, the second at half the resolution.
-
-    With `attention` dual attention after each block, before its upsampling (AFE-RCNN, figure 3).
-    """
-
-    def __init__(
-        self,
-        in_channels: int,
-        block_channels: Sequence[int],
-        block_convs: Sequence[int],
-        upsample_channels: int,
-        attention: Attention = "none",
-    ) -> None:
-        super().__init__()
-        self.blocks, self.deblocks, stride = nn.ModuleList(), nn.ModuleList(), 1
-        self.attention: nn.ModuleList | None = None
-        if attention != "none":
-            self.attention = nn.ModuleList(
-                DualAttention(channels, residual=attention == "rda") for channels in block_channels
-            )
-        for channels, convs, step in zip(block_channels, block_convs, _BLOCK_STRIDES, strict=True):
-            stride *= step
-            self.blocks.append(convolution_block(in_channels, channels, convs, stride=step))
-            self.deblocks.append(upsampling(channels, upsample_channels, stride))
-            in_channels = channels
-        self.out_channels = upsample_channels * len(self.blocks)
-
-    def forward(self, canvas: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> (B, out_channels, H, W)."""
-        return joined_maps(canvas, self.blocks, self.deblocks, self.attention)
 
 
 class FirstStageOutputs(NamedTuple):
@@ -282,7 +247,14 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
     channels = {"points": POINT_CHANNELS - 3, **dict(zip(LEVEL_SOURCES, network.voxel_channels[:-1], strict=True))}
     map_channels = network.voxel_channels[-1] * spec.level_shapes[-1][0]
     neck = MapBackbone(
-        map_channels, network.block_channels, network.block_convs, network.upsample_channels, network.attention
+        map_channels,
+        network.block_channels,
+        network.block_convs,
+        network.upsample_channels,
+        strides=_BLOCK_STRIDES,
+        attention=None
+        if network.attention == "none"
+        else [DualAttention(channels, residual=network.attention == "rda") for channels in network.block_channels],
     )
     return PvRcnn(
         spec,
