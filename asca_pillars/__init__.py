@@ -11,7 +11,7 @@ The names below are the stable ones (docs/API.md). They are imported when they a
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from asca_pillars.base.telemetry import disable_telemetry
+from asca_pillars.base.installation import disable_telemetry
 
 if TYPE_CHECKING:
     from asca_deploy import Bundle, Detector, ScanDetections, ScanQueue, Tracker, Tracks, load_bundle

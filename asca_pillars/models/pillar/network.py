@@ -12,9 +12,8 @@ from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.models.map_layers import as_map
+from asca_pillars.models.map_backbone import SSDHead, as_map
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
-from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pillar.loss import detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, PillarPreparation

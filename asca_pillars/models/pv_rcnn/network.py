@@ -15,12 +15,11 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.proposals import AnchorProposals, propose_anchors
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.pillar.loss import detection_loss
-from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, VoxelBatch
 from asca_pillars.models.pv_rcnn.layers import FirstStageOutputs, PvRcnn, build_pv_rcnn
-from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
+from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels, VoxelBatch, VoxelPreparation
 from asca_pillars.models.trainable import Trainable
+from asca_pillars.models.two_stage.layers import Refinements, zero_of_weights
 from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
-from asca_pillars.models.two_stage.pillar_refiner import Refinements, zero_of_weights
 from asca_pillars.ops.sparse.rulebooks import stack_rows
 from asca_pillars.ops.two_stage.decode import reported_frames
 from asca_pillars.ops.two_stage.prepare import grid_neighbors

@@ -26,8 +26,8 @@ from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
-from asca_pillars.models.pv_rcnn.batch import batch_scans
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from asca_pillars.models.pv_rcnn.preparation import batch_scans
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, voxel_scan
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
 from asca_pillars.training.loop import train

@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models import table_conv as module
-from asca_pillars.models.table_conv import table_conv
+from asca_pillars.models import sparse_conv as module
+from asca_pillars.models.sparse_conv import table_conv
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
 from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
 

@@ -1,7 +1,10 @@
-"""Convolutions at active cells alone, by the tables of `ops.sparse`, forward and backward without a scatter.
+"""Products over rows whose number changes from batch to batch, and convolutions at active cells alone by rulebooks.
 
-Features are rows, one for each active cell; a table's entry beyond the last row stands for zeros. Every sum stays
+Features are rows, one for each active cell; a rulebook's entry beyond the last row stands for zeros. Every sum stays
 inside a matrix product or runs in a fixed order, so results do not differ from run to run.
+
+In a lower precision a CPU's product is compiled by oneDNN for each shape that it has not seen: milliseconds, again and
+again where every batch has its own number of rows; a third of a training step. Rows of zeros round it to one of few.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,7 +14,26 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.row_product import pad_rows, rounded_rows
+
+def rounded_rows(rows: int) -> int:
+    """`rows` or a little more, at most a sixteenth: one of 16 numbers in each octave."""
+    step = 1 << max((rows - 1).bit_length() - 5, 0)
+    return -(-rows // step) * step
+
+
+def pad_rows(features: Tensor, value: float = 0) -> Tensor:
+    """Rows (N, C) followed by rows of `value`, as many in all as `rounded_rows` says."""
+    missing = rounded_rows(len(features)) - len(features)
+    return F.pad(features, (0, 0, 0, missing), value=value) if missing else features
+
+
+def linear_rows(features: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """`torch.nn.functional.linear` of rows, unitless: (N, C) -> (N, outputs)."""
+    device = features.device.type
+    if device != "cpu" or not torch.is_autocast_enabled(device):
+        return F.linear(features, weight, bias)
+    return F.linear(pad_rows(features.to(torch.get_autocast_dtype(device))), weight, bias)[: len(features)]
+
 
 CHUNK_VALUES = 1 << 20  # gathered at a time: on a CPU they stay in its cache; all at once would be memory-bound
 
