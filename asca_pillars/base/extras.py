@@ -12,6 +12,7 @@ EXTRAS = {
     "eval": ("matplotlib",),
     "import": ("pyarrow",),
     "recordings": ("rosbags", "mcap"),
+    "video": ("imageio_ffmpeg",),
     "view": ("rerun", "rosbags", "mcap"),
     "cluster": ("ray",),
 }

@@ -40,8 +40,8 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares

@@ -12,10 +12,10 @@ from typing import IO, Any
 import numpy as np
 
 from asca_deploy.recordings.results import Found
+from asca_pillars.pictures.colors import class_shares
 
 TOPIC = "/asca/boxes"
 LIBRARY = "asca-pillars boxes"
-_COLORS = ((0.2, 0.7, 1.0), (1.0, 0.6, 0.1), (0.4, 0.9, 0.3), (0.9, 0.4, 0.9), (0.9, 0.9, 0.3))
 _ARROW_S = 1.0  # an arrow is as long as the way of so many seconds
 _MOVES_MPS = 0.5
 
@@ -104,7 +104,7 @@ def scene_update(found: Found) -> dict[str, Any]:
     entities = []
     for row, box in enumerate(found.detections):
         x, y, z, length, width, height, yaw = box[2:]
-        red, green, blue = _COLORS[int(found.detections.labels[row]) % len(_COLORS)]
+        red, green, blue = class_shares(box.class_name)
         color = {"r": red, "g": green, "b": blue, "a": 0.4}
         pose = {"position": {"x": x, "y": y, "z": z}, "orientation": _about_z(yaw)}
         above = {"position": {"x": x, "y": y, "z": z + height / 2 + 0.4}, "orientation": _about_z(0.0)}

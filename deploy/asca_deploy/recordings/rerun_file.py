@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.recordings.results import Found
+from asca_pillars.pictures.colors import class_rgb
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan
 
 MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
@@ -72,14 +73,12 @@ class RerunFile:
         quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
         if found.tracks is None:
             labels = [f"{box.class_name} {box.score:.2f}" for box in found.detections]
-            ids = found.detections.labels
         else:
             labels = [f"{track.detection.class_name} {track.track_id}" for track in found.tracks]
-            ids = found.tracks.track_ids
         return rr.Boxes3D(
             centers=boxes[:, :3],
             sizes=boxes[:, 3:6],
             quaternions=quaternions,
             labels=labels,
-            class_ids=(ids % 65_535).astype(np.uint16),
+            colors=np.array([class_rgb(name) for name in found.detections.names], np.uint8).reshape(-1, 3),
         )
