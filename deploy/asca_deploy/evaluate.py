@@ -23,17 +23,17 @@ def evaluate(
     *,
     split: str | None = None,
     protocol: Protocol | None = None,
-    predictions: Path | None = None,
-    labels: Path | None = None,
+    predictions: str | Path | None = None,
+    labels: str | Path | None = None,
     score: ScoreThresholds | None = None,
     min_score: float = MIN_SCORE,
     around: bool = False,
     gallery: int | None = None,
-    compare: Path | None = None,
+    compare: str | Path | None = None,
     errors: bool = False,
     errors_by: str | None = None,
-    beside: Sequence[Path] = (),
-    json: Path | None = None,
+    beside: Sequence[str | Path] = (),
+    json: str | Path | None = None,
     options: RuntimeOptions = _PLAIN,
     progress: Progress | None = None,
     remark: Remark | None = None,
@@ -67,27 +67,26 @@ def evaluate(
     """
     if model is not None:
         options = replace(options, bundle=Path(model))
-    data = None if data is None else Path(data)
     task = EvaluationTask(
-        protocol=protocol or default_protocol(data),
-        model=options.bundle,
-        data=data,
+        protocol=protocol or default_protocol(_path(data)),
+        model=_path(options.bundle),
+        data=_path(data),
         split=split,
-        predictions=predictions,
-        labels=labels,
+        predictions=_path(predictions),
+        labels=_path(labels),
         out=Path(out),
-        json=json,
+        json=_path(json),
         gallery=gallery,
-        compare=compare,
+        compare=_path(compare),
         score=score,
         min_score=min_score,
         around=around,
         errors=errors,
         errors_by=errors_by,
-        beside=tuple(beside),
+        beside=tuple(map(Path, beside)),
     )
-    if predictions is not None:
-        _check_no_runtime(predictions, options, min_score)
+    if task.predictions is not None:
+        _check_no_runtime(task.predictions, options, min_score)
     check_arguments(task)
     reporter = Reporter(progress, remark)
 
@@ -107,6 +106,10 @@ def evaluate(
 
         done = evaluate_text(task, opened, reporter)
     return replace(done, remarks=tuple(reporter.remarks))
+
+
+def _path(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path)
 
 
 def _check_no_runtime(predictions: Path, options: RuntimeOptions, min_score: float) -> None:
