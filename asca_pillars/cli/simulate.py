@@ -104,44 +104,45 @@ def simulate(
     require("sim")
     if report or like is not None:
         require("eval")
-    if cluster is not None:
-        require("cluster")
     from rich.console import Console
 
-    from asca_deploy.open_model import RuntimeOptions, open_model
     from asca_pillars.base.errors import ConfigError
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.data.kitti import KittiSplit
-    from asca_pillars.sim.simulation import load_simulation_config, require_own_frames
-    from asca_pillars.sim.simulation import simulate as write_frames
+    from asca_pillars.sim.simulate import simulate as run
 
     if bundle is not None and like is None:
         raise ConfigError(f"--bundle {bundle} scores the objects of a real folder: give --like FOLDER, too")
-    if length is not None and sequences is None:
-        raise ConfigError(f"--length {length} is for drives: give --sequences N, too, or --frames N for single scans")
+    if sequences is not None and (frames is not None or report or like is not None or cluster is not None):
+        raise ConfigError("--sequences: leave --frames, --report, --like and --cluster out; they are for single scans")
     if like is not None:
         KittiSplit(like).frame_ids  # noqa: B018 - a wrong folder is named before the work
     if bundle is not None:
+        from asca_deploy.open_model import RuntimeOptions, open_model
+
         open_model(RuntimeOptions(bundle=bundle), 0.0)  # and so is a wrong bundle
     console = Console(markup=False)
-    settings = load_simulation_config(config, view)
-    if sequences is not None:
-        if frames is not None or report or like is not None or cluster is not None:
-            raise ConfigError(
-                "--sequences: leave --frames, --report, --like and --cluster out; they are for single scans"
-            )
-        from asca_pillars.sim.sequences.sequence_files import require_own_sequences, simulate_sequences
-
-        length = length or LENGTH
-        require_own_sequences(out)
-        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share)
-        console.print(f"{sequences} sequences of {length} scans below {out}; look at one: asca detect {out}/scans/0000")
-        return
     there = any((out / "training" / "velodyne").glob("*.bin"))
-    if frames is not None or not (there and (report or like is not None)):
-        frames = frames or FRAMES
-        require_own_frames(out)
-        write_frames(out, frames, seed, workers, settings, val_share, cluster=cluster)
-        console.print(f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin")
+    if sequences is not None or frames is not None or not (there and (report or like is not None)):
+        with Bars(console) as bars:
+            done = run(
+                out,
+                frames,
+                sequences=sequences,
+                length=length,
+                seed=seed,
+                workers=workers,
+                config=config,
+                view=view,  # type: ignore[arg-type]  # it is checked with the config
+                val_share=val_share,
+                cluster=cluster,
+                progress=bars,
+            )
+        if sequences is None:
+            console.print(f"{done.frames} frames below {out}; look at one: asca detect {done.scans}/000000.bin")
+        else:
+            what = f"{sequences} sequences of {done.frames // sequences} scans"
+            console.print(f"{what} below {out}; look at one: asca detect {out}/scans/0000")
     if report:
         from asca_pillars.cli.simulate_reports import report_statistics
 

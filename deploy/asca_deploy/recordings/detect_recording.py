@@ -103,9 +103,9 @@ def detect_recording(
     topic: str | None = None,
     track: bool = False,
     odometry: str | None = None,
-    calib: Path | None = None,
-    foxglove: Path | None = None,
-    rerun: Path | None = None,
+    calib: str | Path | None = None,
+    foxglove: str | Path | None = None,
+    rerun: str | Path | None = None,
     options: RuntimeOptions = _PLAIN,
     reading: ScanSettings = _AS_TRAINED,
     score: ScoreThresholds | None = None,
@@ -143,9 +143,9 @@ def detect_recording(
         topic=topic,
         track=track,
         odometry=odometry,
-        calib=calib,
-        foxglove=foxglove,
-        rerun=rerun,
+        calib=None if calib is None else Path(calib),
+        foxglove=None if foxglove is None else Path(foxglove),
+        rerun=None if rerun is None else Path(rerun),
     )
     return _detect(task, reading, options, Reporter(progress, remark))
 
@@ -271,7 +271,7 @@ class _Run:
             yield
 
 
-def _thresholds(bundle: Path | None, score: ScoreThresholds | None) -> dict[str, float]:
+def _thresholds(bundle: str | Path | None, score: ScoreThresholds | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track; ConfigError if it is none."""
     spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)
