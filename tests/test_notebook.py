@@ -56,7 +56,8 @@ def test_scans_without_files(bundle: Path, tmp_path: Path, printed: pytest.Captu
         write_scan(tmp_path / "scans" / f"{number}.bin", make_scan(number, 300))
     (tmp_path / "scans" / "9.bin").write_bytes(b"torn")
     before = sorted(tmp_path.rglob("*"))
-    steps, failed = Steps(), []
+    steps = Steps()
+    failed: list[str] = []
     found = detect_scans(
         tmp_path / "scans", options=RuntimeOptions(bundle=bundle, threads=1), progress=steps, failed=failed.append
     )
@@ -83,7 +84,8 @@ def test_scans_with_files_and_settings(bundle: Path, tmp_path: Path) -> None:
 def test_a_recording(tmp_path: Path, printed: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("rosbags")
     drive = write_drive(tmp_path / "drive.mcap")
-    steps, remarks = Steps(), []
+    steps = Steps()
+    remarks: list[str] = []
     options = RuntimeOptions(threads=1)
     done = detect_recording(drive, tmp_path / "out", options=options, progress=steps, remark=remarks.append)
     assert done.scans == DRIVE_SCANS and sum(done.boxes.values()) > 0

@@ -67,8 +67,9 @@ def evaluate(
     """
     if model is not None:
         options = replace(options, bundle=Path(model))
+    chosen: Protocol = protocol or default_protocol(_path(data))
     task = EvaluationTask(
-        protocol=protocol or default_protocol(_path(data)),
+        protocol=chosen,
         model=_path(options.bundle),
         data=_path(data),
         split=split,
@@ -93,14 +94,14 @@ def evaluate(
     def opened(sensor_height_m: float | None) -> Model:
         return open_model(options, min_score, sensor_height_m=sensor_height_m, around=around)
 
-    if task.protocol == "tracking":
+    if chosen == "tracking":
         from asca_pillars.evaluation.tracking.track_evaluation import evaluate_tracks
 
         done = evaluate_tracks(task)
-    elif task.protocol == "iou" or task.protocol == "distance":
+    elif chosen == "iou" or chosen == "distance":
         from asca_pillars.evaluation.box_evaluation import evaluate_boxes
 
-        done = evaluate_boxes(task, task.protocol, opened, reporter)
+        done = evaluate_boxes(task, chosen, opened, reporter)
     else:
         from asca_pillars.evaluation.kitti_evaluation import evaluate_text
 
