@@ -18,7 +18,7 @@ from rich.progress import track
 
 from asca_deploy import Detector, find_bundle
 from asca_deploy.manifest import load_bundle
-from asca_deploy.tracker import Tracker
+from asca_deploy.tracker import WEAK_SHARE, Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.schema import to_dict
@@ -49,9 +49,6 @@ from asca_pillars.scans.recordings.odometry import Poses, read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
-
-WEAK_SHARE = 0.7
-"""Detections from this share of the lowest threshold on carry tracks on that better ones began."""
 
 
 @dataclass(frozen=True, kw_only=True)

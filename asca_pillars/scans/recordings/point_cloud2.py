@@ -38,14 +38,23 @@ def read_point_cloud(message: Message, source: str) -> PointCloud:
         cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
     except Exception as error:  # the library lets struct's and NumPy's errors pass
         raise ScanError(f"{source}: no readable PointCloud2 ({reason(error)}); record it again") from None
-    points, time_ns = _points(cloud, source), time_of(cloud.header, message)
+    points, time_ns = point_cloud_points(cloud, source), time_of(cloud.header, message)
     if time_ns is None:
         said = "neither the header nor the recording has a usable time stamp, it was taken as 0"
         points, time_ns = points._replace(remarks=(*points.remarks, said)), 0
     return PointCloud(points, time_ns, str(cloud.header.frame_id))
 
 
-def _points(cloud: Any, source: str) -> StoredPoints:
+def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
+    """The points of a PointCloud2 that was decoded by rosbags or came from ROS.
+
+    Args:
+        cloud: an object with the fields of that message.
+        source: names it in errors.
+
+    Raises:
+        ScanError: the message contradicts itself, or has no x, y and z.
+    """
     height, width, step, row_step = int(cloud.height), int(cloud.width), int(cloud.point_step), int(cloud.row_step)
     count, data = height * width, np.asarray(cloud.data, np.uint8)
     if count > MAX_POINTS:
