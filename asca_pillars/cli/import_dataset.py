@@ -11,6 +11,7 @@ from asca_pillars.cli.options import (
     PoseOption,
     ReflectanceScaleOption,
     SensorHeightOption,
+    scan_settings,
 )
 
 
@@ -57,8 +58,7 @@ def import_dataset(
     from rich.console import Console
 
     from asca_pillars.base.errors import ConfigError, printable
-    from asca_pillars.cli.extras import require
-    from asca_pillars.cli.scan_input import scan_settings
+    from asca_pillars.base.extras import require
     from asca_pillars.data.importing.argoverse2 import read_argoverse2
     from asca_pillars.data.importing.box_files import read_box_files
     from asca_pillars.data.importing.imported import Importer, renamed, require_own_dataset, usable, write_imported

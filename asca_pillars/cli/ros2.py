@@ -1,6 +1,6 @@
 """`asca ros2`: a live topic of point clouds in, boxes out."""
 
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated, cast
 
 import typer
 
@@ -16,10 +16,8 @@ from asca_pillars.cli.options import (
     SensorHeightOption,
     ThreadsOption,
     read_scores,
+    scan_settings,
 )
-
-if TYPE_CHECKING:
-    from asca_deploy.providers import Precision, Provider
 
 
 def ros2(
@@ -72,11 +70,12 @@ def ros2(
     import logging
     import os
 
-    from asca_deploy import Detector, find_bundle
+    from asca_deploy.detector import Detector
     from asca_deploy.manifest import load_bundle
+    from asca_deploy.open_model import RuntimeOptions, open_detector
     from asca_deploy.ros2.node import NodeSettings, Qos, run_node
+    from asca_deploy.shipped import find_bundle
     from asca_deploy.tracker import WEAK_SHARE, Tracker
-    from asca_pillars.cli.scan_input import scan_settings
     from asca_pillars.scans.mounting import Mounting
 
     logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are in the diagnostics
@@ -86,22 +85,14 @@ def ros2(
     settings = NodeSettings(
         topic=topic, reading=reading, qos=cast("Qos", qos), frame=frame, log_every=log_every, ros_args=ros_args or ()
     )
-    scores = read_scores(score)
-    spec = load_bundle(find_bundle(bundle)).spec
-    births = {
-        one.name: one.score_threshold for one in (spec if scores is None else spec.with_score_threshold(scores)).classes
-    }
+    options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    scores, spec = read_scores(score), load_bundle(find_bundle(bundle)).spec
+    thresholds = spec if scores is None else spec.with_score_threshold(scores)
+    births = {one.name: one.score_threshold for one in thresholds.classes}
+    least = WEAK_SHARE * min(births.values()) if track else scores
 
-    def open_detector(mounting: Mounting) -> Detector:
-        return Detector(
-            bundle,
-            provider=cast("Provider", provider),  # checked by Detector, as the precision is
-            precision=cast("Precision | None", precision),
-            threads=threads,
-            score_threshold=WEAK_SHARE * min(births.values()) if track else scores,
-            mounting=mounting,
-            view="around" if around else "ahead",
-        )
+    def opened(mounting: Mounting) -> Detector:
+        return open_detector(options, least, mounting, around=around)
 
-    run_node(settings, open_detector, Tracker(birth_score=births) if track else None)
+    run_node(settings, opened, Tracker(birth_score=births) if track else None)
     os._exit(0)  # all is closed; on a busy machine the libraries would take seconds to unload

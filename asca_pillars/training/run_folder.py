@@ -19,9 +19,10 @@ from asca_pillars.config.tree import Config, Precision, load_config
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.training_frames import TrainingFrames
-from asca_pillars.models.checkpoint import weights_sha256
+from asca_pillars.models.checkpoint_file import weights_sha256
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.measure_input import measure_expected_input
+from asca_pillars.training.module import cooldown_start, steps_per_epoch
 from asca_pillars.training.run_files import (
     COMMAND,
     CONFIG_FILE,
@@ -32,7 +33,6 @@ from asca_pillars.training.run_files import (
     is_own_config,
     is_own_expected_input,
 )
-from asca_pillars.training.schedules import cooldown_start, steps_per_epoch
 
 EXPECTED_INPUT_FRAMES = 200
 # Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.

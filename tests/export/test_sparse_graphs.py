@@ -14,8 +14,7 @@ from asca_deploy.ort_session import OrtSession
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.fast_forms import CanvasSteps
 from asca_export.quantize import HEAD, STEPS, canvas_steps
-from asca_export.sparse_forms import SparseBackbone
-from asca_export.sparse_graphs import export_sparse_backbone
+from asca_export.sparse_forms import SparseBackbone, export_sparse_backbone
 from asca_export.sparse_quantize import (
     BEST_CELLS,
     OTHER_CELLS,

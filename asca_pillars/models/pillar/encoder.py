@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from asca_pillars.config.pillar import CpaReading
-from asca_pillars.models.map_layers import NORM_EPS, NORM_MOMENTUM
+from asca_pillars.models.map_backbone import NORM_EPS, NORM_MOMENTUM
 from asca_pillars.models.pillar.attention import ChannelAttention, ChannelLinear, PaperAttention, PointAttention
-from asca_pillars.models.row_product import linear_rows
+from asca_pillars.models.sparse_conv import linear_rows
 from asca_pillars.ops.pillar.prepare import FEATURES, PillarLimits
 
 

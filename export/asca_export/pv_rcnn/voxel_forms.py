@@ -19,7 +19,7 @@ from asca_export.quantize import STEPS, TINY
 from asca_export.row_graphs import RowGraph
 from asca_export.sparse_forms import linear, scale_and_shift
 from asca_export.sparse_quantize import count_steps, highest_outputs, mixed_products, read_moments, round_products
-from asca_pillars.models.pv_rcnn.voxel_backbone import TableLayer, VoxelBackbone
+from asca_pillars.models.pv_rcnn.layers import TableLayer, VoxelBackbone
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
 
 _PLACES = 1000  # of each scan and layer, whose inputs weights are rounded for; 27 taps make a product of them dear

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.models.pv_rcnn.deformation import AuthorsDeformation, PaperDeformation, Surroundings
+from asca_pillars.models.pv_rcnn.keypoints import AuthorsDeformation, PaperDeformation, Surroundings
 from asca_pillars.ops.pv_rcnn.prepare import Deform, SourceBalls, VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import SETTINGS, batch, frame, tiny_detector
 
