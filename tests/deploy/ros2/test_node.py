@@ -59,9 +59,11 @@ def ended(process: subprocess.Popen[str], kind: signal.Signals) -> tuple[list[di
     start = time.monotonic()
     process.send_signal(kind)
     output, _ = process.communicate(timeout=20)
+    seconds = time.monotonic() - start
     assert process.returncode == 0, output
     assert "Traceback" not in output
-    return [json.loads(line) for line in output.splitlines()], time.monotonic() - start
+    lines = [line for line in output.splitlines() if line.startswith("{")]  # the others are ROS' own
+    return [json.loads(line) for line in lines], seconds
 
 
 @pytest.mark.parametrize("kind", ["RELIABLE", "BEST_EFFORT"])
