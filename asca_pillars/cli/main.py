@@ -15,6 +15,7 @@ from asca_pillars.cli.import_dataset import import_dataset
 from asca_pillars.cli.import_weights import import_weights
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.cli.prepare import prepare
+from asca_pillars.cli.ros2 import ros2
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.cli.simulate import simulate
 from asca_pillars.cli.train import train
@@ -36,6 +37,7 @@ app.command("eval")(evaluate)
 app.command()(export)
 app.command("import-weights")(import_weights)
 app.command()(ablate)
+app.command()(ros2)
 app.command()(doctor)
 
 

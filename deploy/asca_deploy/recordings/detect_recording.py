@@ -32,7 +32,7 @@ from asca_deploy.recordings.results import (
 )
 from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
 from asca_deploy.shipped import find_bundle
-from asca_deploy.tracker import Tracker
+from asca_deploy.tracker import WEAK_SHARE, Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
@@ -49,10 +49,6 @@ from asca_pillars.scans.recordings.open_recording import open_recording, recordi
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.scans.scan_input import said_of_scale
 from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
-
-WEAK_SHARE = 0.7
-"""Detections from this share of the lowest threshold on carry tracks on that better ones began."""
-
 
 _PLAIN = RuntimeOptions()
 _AS_TRAINED = ScanSettings()
