@@ -1,7 +1,7 @@
 """`asca detect`: scans or a recording in, tables, pictures, KITTI text and tracks out."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,6 +23,10 @@ from asca_pillars.cli.options import (
     ThreadsOption,
     read_scores,
 )
+from asca_pillars.data.importing.formats import TOOLS
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def detect(
@@ -67,6 +71,14 @@ def detect(
     calib: Annotated[
         Path | None,
         typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
+    ] = None,
+    write: Annotated[
+        str | None,
+        typer.Option(
+            "--write",
+            metavar="FORMAT",
+            help=f"Also write the boxes as labels to correct, to OUT/FORMAT: {', '.join(TOOLS)} (docs/LABELLING.md).",
+        ),
     ] = None,
     cluster: ClusterOption = None,
 ) -> None:
@@ -117,6 +129,12 @@ def detect(
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
     recordings = [path for path in scans or () if is_recording(path)]
+    if write is not None:
+        from asca_pillars.data.importing.tool_labels import require_unchanged
+
+        if recordings:
+            raise ConfigError(f"--write {write}: labels belong to scan files, and {recordings[0]} is a recording")
+        require_unchanged(out, write)
     if recordings:
         if cluster is not None or len(scans or ()) > 1:
             raise ConfigError(f"{recordings[0]}: is a recording; give one alone, without --cluster")
@@ -152,6 +170,7 @@ def detect(
             raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
         paths = [path for path, _ in named]
         detect_archive(paths, scan_input, reading, options, out, score=scores, around=around, address=cluster)
+        _write_labels(out, write, console)
         return
     detector = open_detector(options, scores, scan_input.mounting, around=around)
     if detector.candidates:
@@ -159,3 +178,13 @@ def detect(
     scope = detector_scope(detector.spec, around=around)
     writer = ResultWriter(out, [name for _, name in named], pictures=pictures is not False, scope=scope)
     detect_scans(named, scan_input, detector, writer, console)
+    _write_labels(out, write, console)
+
+
+def _write_labels(out: Path, name: str | None, console: "Console") -> None:
+    """Write the boxes of the run that `out` holds as labels of a tool, if one was named."""
+    if name is not None:
+        from asca_pillars.cli.detect_files import RUN_FILE
+        from asca_pillars.data.importing.tool_labels import write_prelabels
+
+        console.print(f"Labels to correct: {write_prelabels(out / RUN_FILE, name, out)}/", soft_wrap=True)
