@@ -15,10 +15,10 @@ from asca_pillars.cli.options import (
     PrecisionOption,
     ProviderOption,
     ReflectanceScaleOption,
-    RuntimeOptions,
     ScansArgument,
     SensorHeightOption,
     ThreadsOption,
+    scan_settings,
 )
 
 MOST_SCANS = 100  # they are held in memory, and every round goes over all of them
@@ -83,14 +83,14 @@ def bench(
 
     from asca_deploy import sample_scan_path
     from asca_deploy.manifest import load_bundle
+    from asca_deploy.open_model import RuntimeOptions, open_detector
     from asca_pillars.base.errors import ConfigError, ScanError
     from asca_pillars.base.files import write_json
     from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.base.writable_file import require_writable
     from asca_pillars.cli.bench_parts import Parts, measure_parts, named_bundles
-    from asca_pillars.cli.models import open_detector
-    from asca_pillars.cli.scan_input import ScanInput, scan_settings
-    from asca_pillars.cli.writable_file import require_writable
     from asca_pillars.scans.find_scans import name_scans
+    from asca_pillars.scans.scan_input import ScanInput
 
     # A pipe has no width, and the tables are wider than the 80 columns that rich takes then.
     piped = not sys.stdout.isatty() and "COLUMNS" not in os.environ

@@ -10,9 +10,9 @@ from asca_deploy import Detector, default_bundle_path, openvino_session
 from asca_deploy.auto import summary
 from asca_deploy.providers import AUTO, PROVIDERS, require
 from asca_pillars.base.errors import AscaError
+from asca_pillars.base.extras import EXTRAS, missing_modules
 from asca_pillars.base.installation import install_command
 from asca_pillars.base.system import cpu_model, package_versions
-from asca_pillars.cli.extras import EXTRAS, missing_modules
 
 
 def print_checks(console: Console) -> None:

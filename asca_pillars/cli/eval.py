@@ -6,11 +6,9 @@ from typing import Annotated, Literal
 import typer
 
 from asca_pillars.cli.options import (
-    MIN_SCORE,
     AroundOption,
     PrecisionOption,
     ProviderOption,
-    RuntimeOptions,
     ThreadsOption,
     read_scores,
 )
@@ -75,7 +73,7 @@ def evaluate(
         typer.Option(
             "--min-score", min=0, max=1, help="Lowest score that a model is run with: AP needs the weak detections too."
         ),
-    ] = MIN_SCORE,
+    ] = 0.05,
     protocol: Annotated[
         Literal["kitti", "waymo", "iou", "distance", "tracking"] | None,
         typer.Option(
@@ -121,12 +119,12 @@ def evaluate(
     """
     from rich.console import Console
 
+    from asca_deploy.open_model import RuntimeOptions, open_model
     from asca_pillars.cli import eval_steps as steps
     from asca_pillars.cli.eval_arguments import EvalArguments, check_arguments, default_protocol
     from asca_pillars.cli.eval_errors import prepare_errors, who_predicted
     from asca_pillars.cli.eval_files import claim
     from asca_pillars.cli.eval_gallery import draw_gallery
-    from asca_pillars.cli.models import open_model
     from asca_pillars.data.kitti import KittiSplit
     from asca_pillars.evaluation.predictions import read_predictions, read_truth
 

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from asca_deploy.open_model import RuntimeOptions
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.cli.options import MIN_SCORE, RuntimeOptions, Scores
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
+from asca_pillars.detection.spec import ScoreThresholds
+from asca_pillars.evaluation.model import MIN_SCORE
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class EvalArguments:
     out: Path
     gallery: int | None
     compare: Path | None
-    score: Scores | None
+    score: ScoreThresholds | None
     min_score: float
     around: bool
     errors: bool = False
@@ -159,6 +161,6 @@ def _check_compare(compare: Path, given: EvalArguments) -> None:
         raise ConfigError(f"--compare {compare}: this evaluation writes there; give it another --out")
 
 
-def _typed(score: Scores) -> str:
+def _typed(score: ScoreThresholds) -> str:
     """As a user would type it, the first one of several."""
     return next(f"{name}={value:g}" for name, value in score.items()) if isinstance(score, Mapping) else f"{score:g}"

@@ -6,22 +6,23 @@ from typing import Any
 
 from rich.console import Console
 
+from asca_deploy.open_model import RuntimeOptions, open_model
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import atomic_directory, write_json
 from asca_pillars.base.system import describe_environment
 from asca_pillars.cli.eval_errors import prepare_errors, report_errors, who_predicted
 from asca_pillars.cli.eval_files import MADE_BY, PREDICTIONS_FOLDER, claim, write_report
 from asca_pillars.cli.eval_steps import TEXT_SCORE, model_scores, warn_of_degrees, warn_of_unlike_scans
-from asca_pillars.cli.models import Model, open_model
-from asca_pillars.cli.options import RuntimeOptions, Scores, scores_by_class
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.open_split import open_split
+from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation.boxes.box_predictions import BoxFrames, read_box_predictions, write_box_predictions
 from asca_pillars.evaluation.boxes.box_report import BoxProtocol, box_json, box_notes, box_report, box_tables
 from asca_pillars.evaluation.boxes.iou_metrics import fixed_scores
 from asca_pillars.evaluation.errors.error_frames import BoxErrorFrames
+from asca_pillars.evaluation.model import Model, scores_by_class
 from asca_pillars.evaluation.report_page import ReportPage
 
 PREDICTIONS = "detections.jsonl"
@@ -36,7 +37,7 @@ class BoxTask:
     split: str
     out: Path
     json: Path | None
-    score: Scores | None
+    score: ScoreThresholds | None
     min_score: float
     around: bool
     errors: bool

@@ -19,7 +19,7 @@ from asca_pillars.base.own_files import (
     require_own_file,
     require_replaceable,
 )
-from asca_pillars.cli.writable_file import require_writable
+from asca_pillars.base.writable_file import require_writable
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.errors.error_report import PRODUCTS as ERROR_PRODUCTS
 from asca_pillars.evaluation.errors.error_report import remove_errors

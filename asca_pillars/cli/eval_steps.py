@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asca_pillars.base.errors import ConfigError, DatasetError
+from asca_pillars.base.extras import missing_modules
 from asca_pillars.base.files import atomic_directory, remove_directory, write_json
 from asca_pillars.base.installation import install_command
 from asca_pillars.base.own_files import is_own_picture, require_own_file
 from asca_pillars.base.system import describe_environment
 from asca_pillars.cli.eval_errors import ErrorAnalysis, report_errors
 from asca_pillars.cli.eval_files import COMMAND, CURVES, GALLERY_FOLDER, MADE_BY, PREDICTIONS_FOLDER, write_report
-from asca_pillars.cli.extras import missing_modules
-from asca_pillars.cli.models import Model
-from asca_pillars.cli.options import Scores, scores_by_class
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.yaw_units import doubt_of_yaws
+from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.model import Model, scores_by_class
 from asca_pillars.evaluation.predictions import ScoredFrames, write_predictions
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.evaluation.waymo import (
@@ -58,7 +58,7 @@ class Task:
     about: dict[str, Any]
 
 
-def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: Scores | None) -> Task:
+def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: ScoreThresholds | None) -> Task:
     """Finished predictions as KITTI text, counted from `score` on."""
     scores = scores_by_class(score, dict.fromkeys(CLASS_NAMES, TEXT_SCORE))
     about = {"predictions": str(predictions), "labels": str(labels)}
@@ -78,7 +78,7 @@ def check_classes(task: Task, frames: ScoredFrames) -> None:
         )
 
 
-def kitti_scores(model: Model, score: Scores | None, min_score: float) -> dict[str, float]:
+def kitti_scores(model: Model, score: ScoreThresholds | None, min_score: float) -> dict[str, float]:
     """For each class the score from which on detections count for precision and recall."""
     known = {name.lower(): name for name in CLASS_NAMES}
     scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
@@ -93,7 +93,7 @@ def kitti_scores(model: Model, score: Scores | None, min_score: float) -> dict[s
     return scores
 
 
-def model_scores(model: Model, score: Scores | None, min_score: float) -> dict[str, float]:
+def model_scores(model: Model, score: ScoreThresholds | None, min_score: float) -> dict[str, float]:
     """The same for each of the model's own classes.
 
     Raises:

@@ -15,7 +15,7 @@ from asca_deploy.bundle import MANIFEST, Quantization
 from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_checkpoint
 from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.cli.extras import require
+from asca_pillars.base.extras import require
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.ops.pillar.spec import PillarSpec

@@ -11,6 +11,7 @@ from asca_pillars.cli.options import (
     PoseOption,
     ReflectanceScaleOption,
     SensorHeightOption,
+    scan_settings,
 )
 from asca_pillars.data.importing.formats import FORMATS
 
@@ -60,8 +61,7 @@ def import_dataset(
     from rich.console import Console
 
     from asca_pillars.base.errors import ConfigError, printable
-    from asca_pillars.cli.extras import require
-    from asca_pillars.cli.scan_input import scan_settings
+    from asca_pillars.base.extras import require
     from asca_pillars.data.importing.imported import renamed, require_own_dataset, usable, write_imported
     from asca_pillars.scans.scan_settings import ScanSettings
 

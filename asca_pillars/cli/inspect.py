@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.cli.extras import require
+from asca_pillars.base.extras import require
 from asca_pillars.cli.options import JsonOption
 
 
@@ -59,10 +59,10 @@ def inspect(
     from asca_pillars.base.errors import ConfigError, DatasetError
     from asca_pillars.base.files import write_json
     from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.base.writable_file import require_writable
     from asca_pillars.cli import inspect_tables as show
     from asca_pillars.cli.inspect_pictures import draw_frames, require_replaceable_pictures
     from asca_pillars.cli.propose_config import propose_config
-    from asca_pillars.cli.writable_file import require_writable
     from asca_pillars.config.tree import load_config
     from asca_pillars.data.inspection.findings import findings
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
@@ -83,7 +83,7 @@ def inspect(
         if propose is not None:
             raise ConfigError(f"--propose {propose}: classes of model.kind pillar_refine are its first stage's")
         require("train")
-        from asca_pillars.models.two_stage.open_first_stage import with_first_stage
+        from asca_pillars.models.two_stage.first_stage import with_first_stage
 
         settings = dataclasses.replace(settings, model=with_first_stage(settings.model))
     if propose is not None:

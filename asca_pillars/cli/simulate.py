@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.cli.extras import require
+from asca_pillars.base.extras import require
 from asca_pillars.cli.options import ClusterOption
 
 FRAMES, LENGTH = 100, 100
@@ -108,9 +108,8 @@ def simulate(
         require("cluster")
     from rich.console import Console
 
+    from asca_deploy.open_model import RuntimeOptions, open_model
     from asca_pillars.base.errors import ConfigError
-    from asca_pillars.cli.models import open_model
-    from asca_pillars.cli.options import RuntimeOptions
     from asca_pillars.data.kitti import KittiSplit
     from asca_pillars.sim.simulation import load_simulation_config, require_own_frames
     from asca_pillars.sim.simulation import simulate as write_frames

@@ -4,9 +4,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from asca_deploy.open_model import RuntimeOptions, open_model
 from asca_pillars.base.own_files import ending_with, is_own_picture, json_object, require_no_link, require_own
-from asca_pillars.cli.models import open_model
-from asca_pillars.cli.options import RuntimeOptions
 from asca_pillars.sim.report.comparison import compare, measure
 from asca_pillars.sim.report.like_for_like import MIN_SCORE, compare_like_for_like
 from asca_pillars.sim.report.like_tables import print_like, write_like

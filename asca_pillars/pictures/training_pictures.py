@@ -8,8 +8,8 @@ from asca_pillars.base.files import portable_name
 from asca_pillars.data.frames import LabeledFrame, Motion, within_ranges
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.detection.anchors import IGNORED
-from asca_pillars.pictures.drawing import Image
-from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_layers, write_png
+from asca_pillars.pictures.drawing import BoxLayer, Image
+from asca_pillars.pictures.visualize import class_color, draw_layers, write_png
 
 _IGNORED_COLOR = (150, 150, 150)
 

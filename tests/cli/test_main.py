@@ -33,7 +33,7 @@ from importlib.machinery import PathFinder
 class BaseInstall(PathFinder):
     @classmethod
     def find_spec(cls, name, *rest):
-        heavy = {"torch", "lightning", "onnx", "onnxscript", "tensorboard", "numba", "sklearn", "scipy"}
+        heavy = {"torch", "lightning", "onnx", "onnxscript", "tensorboard", "sklearn", "scipy"}
         heavy |= {"matplotlib", "openvino", "rosbags", "mcap", "rerun"}
         if name.split(".")[0] in heavy:
             return None

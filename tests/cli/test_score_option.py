@@ -8,7 +8,8 @@ import pytest
 
 from asca_deploy import Detector, sample_scan_path
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.cli.options import read_scores, scores_by_class
+from asca_pillars.cli.options import read_scores
+from asca_pillars.evaluation.model import scores_by_class
 from asca_pillars.scans.scan_reader import read_scan
 from tests.in_process import run_here
 
