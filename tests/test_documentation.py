@@ -47,7 +47,7 @@ def test_every_block_runs(name: str, files: Path, tmp_path: Path, monkeypatch: p
     for folder in MADE_HERE.get(name, ()):
         shutil.rmtree(tmp_path / folder)
     monkeypatch.chdir(tmp_path)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)
     for block in runs(name):
         run(block, name)
 
