@@ -44,7 +44,7 @@ def inspect(
 ) -> None:
     """Look at a dataset before training: objects, points, sizes and positives per class, ranges, scans.
 
-    Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 2.
+    Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 4.
 
     Examples:
 

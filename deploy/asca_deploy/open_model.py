@@ -75,7 +75,7 @@ def open_model(
 
 
 def _open_bundle(options: RuntimeOptions, min_score: float, mounting: Mounting, *, around: bool) -> Model:
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are collected below
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are collected below
     detector = open_detector(options, min_score, mounting, around=around)
     bundle = detector.bundle
     unlike: list[str] = []

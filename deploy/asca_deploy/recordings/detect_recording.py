@@ -305,6 +305,7 @@ def _about(
         "recording": str(task.path),
         "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files],
         "topic": topic,
+        "made_by": detector.made_by,
         "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         "runs_on": detector.runs_on,
         **detector_scope(detector.spec, around=task.around).to_json(),
