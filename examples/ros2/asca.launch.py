@@ -1,4 +1,7 @@
-"""ros2 launch asca.launch.py topic:=/ouster/points arguments:="--around --track" """
+"""Launch the detector as a ROS 2 node.
+
+ros2 launch asca.launch.py topic:=/ouster/points arguments:="--around --track"
+"""
 
 import shlex
 from typing import Any
