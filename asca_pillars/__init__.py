@@ -16,8 +16,7 @@ from asca_pillars.base.telemetry import disable_telemetry
 if TYPE_CHECKING:
     from asca_deploy import Bundle, Detector, ScanDetections, ScanQueue, Tracker, Tracks, load_bundle
     from asca_pillars.base.errors import AscaError
-    from asca_pillars.detection.detections import Detection, Detections
-    from asca_pillars.detection.report import FrameReport
+    from asca_pillars.detection.detections import Detection, Detections, FrameReport
     from asca_pillars.scans.mounting import Mounting
     from asca_pillars.scans.scan_reader import Scan, read_scan
 
@@ -49,7 +48,7 @@ _HOMES = {
     "Detection": "asca_pillars.detection.detections",
     "Detections": "asca_pillars.detection.detections",
     "Detector": "asca_deploy",
-    "FrameReport": "asca_pillars.detection.report",
+    "FrameReport": "asca_pillars.detection.detections",
     "Mounting": "asca_pillars.scans.mounting",
     "Scan": "asca_pillars.scans.scan_reader",
     "ScanDetections": "asca_deploy",

@@ -21,7 +21,7 @@ from asca_pillars.data.frames import read_frame, within_ranges
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.targets import assign_targets
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.ops.pillar.map_pooling import map_cells
+from asca_pillars.ops.pillar.grid import map_cells
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables
 from asca_pillars.ops.pillar.spec import PillarSpec
 

@@ -36,8 +36,8 @@ from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.two_stage.first_stage import open_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector
-from asca_pillars.models.two_stage.open_first_stage import open_first_stage
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache
 from asca_pillars.models.two_stage.refined_detector import judge
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores

@@ -1,5 +1,6 @@
-"""How this package was installed, and the commands that add to it or replace it."""
+"""How this package was installed, what came along, and the commands that add to it or replace it."""
 
+import importlib.util
 import shlex
 from pathlib import Path
 
@@ -32,3 +33,10 @@ def upgrade_advice() -> str:
     """How to get a newer version."""
     root = source_tree()
     return "install a newer asca-pillars" if root is None else f"upgrade with `git -C {shlex.quote(str(root))} pull`"
+
+
+def shipped_bundles() -> dict[str, Path]:
+    """Folders of the bundles that come with the runtime, by name; the runtime is not imported."""
+    runtime = importlib.util.find_spec("asca_deploy")
+    places = [] if runtime is None else runtime.submodule_search_locations or []
+    return {path.parent.name: path.parent for place in places for path in Path(place).glob("bundles/*/bundle.json")}

@@ -112,17 +112,15 @@ def export(
         export_for_runtime(checkpoint, out, scans, of_a_checkpoint, golden=golden, browser=browser, ort_web=ort_web)
         return
     require("train")
-    from collections.abc import Callable
     from dataclasses import replace
-    from functools import partial
 
     import numpy as np
     from rich.console import Console
 
-    from asca_deploy.bundle import BUNDLE_FOLDER, Bundle
-    from asca_export.pillar.export import export_bundle, require_maskable
-    from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
-    from asca_export.two_stage.export import export_refine_bundle
+    from asca_deploy.bundle import BUNDLE_FOLDER
+    from asca_export.export import export_bundle
+    from asca_export.pillar.export import require_maskable
+    from asca_export.proven_bundle import ExportOptions
     from asca_pillars.base.errors import ConfigError
     from asca_pillars.base.own_files import require_not_input, require_replaceable
     from asca_pillars.cli.export_steps import (
@@ -151,16 +149,9 @@ def export(
     loaded = loaded.with_model(model)
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
-    kind = loaded.config.model.kind
     require_not_input(out, (getattr(model, "first_stage", None),))
     if dense_neck:
         require_maskable(loaded.config.model, int8=int8)
-    kinds: dict[str, Callable[..., Bundle]] = {
-        "pillar": partial(export_bundle, dense_neck=dense_neck),
-        "pillar_refine": export_refine_bundle,
-        "pv_rcnn": export_pv_rcnn_bundle,
-    }
-    export_kind = kinds[kind]
     if loaded.expected_input is None and scans is None:
         raise ConfigError(
             f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
@@ -174,16 +165,15 @@ def export(
     keeps = with_weights or source.path.parent.resolve() == out.resolve()
     weights = source.path if keeps else None
     with console.status("Exporting") as status:
-        bundle: Bundle = export_kind(
-            loaded,
-            out,
-            points,
+        options = ExportOptions(
             trained_on=trained_on or source.trained_on,
             command=source.command,
             calibration=calibration,
+            dense_neck=dense_neck,
             weights=weights,
             progress=status.update,
         )
+        bundle = export_bundle(loaded, out, points, options)
     parity = bundle.parity
     assert parity is not None, "export_bundle proves it"
     console.print(

@@ -83,7 +83,7 @@ def inspect(
         if propose is not None:
             raise ConfigError(f"--propose {propose}: classes of model.kind pillar_refine are its first stage's")
         require("train")
-        from asca_pillars.models.two_stage.open_first_stage import with_first_stage
+        from asca_pillars.models.two_stage.first_stage import with_first_stage
 
         settings = dataclasses.replace(settings, model=with_first_stage(settings.model))
     if propose is not None:

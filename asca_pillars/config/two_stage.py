@@ -66,7 +66,8 @@ class RefineModel(Strict):
 
     Attributes:
         kind: tells the families of detectors apart.
-        first_stage: a float32 bundle (folder, or name of one that ships) or a checkpoint of a pillar detector.
+        first_stage: a checkpoint of a pillar detector, or a float32 bundle that holds one: its folder, or the name of
+            one that ships.
         first_stage_identity: of its trained weights; `asca train` fills it in.
         bev_channels: of the first stage's map; `asca train` fills it in.
         spec: the first stage's, which `asca train` fills in; its score thresholds and suppression are those of the
@@ -75,7 +76,7 @@ class RefineModel(Strict):
     """
 
     kind: Literal["pillar_refine"] = "pillar_refine"
-    first_stage: str = "asca_small_sparse_sim"
+    first_stage: str = "asca_sim"
     first_stage_identity: str = ""
     bev_channels: int = 0
     spec: PillarSpec = field(default_factory=PillarSpec)

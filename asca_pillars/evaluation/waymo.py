@@ -41,8 +41,8 @@ from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares

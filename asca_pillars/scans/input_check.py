@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.detection.report import ScanCounts
+from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.mounting import Mounting

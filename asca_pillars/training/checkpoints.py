@@ -17,7 +17,7 @@ from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import require_content
 from asca_pillars.config.tree import ModelConfig
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import read_plain, unread
+from asca_pillars.models.checkpoint_file import read_plain, unread
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)

@@ -24,8 +24,8 @@ from asca_pillars.config.tree import Config, ModelConfig, TrainConfig
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.require_boxes import require_boxes
-from asca_pillars.models.checkpoint import save_weights
-from asca_pillars.models.two_stage.open_first_stage import with_first_stage
+from asca_pillars.models.checkpoint_file import save_weights
+from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (

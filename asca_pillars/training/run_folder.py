@@ -19,7 +19,7 @@ from asca_pillars.config.tree import Config, Precision, load_config
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.training_frames import TrainingFrames
-from asca_pillars.models.checkpoint import weights_sha256
+from asca_pillars.models.checkpoint_file import weights_sha256
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.measure_input import measure_expected_input
 from asca_pillars.training.run_files import (

@@ -205,8 +205,8 @@ class Provenance(Strict):
     """Python, torch, onnx and the like at export."""
     machine: str
     weights_sha256: str | None = None
-    """Of the trained arrays, the same for every export of a checkpoint, see `asca_pillars.models.checkpoint`; None in
-    bundles made before it was recorded."""
+    """Of the trained arrays, the same for every export of a checkpoint, see `asca_pillars.models.checkpoint_file`; None
+    in bundles made before it was recorded."""
     weights_file: Literal["weights.ckpt"] | None = None
     """Checkpoint beside the graphs that holds the trained arrays in 16 bits; None where it was not asked for."""
     weights_file_sha256: str | None = None

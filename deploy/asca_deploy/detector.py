@@ -25,7 +25,7 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.system import check_threads
 from asca_pillars.detection import decode
-from asca_pillars.detection.report import FrameReport, ScanCounts, summed
+from asca_pillars.detection.detections import FrameReport, ScanCounts, summed
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.input_check import InputWarning, check_input
 from asca_pillars.scans.mounting import Mounting

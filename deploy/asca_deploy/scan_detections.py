@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
-from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.report import FrameReport
+from asca_pillars.detection.detections import Detections, FrameReport
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 

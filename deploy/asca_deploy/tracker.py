@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from asca_deploy.tracks import Tracks
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.geometry.frame_change import FrameChange, is_rigid
 from asca_pillars.geometry.overlap import paired_bev_intersection
 

@@ -26,7 +26,7 @@ from asca_export.sparse_quantize import (
     scale_rows_to_steps,
 )
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.ops.pillar.map_pooling import pool_pillars
+from asca_pillars.ops.pillar.grid import pool_pillars
 from asca_pillars.ops.pillar.prepare import Pillars
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asca_deploy.scan_detections import ScanDetections
-from asca_pillars.detection.report import FrameReport, ScanCounts
+from asca_pillars.detection.detections import FrameReport, ScanCounts
 from asca_pillars.geometry.ranges import Ranges
 from tests.cameras import make_calibration
 from tests.sent import sent

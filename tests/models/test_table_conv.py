@@ -8,8 +8,7 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 from asca_pillars.models import table_conv as module
 from asca_pillars.models.table_conv import table_conv
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
-from asca_pillars.ops.sparse.convolution import Convolution, Shape, map_convolution
-from asca_pillars.ops.sparse.rulebook import CellMap
+from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
 
 CASES = (
     ((1, 8, 10), map_convolution(3, stride=2, padding=1)),

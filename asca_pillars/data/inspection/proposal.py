@@ -18,7 +18,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.ops.pillar.fitting import NECK_STRIDE
+from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import MAP_MULTIPLE
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments
+from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.geometry.overlap import iou_3d
 
 _Integers = NDArray[np.int64]

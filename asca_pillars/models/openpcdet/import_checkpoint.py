@@ -16,7 +16,7 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import unread
+from asca_pillars.models.checkpoint_file import unread
 from asca_pillars.models.openpcdet.links import Link, convert_state
 from asca_pillars.models.openpcdet.mmdetection3d_links import FIRST_LINEAR, FUSION, mmdetection3d_links
 from asca_pillars.models.openpcdet.pointpillars_links import pointpillars_links

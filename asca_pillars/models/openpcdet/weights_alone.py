@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from asca_pillars.models.checkpoint import read_plain
+from asca_pillars.models.checkpoint_file import read_plain
 
 
 class _Omitted:

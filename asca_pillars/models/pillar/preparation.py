@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_map_only
 from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.detection.targets import Assigner, Targets, assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch
-from asca_pillars.ops.pillar.map_pooling import MapCells, map_cells
+from asca_pillars.ops.pillar.grid import MapCells, map_cells
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables, stack_neck_tables
 from asca_pillars.ops.pillar.prepare import Pillars
 from asca_pillars.ops.pillar.spec import PillarSpec

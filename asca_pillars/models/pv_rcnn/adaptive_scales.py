@@ -8,7 +8,7 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.two_stage.point_mlp import mlp
 from asca_pillars.models.two_stage.set_abstraction import SetAbstraction, found_once
-from asca_pillars.ops.points.point_scales import PointScale
+from asca_pillars.ops.points.neighbors import PointScale
 
 _SHARE = 4  # by which the impact's hidden layer is narrower, which the paper does not give
 _INITIAL_STD = 1e-3  # of the impact's last weights: training starts at features that are hardly adjusted

@@ -10,12 +10,11 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from asca_pillars.models.pillar.loss import TargetBatch
-from asca_pillars.ops.points.ball_query import ball_query
-from asca_pillars.ops.points.point_scales import PointScale
+from asca_pillars.ops.points.neighbors import PointScale, ball_query
 from asca_pillars.ops.pv_rcnn.prepare import VoxelScan, VoxelSetSettings
 from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, stack_voxel_levels
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
-from asca_pillars.ops.sparse.batching import stack_cells, stack_rows
+from asca_pillars.ops.sparse.rulebooks import stack_cells, stack_rows
 
 Array = TypeVar("Array")
 

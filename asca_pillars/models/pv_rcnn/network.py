@@ -6,24 +6,25 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from asca_pillars.config.pillar import LossConfig
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.proposals import AnchorProposals, propose_anchors
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.pillar.loss import detection_loss
 from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, VoxelBatch
 from asca_pillars.models.pv_rcnn.layers import FirstStageOutputs, PvRcnn, build_pv_rcnn
 from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
+from asca_pillars.models.trainable import Trainable
 from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
 from asca_pillars.models.two_stage.pillar_refiner import Refinements, zero_of_weights
-from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals, propose_anchors
-from asca_pillars.ops.sparse.batching import stack_rows
+from asca_pillars.ops.sparse.rulebooks import stack_rows
 from asca_pillars.ops.two_stage.decode import reported_frames
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
-from asca_pillars.ops.two_stage.roi_targets import match_proposals, roi_targets, sample_rois
+from asca_pillars.ops.two_stage.rois import match_proposals, roi_targets, sample_rois
 
 _DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
 
@@ -39,13 +40,15 @@ class PvRcnnOutputs(NamedTuple):
     """Of each frame: in training those drawn, otherwise all."""
 
 
-class PvRcnnDetector(nn.Module):
+class PvRcnnDetector(Trainable):
     """PV-RCNN with its proposals, targets and loss.
 
     Args:
         model: its section of the configuration.
         network: made for it.
     """
+
+    preparation: VoxelPreparation
 
     def __init__(self, model: PvRcnnModel, network: PvRcnn) -> None:
         super().__init__()

@@ -14,7 +14,7 @@ from asca_pillars.models.pillar.preparation import batch_targets
 from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, batch_scans
 from asca_pillars.ops.pv_rcnn.prepare import VoxelScan, VoxelSetSettings, voxel_scan
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
-from asca_pillars.ops.two_stage.roi_targets import keypoint_states
+from asca_pillars.ops.two_stage.rois import keypoint_states
 
 
 class TargetedVoxels(NamedTuple):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from asca_pillars.models.map_layers import NORM_EPS, NORM_MOMENTUM
 from asca_pillars.models.table_conv import table_conv
 from asca_pillars.ops.pv_rcnn.rulebooks import SUBMANIFOLD, VoxelLevel
-from asca_pillars.ops.sparse.convolution import Convolution
+from asca_pillars.ops.sparse.rulebooks import Convolution
 
 _CONVS = 2  # submanifold convolutions of each level but the last
 

@@ -5,12 +5,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.two_stage import RefineConfig, RefineModel
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.models.trainable import Trainable
 from asca_pillars.models.two_stage.keypoint_encoder import BallSource, KeypointEncoder
 from asca_pillars.models.two_stage.loss import RefineTargets, refine_loss
 from asca_pillars.models.two_stage.pillar_refiner import PillarRefiner, RefineInputs, Refinements, zero_of_weights
@@ -31,7 +32,7 @@ class RefineOutputs(NamedTuple):
     """Of each frame, which `found` is about."""
 
 
-class RefineDetector(nn.Module):
+class RefineDetector(Trainable):
     """A second stage on the proposals of the first stage that `model` names.
 
     Args:
@@ -45,7 +46,7 @@ class RefineDetector(nn.Module):
         self.refiner = refiner
 
     @cached_property
-    def preparation(self) -> RefinePreparation:
+    def preparation(self) -> RefinePreparation:  # type: ignore[override]  # made when it is first asked for
         """Runs the first stage on each frame; training reads cached proposals instead (`models.build`).
 
         Raises:
@@ -98,7 +99,7 @@ def build_refine_detector(model: RefineModel) -> RefineDetector:
     if not model.bev_channels:
         raise ConfigError(
             f"model.bev_channels = 0: not yet read from {model.first_stage}; `asca train` does, "
-            "`models.two_stage.open_first_stage.with_first_stage` elsewhere"
+            "`models.two_stage.first_stage.with_first_stage` elsewhere"
         )
     return RefineDetector(model, build_refiner(model.bev_channels, len(model.spec.classes), model.refine))
 

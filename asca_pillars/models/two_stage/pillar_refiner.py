@@ -34,7 +34,7 @@ class Refinements(NamedTuple):
     confidence: Tensor
     """(R,) logits."""
     residuals: Tensor
-    """(R, 7), see `ops.two_stage.box_residuals`."""
+    """(R, 7), see `ops.two_stage.rois`."""
     keypoint_logits: Tensor
     """(K,) of a keypoint's being part of an object."""
 

@@ -18,13 +18,13 @@ from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.data.insertion.prepared import prepared_folder
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.detections import Detections
+from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.models.two_stage.loss import RefineTargets
-from asca_pillars.models.two_stage.open_first_stage import open_first_stage, with_first_stage
 from asca_pillars.models.two_stage.pillar_refiner import RefineInputs
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache, ProposalFiles
 from asca_pillars.models.two_stage.samples import RefineSample, collate_samples, sample_of
 from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
-from asca_pillars.ops.two_stage.roi_targets import match_proposals, sample_rois
+from asca_pillars.ops.two_stage.rois import match_proposals, sample_rois
 
 
 class PreparedRefinement(NamedTuple):

@@ -14,7 +14,7 @@ from asca_pillars.models.two_stage.loss import RefineTargets
 from asca_pillars.models.two_stage.pillar_refiner import RefineInputs
 from asca_pillars.ops.two_stage.first_stage import Proposed
 from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan
-from asca_pillars.ops.two_stage.roi_targets import (
+from asca_pillars.ops.two_stage.rois import (
     Overlaps,
     RoiTargets,
     keypoint_states,

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.two_stage.point_mlp import NORM_EPS, NORM_MOMENTUM, mlp
-from asca_pillars.ops.points.cube_neighbors import cube_cells_m
+from asca_pillars.ops.points.neighbors import cube_cells_m
 
 _NEAREST = 3
 _LEAST_DISTANCE_M = 1e-8  # of a point that stands where a cell's center is

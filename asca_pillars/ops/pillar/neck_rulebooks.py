@@ -18,9 +18,7 @@ from typing import Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.ops.sparse.batching import stack_cells, stack_rows
-from asca_pillars.ops.sparse.convolution import map_convolution
-from asca_pillars.ops.sparse.rulebook import CellMap, join
+from asca_pillars.ops.sparse.rulebooks import CellMap, join, map_convolution, stack_cells, stack_rows
 
 MaskRule = Literal["sub", "fine"]
 

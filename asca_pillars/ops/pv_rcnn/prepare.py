@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
-from asca_pillars.detection.report import ScanCounts
-from asca_pillars.ops.points.ball_query import ball_query, three_nearest
-from asca_pillars.ops.points.bilinear import bilinear_cells
-from asca_pillars.ops.points.farthest_points import farthest_points
-from asca_pillars.ops.points.point_scales import PointScale, point_scales
-from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals
+from asca_pillars.detection.detections import ScanCounts
+from asca_pillars.detection.proposals import AnchorProposals
+from asca_pillars.ops.points.neighbors import PointScale, ball_query, point_scales, three_nearest
+from asca_pillars.ops.points.sampling import bilinear_cells, farthest_points
 from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, VoxelTableBuilder
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import voxelize

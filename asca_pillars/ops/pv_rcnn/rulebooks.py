@@ -7,9 +7,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.ops.sparse.batching import stack_rows
-from asca_pillars.ops.sparse.convolution import Convolution, Shape
-from asca_pillars.ops.sparse.rulebook import CellMap, join
+from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, join, stack_rows
 
 SUBMANIFOLD = Convolution((3, 3, 3), (1, 1, 1), (1, 1, 1))
 PV_RCNN_STRIDED = (

@@ -12,7 +12,7 @@ from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, VoxelTableBuilder
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
-from asca_pillars.ops.sparse.convolution import Convolution, Shape
+from asca_pillars.ops.sparse.rulebooks import Convolution, Shape
 
 MAP_MULTIPLE = 2
 """The blocks of the neck that halve the map do so once."""

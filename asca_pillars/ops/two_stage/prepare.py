@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
 from asca_pillars.detection.detections import Detections
-from asca_pillars.ops.points.ball_query import ball_query
-from asca_pillars.ops.points.cube_neighbors import nearest_in_cubes
-from asca_pillars.ops.points.farthest_points import points_near_boxes
+from asca_pillars.ops.points.neighbors import ball_query, nearest_in_cubes
+from asca_pillars.ops.points.sampling import points_near_boxes
 from asca_pillars.ops.two_stage.first_stage import Proposed
-from asca_pillars.ops.two_stage.roi_grid import roi_grid_points
+from asca_pillars.ops.two_stage.rois import roi_grid_points
 
 ROI_FEATURES = 4
 """Columns of `roi_features` beside one for each class."""

@@ -12,7 +12,7 @@ from asca_deploy.benchmark.resident_memory import peak_memory_mib
 from asca_deploy.benchmark.timing import Percentiles, Track, pillars_of, run_frame, silently
 from asca_deploy.detector import Detector
 from asca_pillars.base.system import cpu_model, package_versions
-from asca_pillars.detection.report import FrameReport
+from asca_pillars.detection.detections import FrameReport
 
 
 @dataclass(frozen=True)

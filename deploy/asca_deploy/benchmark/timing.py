@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
-from asca_pillars.detection.report import FrameReport
+from asca_pillars.detection.detections import FrameReport
 from asca_pillars.ops.pillar.prepare import PillarCounts
 
 Track: TypeAlias = Callable[[int, str], Iterable[int]]

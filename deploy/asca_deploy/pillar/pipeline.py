@@ -17,8 +17,7 @@ from asca_deploy.pipeline import Laps, Pipeline
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps, decode
 from asca_pillars.detection.detections import Detections
-from asca_pillars.ops.pillar.grid import PillarGrid
-from asca_pillars.ops.pillar.map_pooling import pool_pillars
+from asca_pillars.ops.pillar.grid import PillarGrid, pool_pillars
 from asca_pillars.ops.pillar.neck_rulebooks import NeckTableBuilder, NeckTables, table_inputs
 from asca_pillars.ops.pillar.prepare import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.ops.pillar.spec import PillarSpec

@@ -32,15 +32,14 @@ from asca_deploy.pv_rcnn.graphs import (
 from asca_deploy.two_stage.pipeline import OUTPUTS
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.report import ScanCounts
-from asca_pillars.ops.points import ball_query, columns
-from asca_pillars.ops.points.bilinear import read_map
+from asca_pillars.detection.detections import Detections, ScanCounts
+from asca_pillars.detection.proposals import propose_anchors
+from asca_pillars.ops.points import neighbors, sampling
+from asca_pillars.ops.points.sampling import read_map
 from asca_pillars.ops.pv_rcnn import voxels
 from asca_pillars.ops.pv_rcnn.prepare import VoxelizedScan, VoxelScan, voxel_levels, with_neighbors
-from asca_pillars.ops.pv_rcnn.proposals import propose_anchors
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
-from asca_pillars.ops.sparse import rulebook as cell_map
+from asca_pillars.ops.sparse import rulebooks
 from asca_pillars.ops.two_stage.decode import reported_detections
 from asca_pillars.ops.two_stage.prepare import GridNeighbors, grid_neighbors
 
@@ -99,7 +98,7 @@ class PvRcnnPipeline:
         precision: providers.Precision = "float32",
         threads: int = 1,
     ) -> None:
-        for kernels in (ball_query.KERNELS, columns.KERNELS, cell_map.KERNELS, voxels.KERNELS):
+        for kernels in (neighbors.KERNELS, sampling.KERNELS, rulebooks.KERNELS, voxels.KERNELS):
             load_kernels(kernels)  # here rather than in the first scan
         self.spec: VoxelSpec = bundle.spec
         self.settings, self.scores = bundle.pv_rcnn.settings, bundle.pv_rcnn.scores

@@ -18,7 +18,7 @@ from asca_pillars.models.pv_rcnn.deformation import Surroundings
 from asca_pillars.models.pv_rcnn.layers import PvRcnn
 from asca_pillars.models.two_stage.keypoint_encoder import SourceRows
 from asca_pillars.models.two_stage.roi_head import RoiHead
-from asca_pillars.ops.points.point_scales import PointScale
+from asca_pillars.ops.points.neighbors import PointScale
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, VoxelSetSettings
 
 

@@ -12,11 +12,11 @@ from asca_deploy.pv_rcnn.graphs import OUT, balls_around
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.parity import require_close, require_compared, require_same_refined
 from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.proposals import propose_anchors
 from asca_pillars.models.pv_rcnn.batch import VoxelBatch, batch_scans
 from asca_pillars.models.pv_rcnn.layers import PvRcnn
-from asca_pillars.ops.points.bilinear import read_map
+from asca_pillars.ops.points.sampling import read_map
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, voxel_scan
-from asca_pillars.ops.pv_rcnn.proposals import propose_anchors
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
 
 RELATIVE_TOLERANCE = 1e-4  # of what a graph gives, to its largest value where that is above 1

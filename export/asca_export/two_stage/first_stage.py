@@ -1,4 +1,4 @@
-"""A bundle as the first stage of two."""
+"""The first stage as an export copies it: the graphs of a bundle, or a checkpoint in PyTorch."""
 
 import tempfile
 from functools import partial
@@ -15,8 +15,10 @@ from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
 from asca_deploy.shipped import find_bundle
 from asca_export.two_stage.neck_output import add_neck_output
 from asca_pillars.base.errors import ExportError
+from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.ops.two_stage.first_stage import FirstPass, require_pillar_kind
+from asca_pillars.models.two_stage.first_stage import open_first_stage
+from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStage, require_pillar_kind
 
 
 class BundleFirstStage:
@@ -66,3 +68,17 @@ class BundleFirstStage:
         """See `FirstStage`."""
         pillars = self._pipeline.pillarize(points)
         return self._backbone.infer_with_neck(self._backbone.place(self._pipeline.encode(pillars), pillars.cells))
+
+
+def is_checkpoint(source: str) -> bool:
+    """Whether the first stage of that name is a checkpoint, and no bundle."""
+    return Path(source).suffix == Path(WEIGHTS_FILE).suffix or Path(source).is_file()
+
+
+def open_exported(source: str) -> FirstStage:
+    """The first stage that a second one was trained on, of a bundle its graphs, which need no weights beside them.
+
+    Raises:
+        AscaError: it is missing, damaged, of another family or not in float32.
+    """
+    return open_first_stage(source) if is_checkpoint(source) else BundleFirstStage(source)

@@ -10,8 +10,10 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
-from asca_export.pillar.export import export_bundle
+from asca_export.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
 from asca_export.pillar.masked_forms import NEVER, MarkedEncoder, MaskedBackbone
+from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage.first_stage import BundleFirstStage
 from asca_pillars.base.errors import ExportError
 from asca_pillars.detection.decode import HeadMaps
@@ -33,8 +35,8 @@ LEFT = [points[points[:, 1] > 4] for points in SCANS]
 def bundles(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The same weights with tables and with masks."""
     folder, checkpoint = tmp_path_factory.mktemp("bundles"), sparse_checkpoint(request.param)
-    export_bundle(checkpoint, folder / "sparse", SCANS)
-    export_bundle(checkpoint, folder / "dense", SCANS, dense_neck=True)
+    export_pillar_bundle(checkpoint, folder / "sparse", SCANS)
+    export_pillar_bundle(checkpoint, folder / "dense", SCANS, ExportOptions(dense_neck=True))
     return folder / "sparse", folder / "dense"
 
 
@@ -117,12 +119,17 @@ def test_openvino_runs_it(bundles: tuple[Path, Path]) -> None:
 def test_a_graph_with_scores_elsewhere_is_no_proof(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("asca_export.parity.NEVER", -9.0)
     with pytest.raises(ExportError, match="head `scores` of inactive cells"):
-        export_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", LEFT, dense_neck=True)
+        export_pillar_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", LEFT, ExportOptions(dense_neck=True))
     assert not (tmp_path / "bundle").exists()
 
 
 def test_what_has_no_such_form_is_refused_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="--dense-neck: the neck of this model is dense"):
-        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, dense_neck=True)
+        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, ExportOptions(dense_neck=True))
     with pytest.raises(ExportError, match="--dense-neck with --int8"):
-        export_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", SCANS, dense_neck=True, calibration=CALIBRATION)
+        export_bundle(
+            sparse_checkpoint("sub"),
+            tmp_path / "bundle",
+            SCANS,
+            ExportOptions(dense_neck=True, calibration=CALIBRATION),
+        )

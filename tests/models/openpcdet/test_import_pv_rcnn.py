@@ -22,7 +22,7 @@ from asca_pillars.ops.two_stage.prepare import grid_neighbors
 from tests.models.openpcdet.foreign_networks import PvRcnn, pooled, random_weights, write_foreign
 from tests.models.pv_rcnn import tiny_pv_rcnn
 from tests.models.pv_rcnn.tiny_pv_rcnn import NETWORK, SETTINGS, batch, frame
-from tests.ops.sparse.test_rulebook import at_cells, dense
+from tests.ops.sparse.test_rulebooks import at_cells, dense
 
 SPEC = dataclasses.replace(  # with the strides of the published model, which has no other kernels
     tiny_pv_rcnn.SPEC, grid=VoxelGrid((4.8, 24.0), (-6.4, 6.4), (-3.0, 1.0), (0.2, 0.2, 0.1)), last_stride=2

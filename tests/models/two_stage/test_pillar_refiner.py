@@ -15,7 +15,7 @@ from asca_pillars.models.two_stage.refined_detector import refine
 from asca_pillars.models.two_stage.roi_head import RoiHead
 from asca_pillars.models.two_stage.samples import RefineBatch, collate_samples, collate_scans
 from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
-from asca_pillars.ops.points.farthest_points import farthest_points
+from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.two_stage.first_stage import Proposed
 from asca_pillars.ops.two_stage.prepare import RefineSettings, refine_scan
 from tests.models.two_stage.drawn_samples import prepare_sample

@@ -1,15 +1,85 @@
-"""What the second stage should say of proposals, and which of them it learns from (PV-RCNN, section 3.4)."""
+"""Proposals as regions of interest (RoI): grids in their frames, residuals, and the targets of training."""
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.boxes import decode_boxes, direction_bins, encode_boxes, points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.ops.two_stage.box_residuals import encode_refinement
+
+
+def to_box_frames(points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Points of each box, LiDAR frame -> the box's own: (R, P, 3), (R, 7) -> (R, P, 3)."""
+    return _turned(points - boxes[:, None, :3], -boxes[:, 6])
+
+
+def from_box_frames(points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Inverse of `to_box_frames`: (R, P, 3), (R, 7) -> (R, P, 3), metres, LiDAR frame."""
+    return _turned(points, boxes[:, 6]) + boxes[:, None, :3]
+
+
+def boxes_in_frames(boxes: NDArray[np.floating[Any]], frames: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """boxes[k] as seen from the box frames[k]: (R, 7), (R, 7) -> (R, 7), metres, yaw in radians, [-pi, pi)."""
+    position = to_box_frames(boxes[:, None, :3], frames)[:, 0]
+    return np.concatenate([position, boxes[:, 3:6], wrap_angle(boxes[:, 6:] - frames[:, 6:])], axis=1)
+
+
+def boxes_from_frames(boxes: NDArray[np.floating[Any]], frames: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Inverse of `boxes_in_frames`: (R, 7), (R, 7) -> (R, 7), metres and radians, yaw in [-pi, pi)."""
+    position = from_box_frames(boxes[:, None, :3], frames)[:, 0]
+    return np.concatenate([position, boxes[:, 3:6], wrap_angle(boxes[:, 6:] + frames[:, 6:])], axis=1)
+
+
+def roi_grid_points(boxes: NDArray[np.floating[Any]], size: int) -> NDArray[np.floating[Any]]:
+    """Centers of size^3 cells of each box, LiDAR frame: (R, 7) -> (R, size^3, 3); z varies fastest, x slowest.
+
+    What RoI-grid pooling looks around (PV-RCNN, section 3.3).
+    """
+    share = (np.indices((size, size, size)).reshape(3, -1).T + 0.5) / size - 0.5
+    return from_box_frames(share.astype(boxes.dtype)[None] * boxes[:, None, 3:6], boxes)
+
+
+def _turned(points: NDArray[np.floating[Any]], yaw_rad: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """(R, P, 3) turned about z by (R,)."""
+    cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+
+
+def encode_refinement(boxes: NDArray[np.floating[Any]], proposals: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Residuals of boxes[k] against proposals[k], metres and radians: (R, 7), (R, 7) -> (R, 7) float32.
+
+    As an anchor's (`encode_boxes`), the proposal moved to the origin being the anchor; the heading difference lies in
+    [-pi/2, pi/2), because refinement leaves it to the proposal which end is the front.
+    """
+    frames = proposals.astype(np.float64)
+    seen = boxes_in_frames(boxes.astype(np.float64), frames)
+    seen[:, 6] = wrap_angle(seen[:, 6], math.pi)
+    return encode_boxes(seen, _at_origin(frames))[0]
+
+
+def decode_refinement(
+    residuals: NDArray[np.floating[Any]], proposals: NDArray[np.floating[Any]]
+) -> NDArray[np.float32]:
+    """Inverse of `encode_refinement`, up to half a turn: (R, 7), (R, 7) -> boxes (R, 7) float32.
+
+    Boxes in metres and radians, in the frame of the proposals. Size ratios are held within 1/100 and 100.
+    """
+    frames = proposals.astype(np.float64)
+    seen = decode_boxes(residuals, direction_bins(residuals[:, 6].astype(np.float64)), _at_origin(frames))
+    return boxes_from_frames(seen.astype(np.float64), frames).astype(np.float32)
+
+
+def _at_origin(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    moved = boxes.copy()
+    moved[:, [0, 1, 2, 6]] = 0
+    return moved
+
 
 FOREGROUND_IOU = 0.55
 """From this overlap in 3D on a proposal is drawn as foreground, and above it learns its residuals."""

@@ -1,7 +1,6 @@
 """Active cells and tables against dense convolution, and the compiled loops against NumPy's."""
 
 import itertools
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,8 +11,8 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
-from asca_pillars.ops.sparse.convolution import Convolution, Shape, map_convolution
-from asca_pillars.ops.sparse.rulebook import CellMap
+from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
+from tests.ops.numpy_kernels import NumpyCellMap
 
 CONVOLUTIONS = (
     *PV_RCNN_STRIDED,
@@ -28,12 +27,6 @@ CONVOLUTIONS = (
 SHAPES = ((5, 8, 6), (1, 9, 4), (3, 3, 3), (63, 4, 3))
 
 seeds, shares = st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.3, 1.0])
-
-
-def numpy_map(shape: Shape) -> CellMap:
-    """As where numba is not installed."""
-    with patch("asca_pillars.ops.sparse.rulebook.load_kernels", lambda _: None):
-        return CellMap(shape)
 
 
 def random_cells(shape: Shape, share: float, seed: int) -> np.ndarray:
@@ -98,7 +91,7 @@ def test_numpy_finds_the_same_bits(seed: int, share: float, earlier: float, shap
     output_shape = conv.output_shape(shape)
     if min(output_shape) < 1:
         return
-    maps = [(form(shape), form(output_shape)) for form in (CellMap, numpy_map)]
+    maps = [(form(shape), form(output_shape)) for form in (CellMap, NumpyCellMap)]
     for scan, part in enumerate((earlier, share)):  # the second must not find anything of the first
         results = []
         for source, target in maps:
@@ -119,7 +112,7 @@ def test_numpy_finds_the_same_bits(seed: int, share: float, earlier: float, shap
 def test_places_of_an_upsampling(seed: int, share: float, halvings: int) -> None:
     stride, (ny, nx) = 1 << halvings, (8, 12)
     fine, coarse = (1, ny, nx), (1, ny // stride, nx // stride)
-    for form in (CellMap, numpy_map):
+    for form in (CellMap, NumpyCellMap):
         children, parents = form(fine), form(coarse)
         children.activate(random_cells(fine, 0.6, seed))
         parents.activate(random_cells(coarse, share, seed + 1))

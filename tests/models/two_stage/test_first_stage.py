@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,15 @@ import torch
 
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle
-from asca_export.pillar.export import export_bundle
-from asca_export.two_stage.first_stage import BundleFirstStage
-from asca_pillars.base.errors import ConfigError, ExportError
+from asca_deploy.shipped import shipped_bundles
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import ExportOptions
+from asca_export.two_stage.first_stage import BundleFirstStage, open_exported
+from asca_pillars.base.errors import BundleError, ConfigError, ExportError
+from asca_pillars.detection.proposals import ProposalSettings
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.models.two_stage.open_first_stage import open_first_stage, with_first_stage
+from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
-from asca_pillars.ops.two_stage.proposals import ProposalSettings
 from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
 from tests.models.two_stage.tiny_refine import tiny_refine_model
 from tests.saved_checkpoint import save_checkpoint
@@ -34,8 +37,8 @@ POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pool
 def test_checkpoint_and_bundle_say_the_same(tmp_path: Path, network: dict[str, Any], spec: Any) -> None:
     checkpoint = tiny_checkpoint("channel", spec, **network)
     save_checkpoint(tmp_path / "first.ckpt", checkpoint)
-    export_bundle(checkpoint, tmp_path / "bundle", SCANS)
-    in_torch, in_onnx = (open_first_stage(str(tmp_path / source)) for source in ("first.ckpt", "bundle"))
+    export_pillar_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    in_torch, in_onnx = open_first_stage(str(tmp_path / "first.ckpt")), BundleFirstStage(tmp_path / "bundle")
     assert in_torch.spec == in_onnx.spec == spec
     assert in_torch.identity == in_onnx.identity
     for points in (SCANS[0], np.empty((0, 4), np.float32)):
@@ -51,19 +54,21 @@ def test_checkpoint_and_bundle_say_the_same(tmp_path: Path, network: dict[str, A
 
 
 def test_the_same_weights_are_taken_from_any_file_and_others_are_refused(tmp_path: Path) -> None:
-    """A checkpoint, its copy, two exports of it; a bundle that does not record its weights goes by its graphs."""
+    """A checkpoint, its copy, two exports of it, whose own weights are rounded."""
     first, copy, other = (tmp_path / name for name in ("first.ckpt", "copy.ckpt", "other.ckpt"))
     checkpoint = tiny_checkpoint("channel")
     save_checkpoint(first, checkpoint)
     save_checkpoint(copy, checkpoint._replace(config=dataclasses.replace(checkpoint.config, name="copy")))
     bundles = [tmp_path / name for name in ("bundle", "again")]
     for folder, calibration in zip(bundles, (None, CALIBRATION), strict=True):
-        export_bundle(checkpoint, folder, SCANS, calibration=calibration)
+        export_pillar_bundle(checkpoint, folder, SCANS, ExportOptions(calibration=calibration, weights=first))
     one, eight_bit = (load_pillar_bundle(folder) for folder in bundles)
     assert one.provenance.weights_sha256 == eight_bit.provenance.weights_sha256 and one.graphs != eight_bit.graphs
     model = with_first_stage(tiny_refine_model(first))
     assert model.first_stage_identity == one.provenance.weights_sha256
-    export_bundle(checkpoint, bundles[1], SCANS, trained_on="the same, exported again")
+    export_pillar_bundle(
+        checkpoint, bundles[1], SCANS, ExportOptions(trained_on="the same, exported again", weights=first)
+    )
     for source in (copy, *bundles):
         moved = dataclasses.replace(model, first_stage=str(source))
         assert with_first_stage(moved) == moved
@@ -101,8 +106,35 @@ def test_rows_of_active_cells_are_a_map_with_zeros_beside_them(tmp_path: Path) -
 
 
 def test_a_second_stage_is_not_trained_on_eight_bits() -> None:
-    with pytest.raises(ExportError, match="asca_small_sim_int8: a bundle in int8; give one in float32"):
+    with pytest.raises(ConfigError, match="asca_small_sim_int8: a bundle in int8; give one in float32"):
         open_first_stage("asca_small_sim_int8")
+    with pytest.raises(ExportError, match="asca_small_sim_int8: a bundle in int8; give one in float32"):
+        open_exported("asca_small_sim_int8")
+
+
+def test_the_first_stage_of_the_bundle_that_ships_is_known_by_its_unrounded_weights() -> None:
+    folder = shipped_bundles()["asca_sim"]
+    stage = open_first_stage("asca_sim")
+    bundle = load_pillar_bundle(folder)
+    assert stage.identity == bundle.provenance.weights_sha256 and stage.spec == bundle.spec
+    maps, exported = (each(SCANS[0]).maps for each in (stage, BundleFirstStage(folder)))
+    np.testing.assert_allclose(maps.scores, exported.scores, atol=0.1)  # weights in 16 bits
+
+
+def test_bundles_whose_weights_cannot_be_taken(tmp_path: Path) -> None:
+    checkpoint = tiny_checkpoint("channel")
+    save_checkpoint(tmp_path / "first.ckpt", checkpoint)
+    with pytest.raises(BundleError, match=r"no such bundle or checkpoint; set model\.first_stage"):
+        open_first_stage("asca_smal")
+    with pytest.raises(BundleError, match=r"asca_small_sim: holds no weights\.ckpt, .* --with-weights"):
+        open_first_stage("asca_small_sim")
+    export_pillar_bundle(checkpoint, tmp_path / "bundle", SCANS, ExportOptions(weights=tmp_path / "first.ckpt"))
+    shutil.copyfile(tmp_path / "first.ckpt", tmp_path / "bundle" / "weights.ckpt")
+    with pytest.raises(BundleError, match=r"weights\.ckpt: is damaged, or of another bundle"):
+        open_first_stage(str(tmp_path / "bundle"))
+    (tmp_path / "bundle" / MANIFEST).write_text('{"kind": "pillar"}')
+    with pytest.raises(BundleError, match=r"bundle\.json: cannot be read, or is damaged"):
+        open_first_stage(str(tmp_path / "bundle"))
 
 
 def test_two_stages_are_no_first_stage() -> None:

@@ -5,9 +5,9 @@ import pytest
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.decode import HeadMaps, sigmoid
+from asca_pillars.detection.proposals import AnchorProposals, propose_anchors
 from asca_pillars.geometry.boxes import encode_boxes
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals, propose_anchors
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
 
