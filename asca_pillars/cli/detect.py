@@ -21,6 +21,8 @@ from asca_pillars.cli.options import (
     ScoreOption,
     SensorHeightOption,
     ThreadsOption,
+    VideoOption,
+    VideoViewOption,
     read_scores,
 )
 
@@ -64,6 +66,8 @@ def detect(
         Path | None,
         typer.Option("--rerun", help="Of a recording: also write scans and boxes as an .rrd for the rerun viewer."),
     ] = None,
+    video: VideoOption = None,
+    video_view: VideoViewOption = "above",
     calib: Annotated[
         Path | None,
         typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
@@ -74,7 +78,8 @@ def detect(
 
     OUT/NAME.json holds the boxes of one scan in the scan's own frame, OUT/detections.jsonl those of the whole run, one
     line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image. Labels beside
-    the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white.
+    the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white. OUT/index.html shows all pictures,
+    sorted by scores and misses.
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
 
@@ -93,6 +98,8 @@ def detect(
 
     asca detect drive.mcap --track --foxglove boxes.mcap
 
+    asca detect drive.mcap --track --video drive.mp4 --video-view chase
+
     asca detect /mnt/archive --out /mnt/boxes --cluster local
     """
     import logging
@@ -103,6 +110,7 @@ def detect(
     from asca_deploy.auto import summary
     from asca_pillars.cli.detect_files import ResultWriter
     from asca_pillars.cli.detect_scans import detect_scans
+    from asca_pillars.cli.detect_video import video_options
     from asca_pillars.cli.models import open_detector
     from asca_pillars.cli.scan_input import ScanInput, scan_settings
     from asca_pillars.data.boxes.detector_scope import detector_scope
@@ -116,6 +124,7 @@ def detect(
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
+    view = video_options(video, video_view, [*(scans or ()), *([] if calib is None else [calib])])
     recordings = [path for path in scans or () if is_recording(path)]
     if recordings:
         if cluster is not None or len(scans or ()) > 1:
@@ -137,6 +146,8 @@ def detect(
             calib=calib,
             foxglove=foxglove,
             rerun=rerun,
+            video=video,
+            video_view=view,
         )
         detect_recording(task, reading, options, console)
         return
@@ -148,6 +159,8 @@ def detect(
     if cluster is not None:
         from asca_pillars.cli.detect_archive import detect_archive
 
+        if video is not None:
+            raise ConfigError(f"--video {video}: is not made with --cluster; leave one of them out")
         if pictures:
             raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
         paths = [path for path, _ in named]
@@ -157,5 +170,6 @@ def detect(
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     scope = detector_scope(detector.spec, around=around)
-    writer = ResultWriter(out, [name for _, name in named], pictures=pictures is not False, scope=scope)
+    names = [name for _, name in named]
+    writer = ResultWriter(out, names, pictures=pictures is not False, scope=scope, video=video, video_view=view)
     detect_scans(named, scan_input, detector, writer, console)

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import track
 
 from asca_deploy import Detector, find_bundle
+from asca_deploy.around import ranges_around
 from asca_deploy.manifest import load_bundle
 from asca_deploy.tracker import Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
@@ -24,6 +25,7 @@ from asca_pillars.base.files import atomic_path
 from asca_pillars.base.schema import to_dict
 from asca_pillars.cli import detect_tables as show
 from asca_pillars.cli.detect_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
+from asca_pillars.cli.detect_video import RecordingVideo, recording_rate_hz
 from asca_pillars.cli.extras import require
 from asca_pillars.cli.foxglove_file import FoxgloveFile, is_own_mcap
 from asca_pillars.cli.models import open_detector
@@ -43,6 +45,7 @@ from asca_pillars.cli.scan_input import said_of_scale
 from asca_pillars.cli.writable_file import require_suffix, require_writable
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
+from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.odometry import Poses, read_poses
@@ -68,6 +71,8 @@ class RecordingTask:
     calib: Path | None
     foxglove: Path | None
     rerun: Path | None
+    video: Path | None = None
+    video_view: VideoView = "above"
 
 
 def detect_recording(task: RecordingTask, reading: ScanSettings, options: RuntimeOptions, console: Console) -> None:
@@ -128,7 +133,8 @@ def detect_recording(task: RecordingTask, reading: ScanSettings, options: Runtim
             _check_times(times_ns, task, topic.name, poses, console)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
         scope = detector_scope(detector.spec, around=task.around)
-        written, classes = _write(task, results, scans, calibration, scope, about)
+        video = _video(task, detector, scans, times_ns, poses)
+        written, classes = _write(task, results, scans, calibration, scope, about, video)
         journal.remove()
     boxes = ", ".join(f"{classes[name]} {name}" for name in detector.spec.class_names)
     console.print(f"{written} scans, in all {boxes}", highlight=False)
@@ -247,6 +253,24 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
     return np.asarray(poses.at(time_ns) @ level)
 
 
+def _video(
+    task: RecordingTask, detector: Detector, scans: RecordedScans, times_ns: Sequence[int], poses: Poses | None
+) -> Callable[[Path], RecordingVideo] | None:
+    """A function that opens the video, or None where there is none."""
+    if task.video is None:
+        return None
+    mounting = detector.mounting
+    return partial(
+        RecordingVideo,
+        rate_hz=recording_rate_hz(times_ns),
+        view=task.video_view,
+        ranges=ranges_around(detector.spec.ranges, detector.passes),
+        level=None if mounting.level.is_identity else mounting.level,
+        scans=scans.read(),
+        pose_at=None if poses is None else partial(_pose_of_scan, poses, mounting),
+    )
+
+
 def _write(
     task: RecordingTask,
     results: Iterator[Found],
@@ -254,6 +278,7 @@ def _write(
     calibration: Any,
     scope: DetectorScope,
     about: dict[str, Any],
+    video: Callable[[Path], RecordingVideo] | None,
 ) -> tuple[int, Counter[str]]:
     """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
     with ExitStack() as places, ExitStack() as handles:
@@ -273,6 +298,11 @@ def _write(
             rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
             handles.callback(rerun.finish)
             files.append(rerun)
+        if task.video is not None and video is not None:
+            place = places.enter_context(atomic_path(task.video))
+            drawn = video(place)
+            handles.callback(drawn.finish)
+            files.append(drawn)
         scans_written = 0
         classes: Counter[str] = Counter()
         for found in results:
@@ -290,7 +320,7 @@ def _tell(task: RecordingTask, run: _Run, seconds: float, console: Console) -> N
         console.print(f"{1e3 * seconds / len(run.kept):.1f} ms of CPU per scan")
         for line in show.notes(run.kept):
             show.remark(console, line)
-    written = [task.out / RUN_FILE, *(path for path in (task.foxglove, task.rerun) if path is not None)]
+    written = [task.out / RUN_FILE, *(path for path in (task.foxglove, task.rerun, task.video) if path is not None)]
     if task.calib is not None:
         written.insert(1, task.out / KITTI_FILE)
     console.print(f"Results: {', '.join(map(str, written))}", soft_wrap=True)
