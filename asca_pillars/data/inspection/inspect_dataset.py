@@ -29,7 +29,7 @@ from asca_pillars.data.yaw_units import doubt_of_yaws
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.detection.targets import Assigner
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.scans.input_check import FrameDoubt
+from asca_pillars.scans.input_check import AxesWarning
 
 
 class Spread(NamedTuple):
@@ -139,7 +139,7 @@ class Inspection:
     classes: tuple[ClassFacts, ...]
     scans: ScanFacts
     damaged: tuple[str, ...]
-    doubts: tuple[FrameDoubt, ...]
+    doubts: tuple[AxesWarning, ...]
     states_mounting: bool
     conventions: tuple[ConventionFit, ...]
     yaws_doubt: str | None

@@ -19,7 +19,7 @@ from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
-from asca_pillars.scans.input_check import FrameDoubt, doubt_frame, ground_z_m
+from asca_pillars.scans.input_check import AxesWarning, check_axes, ground_z_m
 from asca_pillars.scans.scan_reader import decide_scale
 
 InspectedSpec: TypeAlias = PillarSpec | VoxelSpec
@@ -124,7 +124,7 @@ class FrameMeasure(NamedTuple):
     outcomes: NDArray[np.int64]
     positives: NDArray[np.int64]
     scan: ScanMeasure
-    doubt: FrameDoubt | None
+    doubt: AxesWarning | None
     convention_points: NDArray[np.int64]
     label_yaws: NDArray[np.float64]
 
@@ -155,7 +155,7 @@ def measure_frame(
         outcomes=outcomes[own],
         positives=positives,
         scan=scan,
-        doubt=doubt_frame(sample, None if np.isnan(scan.ground_z_m) else scan.ground_z_m) if len(sample) else None,
+        doubt=check_axes(sample, None if np.isnan(scan.ground_z_m) else scan.ground_z_m) if len(sample) else None,
         convention_points=count_points(frame.points, frame.boxes[own]),
         label_yaws=split.label_yaws(frame_id),
     )
