@@ -27,7 +27,7 @@ from asca_pillars.base.own_files import (
 )
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import Calibration, is_detection_text, read_calibration
-from asca_pillars.data.open_split import labels_beside
+from asca_pillars.data.open_split import labels_of_scan
 from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 from asca_pillars.scans.scan_reader import Scan
@@ -194,7 +194,7 @@ class ResultWriter:
 
     def _labels(self, path: Path) -> NDArray[np.float32] | None:
         try:
-            return labels_beside(path)
+            return labels_of_scan(path)
         except AscaError as error:
             self.remarks.append(f"labels are not drawn: {error}")
             return None

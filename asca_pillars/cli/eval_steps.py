@@ -20,7 +20,7 @@ from asca_pillars.cli.extras import missing_modules
 from asca_pillars.cli.models import Model
 from asca_pillars.cli.options import Scores, scores_by_class
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.yaw_units import doubt_of_yaws
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.evaluation.curves import write_curves
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
@@ -125,7 +125,7 @@ def warn_of_unlike_scans(model: Model, scans: int, console: Console) -> None:
 def warn_of_degrees(console: Console, **yaws: Sequence[NDArray[np.floating]]) -> None:
     """Say of which files, labels or predictions, the yaws look like degrees."""
     for what, own in yaws.items():
-        if (doubt := doubt_of_yaws(own)) is not None:
+        if (doubt := check_yaws(own)) is not None:
             console.print(f"{what}: {doubt}", style="yellow", soft_wrap=True)
 
 
