@@ -34,7 +34,7 @@ _WALKER_M = 1.5  # children push nothing
 
 
 def draw_burden(rng: np.random.Generator, height: float, lean_m: float, shoulder_m: float) -> Primitives:
-    """What a person of that height carries, pulls or pushes; often nothing."""
+    """Object that a person of that height carries, pulls or pushes; often nothing."""
     names = (*SHARES, "nothing")
     what = names[int(np.searchsorted(np.cumsum(list(SHARES.values())), rng.random()))]
     side = float(rng.choice([-1.0, 1.0]))
