@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.bodies.primitives import (
-    Floats,
     Limb,
     Primitives,
     Surface,

@@ -5,9 +5,9 @@ They are built of ellipsoids with jointed limbs; x ahead, feet on z = 0.
 
 import numpy as np
 
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.bodies.cycles import bicycle
 from asca_pillars.sim.bodies.primitives import (
-    Floats,
     Limb,
     Primitives,
     Surface,
