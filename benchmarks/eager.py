@@ -26,7 +26,8 @@ from rich.progress import track
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import compare
 from asca_deploy.providers import Precision, Provider
-from asca_export.pillar.export import MIN_SCANS, export_bundle
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import MIN_SCANS, ExportOptions
 from asca_pillars.base.errors import AscaError
 from asca_pillars.base.system import cpu_model, default_threads, package_versions
 from asca_pillars.cli.bench_tables import comparison_table
@@ -62,7 +63,7 @@ def main(
 ) -> None:
     """Compare and print one table."""
     console = Console(markup=False, highlight=False)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # it may be any scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # it may be any scan
     threads = default_threads() if threads is None else threads
     torch.set_num_threads(threads)
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]
@@ -72,7 +73,7 @@ def main(
             bundle = Path(folder) / "bundle"
             proof = [points[number % len(points)] for number in range(MIN_SCANS)]
             with console.status("Exporting, which compares the boxes too"):
-                export_bundle(model, bundle, proof, calibration=proof if int8 else None)
+                export_pillar_bundle(model, bundle, proof, ExportOptions(calibration=proof if int8 else None))
         runtime = Detector(bundle, provider=provider, precision=precision, threads=threads)
         if (report := runtime.bundle.quantization) is not None:
             kept = sum(layer.kept_float for layer in report.layers)

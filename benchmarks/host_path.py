@@ -1,18 +1,15 @@
-"""What the detector does outside its two graphs: how long it takes compiled by numba, and in NumPy.
+"""What the detector does outside its two graphs, and how long it takes.
 
     python -m benchmarks.host_path [SCANS]...
 
-Rounds alternate between the two forms, so that a busy machine slows both; medians with the middle half of the rounds,
-milliseconds. Memory is as after a frame of the network: other data has pushed the scan out of the caches.
+Medians with the middle half of the rounds, milliseconds. Memory is as after a frame of the network: other data
+has pushed the scan out of the caches.
 """
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
-from unittest.mock import patch
 
 import numpy as np
 import typer
@@ -26,8 +23,8 @@ from asca_pillars.base.system import cpu_model
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.detection.decode import HeadMaps, rotated_nms
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.ops.pillar.map_pooling import map_cells
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTableBuilder
+from asca_pillars.ops.pillar.grid import map_cells
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebookBuilder
 from asca_pillars.scans.input_check import check_input
 from asca_pillars.scans.scan_reader import read_scan
 
@@ -38,7 +35,7 @@ CANDIDATES = (100, 1000)
 
 def main(
     scans: Annotated[list[Path] | None, typer.Argument(help="KITTI .bin files; default: the one that ships.")] = None,
-    rounds: Annotated[int, typer.Option(help="Rounds of each form.")] = 51,
+    rounds: Annotated[int, typer.Option(help="Rounds.")] = 51,
 ) -> None:
     """Print a table for each scan, as it is and as the camera sees it, and one for suppression."""
     bundle = load_pillar_bundle(default_bundle_path())
@@ -47,9 +44,9 @@ def main(
         points = read_scan(path).points
         for view, part in (("full", points), ("camera view", points[camera_view(points)])):
             print(f"{path.name}, {view}: {len(part)} points")
-            report(partial(host_path, part, bundle), rounds)
+            report(host_path(part, bundle), rounds)
     print("rotated NMS, 60 m by 60 m at nms_iou 0.01")
-    report(lambda: {f"{count} candidates": suppression(count) for count in CANDIDATES}, rounds)
+    report({f"{count} candidates": suppression(count) for count in CANDIDATES}, rounds)
 
 
 def camera_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -75,7 +72,7 @@ def host_path(points: NDArray[np.float32], bundle: PillarBundle) -> dict[str, Ca
         "decode": lambda: spec.decode(maps),
     }
     if rule is not None:
-        pooled, builder = map_cells(pillars.cells, spec.grid), NeckTableBuilder(*spec.grid.map_shape, rule)
+        pooled, builder = map_cells(pillars.cells, spec.grid), NeckRulebookBuilder(*spec.grid.map_shape, rule)
         cells = pillars.cells if pooled is None else pooled.cells
         stages["tables"] = lambda: builder.build(cells)
     return stages
@@ -89,31 +86,15 @@ def suppression(count: int) -> Callable[[], Any]:
     return lambda: rotated_nms(boxes, scores, 0.01)
 
 
-def report(make_stages: Callable[[], dict[str, Callable[[], Any]]], rounds: int) -> None:
-    """Time the stages in both forms, in which they are made as well, and print them."""
-    forms: tuple[Callable[[], AbstractContextManager[None]], ...] = (nullcontext, in_numpy)
-    stages_of = []
-    for form in forms:
-        with form():
-            stages_of.append(make_stages())
-    stages = list(stages_of[0])
-    times_ms = np.empty((rounds + 1, 2, len(stages)))  # the first round is not counted
-    for one_round in times_ms:
-        for form, one_form, steps in zip(forms, one_round, stages_of, strict=True):
-            with form():
-                one_form[:] = [measure_ms(step) for step in steps.values()]
+def report(stages: dict[str, Callable[[], Any]], rounds: int) -> None:
+    """Time the stages and print them."""
+    times_ms = np.array([[measure_ms(stage) for stage in stages.values()] for _ in range(rounds + 1)])
     if len(stages) > 2:
-        times_ms = np.concatenate([times_ms, times_ms.sum(axis=2, keepdims=True)], axis=2)
-    quarter, median, three_quarters = np.quantile(times_ms[1:], [0.25, 0.5, 0.75], axis=0)
-    ratios = np.median(times_ms[1:, 1] / times_ms[1:, 0], axis=0)
-    rows = []
-    for index, name in enumerate([*stages, "all"][: times_ms.shape[2]]):
-        cells = [
-            f"{median[form, index]:.2f} ({quarter[form, index]:.2f}-{three_quarters[form, index]:.2f})"
-            for form in (0, 1)
-        ]
-        rows.append((name, *cells, f"{ratios[index]:.1f}"))
-    print(markdown_table(("stage", "compiled", "NumPy", "ratio"), rows, left=1))
+        times_ms = np.concatenate([times_ms, times_ms.sum(axis=1, keepdims=True)], axis=1)
+    quarter, median, three_quarters = np.quantile(times_ms[1:], [0.25, 0.5, 0.75], axis=0)  # the first is not counted
+    names = [*stages, "all"][: len(median)]
+    cells = [f"{own[1]:.2f} ({own[0]:.2f}-{own[2]:.2f})" for own in zip(quarter, median, three_quarters, strict=True)]
+    print(markdown_table(("stage", "ms"), list(zip(names, cells, strict=True)), left=1))
 
 
 def measure_ms(stage: Callable[[], Any]) -> float:
@@ -122,15 +103,6 @@ def measure_ms(stage: Callable[[], Any]) -> float:
     start = time.perf_counter()
     stage()
     return (time.perf_counter() - start) * 1e3
-
-
-@contextmanager
-def in_numpy() -> Iterator[None]:
-    """As without numba."""
-    with ExitStack() as patches:
-        for module in ("ops.pillar.prepare", "ops.sparse.rulebook", "detection.decode"):
-            patches.enter_context(patch(f"asca_pillars.{module}.load_kernels", lambda _: None))
-        yield
 
 
 if __name__ == "__main__":

@@ -20,7 +20,8 @@ from torch import nn
 
 from asca_deploy import sample_scan_path
 from asca_deploy.bundle import PillarBundle
-from asca_export.pillar.export import MIN_SCANS, export_bundle
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import MIN_SCANS, ExportOptions
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.config.pillar import PillarModel
@@ -52,13 +53,11 @@ def export_random_weights(
 ) -> PillarBundle:
     """Export, in 8 bits calibrated on a scan (N, 4), metres, LiDAR frame, each time without another eighth of it."""
     thinned = [np.delete(points, slice(part, None, MIN_SCANS), axis=0) for part in range(MIN_SCANS)]
-    return export_bundle(
+    return export_pillar_bundle(
         model,
         out,
         [points] * MIN_SCANS,
-        trained_on="nothing: random weights",
-        calibration=thinned if int8 else None,
-        progress=progress,
+        ExportOptions(trained_on="nothing: random weights", calibration=thinned if int8 else None, progress=progress),
     )
 
 

@@ -138,8 +138,8 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
             proven on.
     """
     from asca_deploy.shipped import find_checkpoint
-    from asca_export.pillar.export import MIN_SCANS
-    from asca_pillars.training.initial_weights import initial_weights
+    from asca_export.proven_bundle import MIN_SCANS
+    from asca_pillars.training.checkpoints import initial_weights
 
     base = load_config(config, overrides)
     init = None if init is None else find_checkpoint(init)
@@ -168,8 +168,8 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     """Export one checkpoint of every variant and time them in alternation on the same scans."""
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
-    from asca_export.pillar.export import MIN_SCANS, export_bundle
-    from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
+    from asca_export.export import export_bundle
+    from asca_export.proven_bundle import MIN_SCANS
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.checkpoint import load_checkpoint
 
@@ -177,11 +177,10 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     first = {one.variant.name: one for one in reversed(todo)}  # of several seeds the first one wins
     detectors: dict[str, Detector] = {}
     parameters: dict[str, int] = {}
-    export: Any = export_bundle if family is PILLARS else export_pv_rcnn_bundle
     with tempfile.TemporaryDirectory() as folder:
         for name, one in track(first.items(), "Exporting", console=console):
             checkpoint = load_checkpoint(one.checkpoint)
-            export(checkpoint, Path(folder) / name, scans)
+            export_bundle(checkpoint, Path(folder) / name, scans)
             detectors[name] = Detector(Path(folder) / name)
             parameters[name] = sum(part.numel() for part in checkpoint.detector.parameters())
         with console.status(f"Timing {len(detectors)} detectors in alternation"):

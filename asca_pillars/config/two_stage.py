@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from asca_pillars.base.bounds import require_bounds
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.strict import Strict
+from asca_pillars.base.strict import Strict, require_bounds
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.two_stage.decode import Scores
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings
@@ -66,7 +65,8 @@ class RefineModel(Strict):
 
     Attributes:
         kind: tells the families of detectors apart.
-        first_stage: a float32 bundle (folder, or name of one that ships) or a checkpoint of a pillar detector.
+        first_stage: a checkpoint of a pillar detector, or a float32 bundle that holds one: its folder, or the name of
+            one that ships.
         first_stage_identity: of its trained weights; `asca train` fills it in.
         bev_channels: of the first stage's map; `asca train` fills it in.
         spec: the first stage's, which `asca train` fills in; its score thresholds and suppression are those of the
@@ -75,7 +75,7 @@ class RefineModel(Strict):
     """
 
     kind: Literal["pillar_refine"] = "pillar_refine"
-    first_stage: str = "asca_small_sparse_sim"
+    first_stage: str = "asca_sim"
     first_stage_identity: str = ""
     bev_channels: int = 0
     spec: PillarSpec = field(default_factory=PillarSpec)

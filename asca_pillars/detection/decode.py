@@ -14,14 +14,8 @@ from asca_pillars.base.strict import Strict
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes
-from asca_pillars.geometry.overlap import bev_iou
 
 KERNELS = "asca_pillars.geometry.nms_kernels"
-
-# Candidates that suppression looks at together: enough to keep NumPy busy, few enough that the pairs inside a
-# block, some of them needless, stay cheap.
-_NMS_BLOCK = 64
-
 
 LEAST_LOGIT = -1e3
 """Of anything that can be reported: a score of 0 in every type. Cells that a masked neck never looks at lie below."""
@@ -202,26 +196,8 @@ def rotated_nms(
         scores: (N,), any monotonic measure.
     """
     order = np.argsort(-scores, kind="stable")
-    kernels = load_kernels(KERNELS)
-    nms = _nms if kernels is None else kernels.nms
+    nms = load_kernels(KERNELS).nms
     return order[nms(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)]
-
-
-def _nms(boxes: NDArray[np.float64], iou_threshold: float, limit: int) -> NDArray[np.int64]:
-    """`rotated_nms` of boxes that come best first."""
-    waiting = np.arange(len(boxes))
-    kept = [waiting[:0]]
-    while len(waiting) and sum(map(len, kept)) < limit:
-        block, waiting = waiting[:_NMS_BLOCK], waiting[_NMS_BLOCK:]
-        clashes = bev_iou(boxes[block], boxes[block]) > iou_threshold
-        alive = np.ones(len(block), bool)
-        for index, row in enumerate(clashes):
-            if alive[index]:
-                alive[index + 1 :] &= ~row[index + 1 :]
-        kept.append(block[alive])
-        clashes = bev_iou(boxes[block[alive]], boxes[waiting]) > iou_threshold
-        waiting = waiting[~clashes.any(axis=0)]
-    return np.concatenate(kept)[:limit]
 
 
 def _candidates(

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.detection.assignment import match_by_overlap
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.targets import match_by_overlap
 from asca_pillars.geometry.overlap import bev_iou
 
 BEV_IOU = {"Car": 0.5}  # every other class is as small as a person: 0.25

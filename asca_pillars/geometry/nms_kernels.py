@@ -1,4 +1,4 @@
-"""The loop of `rotated_nms`, compiled; what it computes is said in `decode` and `overlap`, in NumPy.
+"""The loop of `rotated_nms`, compiled; tests/ops/numpy_kernels.py has it in NumPy.
 
 Here the cosine of the turn between two boxes is a sum of products of theirs, so overlaps differ in their last digits:
 the same boxes stay unless an overlap is within 1e-12 or so of the threshold.
@@ -14,7 +14,7 @@ from asca_pillars.geometry.arrays import Floats, Ints
 
 
 def nms(boxes: Floats, iou_threshold: float, limit: int) -> Ints:
-    """`decode._nms`, box by box: boxes (N, 7), best first -> indices (K,) of those kept."""
+    """`numpy_kernels._nms`, box by box: boxes (N, 7), best first -> indices (K,) of those kept."""
     kept = np.empty(len(boxes), np.int64)
     count = _nms(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
     return kept[:count]

@@ -1,6 +1,7 @@
-"""What training, evaluation in PyTorch and checkpoints need of a family of detectors, whatever is inside it."""
+"""What a family of detectors is to training, evaluation and checkpoints."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -36,49 +37,23 @@ class Preparation(Protocol):
         ...
 
 
-class Trainable(Protocol):
-    """A detector that can be trained; a `torch.nn.Module` that has the methods below.
+class Trainable(nn.Module, ABC):
+    """A detector that can be trained.
 
     Outputs are the family's own: what `predict` gives goes to `loss` and to `detect` only.
     """
 
-    @property
-    def preparation(self) -> Preparation:
-        """How its batches are made."""
-        ...
+    preparation: Preparation
+    """How its batches are made."""
 
+    @abstractmethod
     def predict(self, batch: Any) -> Any:
         """Outputs of the network for a batch that `preparation.collate` made."""
-        ...
 
+    @abstractmethod
     def loss(self, outputs: Any, batch: Any) -> Mapping[str, Tensor]:
         """Weighted terms of the loss by name, scalars; training minimizes their sum."""
-        ...
 
+    @abstractmethod
     def detect(self, outputs: Any, spec: DetectorSpec) -> list[Detections]:
         """Detections of each of the B frames, best first, with the thresholds of `spec`."""
-        ...
-
-    def parameters(self) -> Iterator[nn.Parameter]:
-        """As of `torch.nn.Module`."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """As of `torch.nn.Module`."""
-        ...
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
-        """As of `torch.nn.Module`."""
-        ...
-
-    def to(self, device: Any) -> Self:
-        """As of `torch.nn.Module`."""
-        ...
-
-    def train(self, mode: bool = True) -> Self:
-        """As of `torch.nn.Module`."""
-        ...
-
-    def eval(self) -> Self:
-        """As of `torch.nn.Module`."""
-        ...

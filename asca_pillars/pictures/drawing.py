@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.pictures.colors import HEIGHT_SPAN_M, height_rgb
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
@@ -16,6 +17,10 @@ BACKGROUND: Color = (24, 18, 14)
 OVERSAMPLING = 2
 """What is seen from above is drawn this much larger and averaged down, which smooths even single points."""
 SUBPIXEL_BITS = 4
+LEGEND_PX, LEGEND_ROW_PX = 200, 22
+"""Width kept free for the legend, and height of a row, before oversampling."""
+_WHITE: Color = (255, 255, 255)
+_GRAY: Color = (190, 180, 172)
 _FONT = cv2.FONT_HERSHEY_DUPLEX
 _MARGIN_M = 3.0
 _MAX_ASPECT = 1.1  # height over width of the picture from above
@@ -59,12 +64,37 @@ class View:
         return bool(inner.all())
 
 
+@dataclass(frozen=True, eq=False)
+class BoxLayer:
+    """Boxes that are drawn alike, and their line in the legend."""
+
+    name: str
+    boxes: NDArray[np.floating]
+    """(N, 7) LiDAR boxes."""
+    color: Color
+    texts: Sequence[str] = ()
+    """What stands beside each box; nothing if empty."""
+    thickness_px: int = 4
+    """Of the outline, before the picture is made half as large."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trail:
+    """Where a box was in the scans before."""
+
+    places_m: NDArray[np.floating]
+    """(N, 3) x, y, z of the floor's center, oldest first, in the frame of the picture."""
+    color: Color
+
+
 @dataclass
 class Texts:
     """Text on a canvas that keeps clear of the text put before it."""
 
     canvas: Image
     scale: float
+    background: Color | None = BACKGROUND
+    """Behind the text; None: what is there."""
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def size(self, text: str) -> tuple[int, int]:
@@ -89,9 +119,40 @@ class Texts:
             y = min(max(y, height + 2.0), self.canvas.shape[0] - 4.0)
             if self.reserve(x - 2, y - height - 2, x + width + 2, y + 4):
                 corners = (round(x - 2), round(y - height - 2)), (round(x + width + 2), round(y + 4))
-                cv2.rectangle(self.canvas, *corners, BACKGROUND, -1)
+                if self.background is not None:
+                    cv2.rectangle(self.canvas, *corners, self.background, -1)
                 cv2.putText(self.canvas, text, (round(x), round(y)), _FONT, self.scale, color, 1, cv2.LINE_AA)
                 return
+
+
+def draw_legend(texts: Texts, layers: Sequence[BoxLayer]) -> None:
+    """Name, color and number of boxes of each layer, in the upper left corner of an oversampled canvas."""
+    line = LEGEND_ROW_PX * OVERSAMPLING
+    for number, layer in enumerate(layers):
+        left, base = 16 * OVERSAMPLING, 12 * OVERSAMPLING + (number + 1) * line - line // 4
+        cv2.rectangle(texts.canvas, (left, base - line // 2), (left + line // 2, base), layer.color, -1)
+        texts.put(f"{layer.name}  {len(layer.boxes)}", [(left + line, base)], _WHITE)
+
+
+def draw_color_bar(texts: Texts) -> None:
+    """What the colors of the points mean, in the upper right corner of an oversampled canvas."""
+    steps, width, height = 64, 10 * OVERSAMPLING, 76 * OVERSAMPLING
+    right, top = texts.canvas.shape[1] - 16 * OVERSAMPLING, 16 * OVERSAMPLING
+    if texts.canvas.shape[0] < top + height + 60 * OVERSAMPLING or texts.canvas.shape[1] < 400 * OVERSAMPLING:
+        return
+    ramp = height_rgb(np.linspace(HEIGHT_SPAN_M, 0, steps), 0.0)[:, None, ::-1]
+    bar = cv2.resize(np.ascontiguousarray(ramp), (width, height), interpolation=cv2.INTER_LINEAR)
+    texts.canvas[top : top + height, right - width : right] = bar
+    texts.reserve(right - width, top, right, top + height)
+    for text, base in ((f"+{HEIGHT_SPAN_M:g} m", top + 0.0), ("ground", top + height - 1.0)):
+        wide, high = texts.size(text)
+        texts.put(text, [(right - width - wide - 6 * OVERSAMPLING, base + (high if base == top else 0))], _GRAY)
+
+
+def mixed(first: Color, second: Color, share: float) -> Color:
+    """The second of two colors by this share, 0..1, in the first."""
+    blue, green, red = (round(a + share * (b - a)) for a, b in zip(first, second, strict=True))
+    return blue, green, red
 
 
 def subpixels(pixels: NDArray[np.floating]) -> NDArray[np.int32]:

@@ -4,7 +4,6 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +17,35 @@ from asca_pillars.data.kitti.calibration import Calibration, project_edges
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.pictures.drawing import BACKGROUND, OVERSAMPLING, SUBPIXEL_BITS, Color, Image, Texts, View, subpixels
+from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
+from asca_pillars.pictures.drawing import (
+    BACKGROUND,
+    LEGEND_PX,
+    LEGEND_ROW_PX,
+    OVERSAMPLING,
+    SUBPIXEL_BITS,
+    BoxLayer,
+    Color,
+    Image,
+    Texts,
+    Trail,
+    View,
+    draw_color_bar,
+    draw_legend,
+    mixed,
+    subpixels,
+)
 
-_CLASS_COLORS: dict[str, Color] = {
-    "Car": (40, 165, 255),
-    "Pedestrian": (150, 80, 255),
-    "Cyclist": (120, 235, 60),
-}
-_OTHER_COLORS: tuple[Color, ...] = ((255, 200, 70), (255, 120, 200), (90, 230, 230), (200, 200, 200))
 _RING, _GRAY, _WHITE = (74, 62, 54), (190, 180, 172), (255, 255, 255)
 _POINT_PX = 3
-_LEGEND_PX, _LEGEND_ROW_PX = 200, 22  # width kept free for it, and height of a row
 _PNG_HEADER_BYTES = 33  # signature and IHDR, which other chunks may follow
 _RING_TEXT_DEG = (-40, -30, 40, 30, 0, -135, 135, 180)
 
 
 def class_color(name: str) -> Color:
-    """The BGR color of a class: the same in every picture, whatever else is in it."""
-    return _CLASS_COLORS.get(name) or _OTHER_COLORS[zlib.crc32(name.encode()) % len(_OTHER_COLORS)]
+    """The color of a class as OpenCV has it: blue, green, red, 0..255."""
+    red, green, blue = class_rgb(name)
+    return blue, green, red
 
 
 def read_image(path: Path) -> Image | None:
@@ -65,20 +75,6 @@ class Picture(np.ndarray[Any, np.dtype[np.uint8]]):
         return png_bytes(self) if self.ndim == 3 and self.dtype == np.uint8 else None
 
 
-@dataclass(frozen=True, eq=False)
-class BoxLayer:
-    """Boxes that are drawn alike, and their line in the legend."""
-
-    name: str
-    boxes: NDArray[np.floating]
-    """(N, 7) LiDAR boxes."""
-    color: Color
-    texts: Sequence[str] = ()
-    """What stands beside each box; nothing if empty."""
-    thickness_px: int = 4
-    """Of the outline, before the picture is made half as large."""
-
-
 def draw_bev(
     points: NDArray[np.floating],
     detections: Detections | None,
@@ -96,14 +92,26 @@ def draw_bev(
 
     The picture shows the part of the ranges in which there is something.
     """
-    layers = []
+    return draw_layers(points, class_layers(detections, labels), ranges, width_px=width_px)
+
+
+def class_layers(
+    detections: Detections | None, labels: NDArray[np.floating] | None = None, texts: Sequence[str] | None = None
+) -> list[BoxLayer]:
+    """A layer for each class, in its color, and one for ground truth (M, 7) if there is any.
+
+    `texts` stand beside the detections, in their order; None for the scores.
+    """
     found = Detections.empty(()) if detections is None else detections
+    texts = [f"{score:.2f}" for score in found.scores] if texts is None else texts
+    layers = []
     for label, name in enumerate(found.class_names):
-        own = found[found.labels == label]
-        layers.append(BoxLayer(name, own.boxes, class_color(name), [f"{score:.2f}" for score in own.scores]))
+        own = found.labels == label
+        named = [text for text, mine in zip(texts, own, strict=True) if mine]
+        layers.append(BoxLayer(name, found.boxes[own], class_color(name), named))
     if labels is not None and len(labels):
         layers.append(BoxLayer("ground truth", labels, _WHITE, thickness_px=2))
-    return draw_layers(points, layers, ranges, width_px=width_px)
+    return layers
 
 
 def draw_layers(
@@ -113,11 +121,14 @@ def draw_layers(
     *,
     width_px: int = 1000,
     room_for: NDArray[np.floating] | None = None,
+    trails: Sequence[Trail] = (),
+    ground_m: float | None = None,
 ) -> Image:
     """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend.
 
     Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR. With the same boxes (K, 7) as
-    `room_for` several pictures of a scan show the same part of it, whatever is drawn in each.
+    `room_for` several pictures of a scan show the same part of it, whatever is drawn in each. `trails` are where boxes
+    were before; colors begin at `ground_m`, or where the points say.
     """
     points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
@@ -129,11 +140,15 @@ def draw_layers(
     canvas = np.full((view.height_px, view.width_px, 3), BACKGROUND, np.uint8)
     texts = Texts(canvas, 0.42 * OVERSAMPLING)
     _draw_rings(texts, view, legend_rows=len(layers))
-    _draw_points(canvas, view, points)
+    _draw_points(canvas, view, points, ground_m)
+    for trail in trails:
+        _draw_trail(canvas, view, trail)
     for layer, layer_outlines in reversed(list(zip(layers, outlines, strict=True))):
         for outline in layer_outlines:
             _draw_footprint(canvas, view.pixels(outline), layer.color, layer.thickness_px)
-    _draw_legend(texts, view, layers)
+    draw_legend(texts, layers)
+    draw_color_bar(texts)
+    _draw_scale(texts, view)
     for layer, layer_outlines in zip(layers, outlines, strict=True):
         for outline, text in zip(layer_outlines, layer.texts, strict=bool(layer.texts)):
             if view.shows(view.pixels(outline.mean(axis=0))):
@@ -189,14 +204,12 @@ def _in_range(points: NDArray[np.floating], ranges: Ranges) -> NDArray[np.bool_]
     return (x >= x_min) & (x < x_max) & (y >= y_min) & (y < y_max)
 
 
-def _draw_points(canvas: Image, view: View, points: NDArray[np.floating]) -> None:
+def _draw_points(canvas: Image, view: View, points: NDArray[np.floating], ground_m: float | None) -> None:
     if not len(points):
         return
     points = points[np.argsort(points[:, 2])]  # the highest last, on top
-    ground_m = np.percentile(points[:, 2], 10)
-    height = np.clip((points[:, 2] - ground_m) / 3.0, 0, 1)
-    ramp = np.round(70 + 185 * height).astype(np.uint8)[:, None]
-    colors = cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS)[:, 0]
+    ground_m = ground_height(points[:, 2]) if ground_m is None else ground_m
+    colors = height_rgb(points[:, 2], ground_m)[:, ::-1]
     columns, rows = view.pixels(points[:, :2]).astype(np.int64).T
     for down in range(_POINT_PX):
         for right in range(_POINT_PX):
@@ -206,7 +219,7 @@ def _draw_points(canvas: Image, view: View, points: NDArray[np.floating]) -> Non
 
 def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
     """Circles of equal distance to the sensor, with texts beside the legend's place, and the sensor as an arrow."""
-    legend = np.array([_LEGEND_PX, _LEGEND_ROW_PX * (legend_rows + 1)]) * OVERSAMPLING
+    legend = np.array([LEGEND_PX, LEGEND_ROW_PX * (legend_rows + 1)]) * OVERSAMPLING
     reach_m = math.hypot(view.x_max_m, max(abs(view.y_max_m), abs(view.y_max_m - view.width_px / view.px_per_m)))
     step_m = 10 if reach_m < 100 else 20
     around = np.radians(np.arange(360))
@@ -221,6 +234,16 @@ def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
             texts.put(f"{radius_m} m", [(visible[0][0] - 20, visible[0][1] + 8)], _GRAY)
     arrow = view.pixels(np.array([[1.3, 0], [-0.5, 0.8], [0, 0], [-0.5, -0.8]]))
     cv2.fillPoly(texts.canvas, [subpixels(arrow)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)
+    texts.reserve(*arrow.min(axis=0), *arrow.max(axis=0))
+
+
+def _draw_trail(canvas: Image, view: View, trail: Trail) -> None:
+    """From its oldest place, faint, to its newest."""
+    pixels = view.pixels(trail.places_m[:, :2])
+    for number in range(1, len(pixels)):
+        color = mixed(BACKGROUND, trail.color, 0.15 + 0.85 * number / len(pixels))
+        ends = subpixels(pixels[number - 1 : number + 1])
+        cv2.polylines(canvas, [ends], False, color, 2 * OVERSAMPLING, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def _draw_footprint(canvas: Image, outline: NDArray[np.float64], color: Color, thickness: int) -> None:
@@ -238,14 +261,7 @@ def _put_beside(texts: Texts, outline: NDArray[np.float64], text: str, color: Co
     texts.put(text, [(right + 8, middle), (left - width - 8, middle), above, below], color)
 
 
-def _draw_legend(texts: Texts, view: View, layers: Sequence[BoxLayer]) -> None:
-    """Legend with the number of boxes of each layer, and the scale."""
-    rows = [(f"{layer.name}  {len(layer.boxes)}", layer.color) for layer in layers]
-    line = _LEGEND_ROW_PX * OVERSAMPLING
-    for number, (text, color) in enumerate(rows):
-        left, base = 16 * OVERSAMPLING, 12 * OVERSAMPLING + (number + 1) * line - line // 4
-        cv2.rectangle(texts.canvas, (left, base - line // 2), (left + line // 2, base), color, -1)
-        texts.put(text, [(left + line, base)], _WHITE)
+def _draw_scale(texts: Texts, view: View) -> None:
     length_m = 10
     right, base = view.width_px - 16 * OVERSAMPLING, view.height_px - 14 * OVERSAMPLING
     left = right - round(length_m * view.px_per_m)

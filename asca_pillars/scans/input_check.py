@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asca_pillars.detection.report import ScanCounts
+from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.geometry.arrays import Floating, Mask, Singles
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.scans.expected_input import ExpectedInput

@@ -8,8 +8,7 @@ from asca_deploy.scan_queue import ScanQueue
 from asca_deploy.shipped import default_bundle_path, find_bundle, sample_scan_path, shipped_bundles
 from asca_deploy.tracker import Tracker
 from asca_deploy.tracks import Tracks
-from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.report import FrameReport
+from asca_pillars.detection.detections import Detections, FrameReport
 
 __all__ = [
     "Bundle",

@@ -17,6 +17,7 @@ from asca_pillars.base.errors import BundleError, ConfigError
 from asca_pillars.base.files import atomic_directory, write_json
 from asca_pillars.base.input_files import require_content
 from asca_pillars.base.own_files import json_object, require_not_input, require_replaceable
+from asca_pillars.pictures.colors import color_table
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 
 PAGE = "page.json"
@@ -73,7 +74,13 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
             (folder / name).write_bytes(read(f"dist/{name}"))
         write_scan(folder / SAMPLE, points)
         files = sorted(path.name for path in folder.iterdir())
-        content = {"bundle": manifest.name, "scan": scan.name, "onnxruntime_web": version, "files": files}
+        content = {
+            "bundle": manifest.name,
+            "scan": scan.name,
+            "onnxruntime_web": version,
+            "colors": color_table(one.name for one in manifest.spec.classes),
+            "files": files,
+        }
         write_json(folder / PAGE, content)
         return sum(path.stat().st_size for path in folder.iterdir())
 

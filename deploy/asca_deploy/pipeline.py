@@ -6,8 +6,7 @@ from typing import Any, Protocol, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.report import ScanCounts
+from asca_pillars.detection.detections import Detections, ScanCounts
 
 Laps: TypeAlias = list[tuple[str, float]]
 """A scan's stages in the order in which they ended: name, and `time.perf_counter()` at the end. A stage lasts from the

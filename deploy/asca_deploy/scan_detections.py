@@ -2,16 +2,15 @@
 
 import base64
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
-from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.report import FrameReport
+from asca_pillars.detection.detections import Detections, FrameReport
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 
@@ -28,6 +27,8 @@ class ScanDetections(Detections):
     """From the frame of the boxes to a level one, x forward, y left, z up; None: it is such a one."""
     source: Callable[[], NDArray[Any] | None] | None = field(default=None, kw_only=True)
     """Weak reference to the points (N, >=3) that the boxes were found in."""
+    made_by: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    """The model, its weights' digest and the version, `Detector.made_by`."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Copied or sent to another process, they come without the points."""
@@ -54,22 +55,30 @@ class ScanDetections(Detections):
         self,
         points: NDArray[Any] | None = None,
         *,
+        view: Literal["above", "chase"] = "above",
         labels: NDArray[np.floating] | None = None,
         width_px: int = 1000,
     ) -> NDArray[np.uint8]:
-        """The scan and the boxes from above: an image (H, width_px, 3), blue, green, red as in OpenCV; ahead is up.
+        """The scan and the boxes as an image (H, width_px, 3), blue, green, red as in OpenCV.
 
         A notebook shows it as a picture.
 
         Args:
             points: (N, >=3) x, y, z in metres, LiDAR frame. None for those that the boxes were found in: only a weak
                 reference to them is kept, so they are drawn as long as somebody else keeps the array.
+            view: "above", where ahead is up, or "chase", in 3D from behind the sensor.
             labels: (M, 7) true boxes in the scan's frame, drawn thin and white; None without any.
             width_px: of the image.
+
+        Raises:
+            ValueError: there is no such view.
         """
         # Here: OpenCV takes a tenth of a second, and a vehicle draws nothing.
-        from asca_pillars.pictures.visualize import Picture, draw_bev
+        from asca_pillars.pictures.perspective import draw_chase
+        from asca_pillars.pictures.visualize import Picture, class_layers, draw_layers
 
+        if view not in ("above", "chase"):
+            raise ValueError(f"view {view!r}: there are 'above' and 'chase'")
         if points is None:
             points = self._points()
         points = np.empty((0, 4), np.float32) if points is None else np.asarray(points)
@@ -77,7 +86,8 @@ class ScanDetections(Detections):
         if self.level is not None:
             points = self.level.points(points)
             labels = None if labels is None else self.level.boxes(labels)
-        return draw_bev(points, found, self.ranges, labels=labels, width_px=width_px).view(Picture)
+        draw = draw_chase if view == "chase" else draw_layers
+        return draw(points, class_layers(found, labels), self.ranges, width_px=width_px).view(Picture)
 
     def _points(self) -> NDArray[Any] | None:
         return None if self.source is None else self.source()

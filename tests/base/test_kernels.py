@@ -1,10 +1,7 @@
 """The compiled forms against the NumPy forms, bit for bit, and the results that no form may change."""
 
 import dataclasses
-from collections.abc import Callable
-from importlib import import_module
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,6 +15,7 @@ from asca_pillars.detection.decode import rotated_nms
 from asca_pillars.geometry import overlap
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import PillarLimits, Pillars, pillarize
+from tests.ops.numpy_kernels import by_numpy
 
 # Rectangular, off center, with a positive minimum, and columns of one to three depths.
 GRIDS = tuple(
@@ -25,20 +23,6 @@ GRIDS = tuple(
     for zones, far_m in ((1, 9.68), (2, 7.12), (3, 9.68))
 )
 LIMITS = (PillarLimits(2**31 - 1, 2**31 - 1), PillarLimits(20, 3), PillarLimits(10**9, 2), PillarLimits(15, 10**9))
-
-WITH_KERNELS = (
-    *("detection.decode", "ops.pillar.prepare", "ops.points.columns", "ops.points.ball_query"),
-    *("ops.sparse.rulebook", "ops.pv_rcnn.voxels"),
-)
-
-
-def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The function's result where numba is not installed."""
-    with (
-        patch("asca_pillars.ops.pillar.prepare.load_kernels", lambda _: None),
-        patch("asca_pillars.detection.decode.load_kernels", lambda _: None),
-    ):
-        return function(*arguments)
 
 
 def assert_same_bits(first: Pillars, second: Pillars) -> None:
@@ -161,14 +145,7 @@ def test_boxes_that_are_not_finite_clash_with_nothing() -> None:
     assert rotated_nms(boxes, scores, 0.5).tolist() == [0, 1, 2] == by_numpy(rotated_nms, boxes, scores, 0.5).tolist()
 
 
-@pytest.mark.parametrize("place", WITH_KERNELS)
-def test_the_compiled_forms_exist(place: str) -> None:
-    module = import_module(f"asca_pillars.{place}").KERNELS
-    assert load_kernels(module) is not None, "or comparisons of both forms compare NumPy with itself"
-
-
 def test_nothing_is_compiled_at_use() -> None:
     module = load_kernels(decode.KERNELS)
-    assert module is not None
     with pytest.raises(TypeError, match="No matching definition"):
         module._nms(np.zeros((1, 7), np.float32), 0.5, 1, np.empty((1, 3)), np.empty((1, 5)), np.empty(1, np.int64))

@@ -54,6 +54,6 @@ def test_the_camera_sees_ahead() -> None:
 
 
 def test_the_host_path_is_timed_with_its_tables(capsys: pytest.CaptureFixture[str]) -> None:
-    report(partial(host_path, make_scene(0)[0], load_pillar_bundle(default_bundle_path())), rounds=1)
+    report(host_path(make_scene(0)[0], load_pillar_bundle(default_bundle_path())), rounds=1)
     rows = [row for row in capsys.readouterr().out.splitlines() if row.startswith("|")][2:]
     assert [row.split("|")[1].strip() for row in rows] == ["input", "pillarize", "decode", "tables", "all"]

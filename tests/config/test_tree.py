@@ -19,7 +19,7 @@ from asca_pillars.config.tree import AugmentConfig, Config, TrainConfig, load_co
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.models.build import build_model
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.models.two_stage.open_first_stage import with_first_stage
+from asca_pillars.models.two_stage.first_stage import with_first_stage
 from tests.config_files import refusal, write
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
@@ -58,8 +58,9 @@ def test_defaults_are_the_paper_s() -> None:
 def test_configs_that_ship_load_and_build(path: Path) -> None:
     config = load_config(path)
     assert load_config(path.stem) == config, "found by its name too"
+    model = with_first_stage(config.model) if config.model.kind == "pillar_refine" else config.model
     with torch.device("meta"):  # layers and shapes, without the time that random weights take
-        detector = build_model(with_first_stage(config.model) if config.model.kind == "pillar_refine" else config.model)
+        detector = build_model(model)
     if not isinstance(config.model, PillarModel):
         return
     assert isinstance(detector, PillarDetector) and detector.grid == config.model.spec.grid

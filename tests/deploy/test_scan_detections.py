@@ -4,9 +4,10 @@ import copy
 
 import cv2
 import numpy as np
+import pytest
 
 from asca_deploy.scan_detections import ScanDetections
-from asca_pillars.detection.report import FrameReport, ScanCounts
+from asca_pillars.detection.detections import FrameReport, ScanCounts
 from asca_pillars.geometry.ranges import Ranges
 from tests.cameras import make_calibration
 from tests.sent import sent
@@ -52,3 +53,11 @@ def test_a_part_has_the_same_report() -> None:
 def test_they_can_be_copied_and_sent_to_other_processes() -> None:
     for other in (sent(THREE), copy.deepcopy(THREE)):
         assert list(other) == list(THREE) and other.report == REPORT and other._repr_png_() is None
+
+
+def test_the_view_in_3d_is_another_picture_of_the_same_scan() -> None:
+    points = np.random.default_rng(0).uniform(-20, 20, (500, 4))
+    picture = THREE.plot(points, view="chase", width_px=320)
+    assert picture.shape == (180, 320, 3)
+    with pytest.raises(ValueError, match="there are 'above' and 'chase'"):
+        THREE.plot(points, view="below")  # type: ignore[arg-type]

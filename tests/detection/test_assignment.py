@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from asca_pillars.detection.assignment import UNMATCHED, best_assignments, greedy_matches, match_by_overlap
+from asca_pillars.detection.targets import UNMATCHED, best_assignments, greedy_matches, match_by_overlap
 
 
 def greatest_sum(overlap: NDArray[np.float64]) -> float:

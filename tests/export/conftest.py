@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import ExportOptions
 from asca_pillars.config.pillar import CpaReading
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.made_once import made_once
@@ -19,7 +20,9 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[CpaReading],
     @cache
     def export(cpa: CpaReading) -> Path:
         def make(folder: Path) -> None:
-            export_bundle(tiny_checkpoint(cpa), folder / cpa, SCANS, trained_on="nothing", command="none")
+            export_pillar_bundle(
+                tiny_checkpoint(cpa), folder / cpa, SCANS, ExportOptions(trained_on="nothing", command="none")
+            )
 
         return made_once(tmp_path_factory, f"exported_{cpa}", make) / cpa
 

@@ -16,7 +16,8 @@ from asca_deploy.bundle import PillarBundle
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.pipeline import CanvasBackbone, PillarPipeline
 from asca_export import graphs, int8
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import ExportOptions
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pillar import CpaReading
 from asca_pillars.config.tree import pillar_spec
@@ -33,7 +34,9 @@ def export_int8(folder: Path) -> PillarBundle:
         config=replace(checkpoint.config, model=replace(checkpoint.config.model, spec=spec))  # type: ignore[arg-type]
     )
     # Two of the compared scans are given to calibrate on as well.
-    return export_bundle(checkpoint, folder, SCANS, calibration=[*CALIBRATION, SCANS[3], SCANS[0].copy()])
+    return export_pillar_bundle(
+        checkpoint, folder, SCANS, ExportOptions(calibration=[*CALIBRATION, SCANS[3], SCANS[0].copy()])
+    )
 
 
 def quantize(folder: Path, copy: Path, calibration: list[np.ndarray]) -> PillarBundle:
@@ -136,5 +139,5 @@ def test_calibration_on_the_compared_scans_alone_is_refused_before_the_work(
 ) -> None:
     monkeypatch.setattr(graphs, "export_encoder", lambda *_: pytest.fail("exported"))
     with pytest.raises(ExportError, match=r"8 were left out because parity is proven on them.*other scans to --calib"):
-        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, calibration=SCANS)
+        export_pillar_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, ExportOptions(calibration=SCANS))
     assert not list(tmp_path.iterdir())

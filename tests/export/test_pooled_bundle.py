@@ -11,7 +11,7 @@ import pytest
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_export.int8 import quantize_bundle
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.scan_detector import ScanDetector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
@@ -23,14 +23,14 @@ POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pool
 @pytest.fixture(scope="module")
 def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pooled") / "dense"
-    export_bundle(tiny_checkpoint("channel", POOLED), folder, SCANS)
+    export_pillar_bundle(tiny_checkpoint("channel", POOLED), folder, SCANS)
     return folder
 
 
 @pytest.fixture(scope="module")
 def sparse(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pooled") / "sparse"
-    export_bundle(tiny_checkpoint("channel", POOLED, neck="sparse"), folder, SCANS)
+    export_pillar_bundle(tiny_checkpoint("channel", POOLED, neck="sparse"), folder, SCANS)
     return folder
 
 
@@ -60,7 +60,7 @@ def test_runtime_and_pytorch_find_the_same(request: pytest.FixtureRequest, tmp_p
 def test_the_graphs_are_those_of_uniform_pillars(dense: Path, tmp_path: Path) -> None:
     grid = dataclasses.replace(SPEC.grid, zones=1, v_max_m=SPEC.grid.v_max_m / 2)
     uniform = dataclasses.replace(POOLED, grid=grid)
-    export_bundle(tiny_checkpoint("channel", uniform), tmp_path / "uniform", SCANS)
+    export_pillar_bundle(tiny_checkpoint("channel", uniform), tmp_path / "uniform", SCANS)
     for graph in ("encoder.onnx", "backbone.onnx"):
         ours, theirs = (onnx.load(folder / graph).graph for folder in (dense, tmp_path / "uniform"))
         assert ours.SerializeToString(deterministic=True) == theirs.SerializeToString(deterministic=True)

@@ -14,7 +14,8 @@ from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import ExportOptions
 from asca_pillars.base.errors import ConfigError, ProviderError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
@@ -36,14 +37,14 @@ def sparse_checkpoint(rule: str) -> Checkpoint:
 @pytest.fixture(scope="module", params=["sub", "fine"])
 def float_bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Checkpoint]:
     folder, checkpoint = tmp_path_factory.mktemp("bundles") / "float", sparse_checkpoint(request.param)
-    export_bundle(checkpoint, folder, SCANS)
+    export_pillar_bundle(checkpoint, folder, SCANS)
     return folder, checkpoint
 
 
 @pytest.fixture(scope="module")
 def int8_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bundles") / "int8"
-    export_bundle(sparse_checkpoint("fine"), folder, SCANS, calibration=CALIBRATION)
+    export_pillar_bundle(sparse_checkpoint("fine"), folder, SCANS, ExportOptions(calibration=CALIBRATION))
     return folder
 
 

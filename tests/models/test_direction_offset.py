@@ -9,12 +9,11 @@ import pytest
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.detection.decode import HeadMaps, PostProcess
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.proposals import AnchorProposals, ProposalSettings, propose, propose_anchors
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.detection.targets import Targets
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pv_rcnn.network import build_pv_rcnn_detector
-from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals, propose_anchors
-from asca_pillars.ops.two_stage.proposals import ProposalSettings, propose
 from tests.models.pv_rcnn import tiny_pv_rcnn
 from tests.models.pv_rcnn.tiny_pv_rcnn import frame
 from tests.scenes import SPEC

@@ -7,7 +7,9 @@ import pytest
 from asca_pillars.data.kitti.calibration import Calibration
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.pictures.visualize import BoxLayer, class_color, draw_bev, draw_layers, draw_on_image, write_png
+from asca_pillars.pictures.colors import HEIGHT_RAMP
+from asca_pillars.pictures.drawing import BoxLayer
+from asca_pillars.pictures.visualize import class_color, draw_bev, draw_layers, draw_on_image, write_png
 
 AHEAD = Ranges(x_m=(5.12, 25.6), y_m=(-10.24, 5.12), z_m=(-3.0, 1.0))
 AROUND = Ranges(x_m=(-10.24, 20.48), y_m=(-5.12, 10.24), z_m=(-3.0, 1.0))
@@ -199,3 +201,24 @@ def test_boxes_on_the_image_take_given_colors():
     drawn = draw_on_image(image, box, [""], None, calib, colors=[(255, 0, 255)])
     assert len(near(drawn, (255, 0, 255))[0]) > 100
     assert not drawn[..., 1].any()  # an empty text leaves no mark
+
+
+def test_the_score_of_a_box_leaves_the_arrow_of_the_sensor_free():
+    """The sensor is to the right of the box, where its score would stand."""
+    box = np.array([[0.2, 1.6, -1, 2, 1, 2, 0.0]])
+    plain, scored = (
+        draw_layers(NO_POINTS, [BoxLayer("a", box, (0, 0, 255), [text])], AROUND, width_px=300) for text in ("", "0.88")
+    )
+    arrow = (plain[60:-40] == 255).all(axis=-1)
+    assert arrow.sum() > 30
+    assert (scored[60:-40][arrow] == 255).all()
+    assert len(near(scored, (0, 0, 255))[0]) > len(near(plain, (0, 0, 255))[0]) + 20  # the score is elsewhere
+
+
+def test_a_bar_says_what_the_colors_of_the_points_mean():
+    image = draw_bev(CORNERS, None, AHEAD, width_px=550)
+    bar = image[16:92, 550 - 16 - 5]
+    low, high = (np.array(color[::-1]) for color in (HEIGHT_RAMP[0], HEIGHT_RAMP[-1]))
+    assert np.abs(bar[1].astype(int) - high).max() < 12 and np.abs(bar[-2].astype(int) - low).max() < 12
+    small = draw_bev(CORNERS, None, AHEAD, width_px=200)  # where there is no room, there is no bar
+    assert len(near(small[:60, 150:], high, 12)[0]) == 0

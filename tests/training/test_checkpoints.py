@@ -15,7 +15,7 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config, DataConfig, TrainConfig
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import save_weights
+from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.training import loop
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loop import train

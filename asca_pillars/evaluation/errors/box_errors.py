@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.frames import NEIGHBOR_TYPES
-from asca_pillars.detection.assignment import match_by_overlap
+from asca_pillars.detection.targets import match_by_overlap
 from asca_pillars.evaluation.errors.error_frames import ErrorFrame
 from asca_pillars.evaluation.errors.label_fit import view_angle_deg
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU

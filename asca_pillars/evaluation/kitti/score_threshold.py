@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from asca_pillars.detection.assignment import greedy_matches
+from asca_pillars.detection.targets import greedy_matches
 from asca_pillars.evaluation.kitti.average_precision import min_overlap as kitti_min_overlap
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs

@@ -12,13 +12,13 @@ from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.models.map_layers import as_map
+from asca_pillars.models.map_backbone import SSDHead, as_map
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
-from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pillar.loss import detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, PillarPreparation
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from asca_pillars.models.trainable import Trainable
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 from asca_pillars.ops.pillar.spec import PillarSpec
 
 
@@ -31,10 +31,10 @@ class PillarOutputs(NamedTuple):
     """
 
     maps: HeadMaps[Tensor]
-    neck: NeckTables[Tensor] | None
+    neck: NeckRulebooks[Tensor] | None
 
 
-class PillarDetector(nn.Module):
+class PillarDetector(Trainable):
     """ASCA-PointPillars (figure 1 of the paper); PointPillars with K = 1, V_max = 0.16 m and no CPA.
 
     Args:
@@ -44,6 +44,8 @@ class PillarDetector(nn.Module):
         neck: pseudo-image, or pillars and tables, to features (section 3.3).
         head: features to head maps.
     """
+
+    preparation: PillarPreparation
 
     def __init__(
         self,
@@ -131,7 +133,7 @@ class PillarDetector(nn.Module):
     def pool(self, pillar_features: Tensor, batch: PillarBatch) -> tuple[Tensor, Tensor, Sequence[int]]:
         """Pillar features (P, C) -> features (M, C) and cells (M,) of the map, and how many each frame has.
 
-        See `ops.pillar.map_pooling`; without a pooled map pillars and cells are the same.
+        See `ops.pillar.grid`; without a pooled map pillars and cells are the same.
         """
         if self.grid.pools != (batch.pooling is not None) or isinstance(self.neck, RPNNeck) != (batch.neck is None):
             raise ValueError("the batch was placed for another map or neck; use `preparation.place` of this detector")

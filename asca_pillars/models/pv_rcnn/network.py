@@ -6,24 +6,24 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from asca_pillars.config.pillar import LossConfig
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.proposals import AnchorProposals, propose_anchors
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.pillar.loss import detection_loss
-from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, VoxelBatch
 from asca_pillars.models.pv_rcnn.layers import FirstStageOutputs, PvRcnn, build_pv_rcnn
-from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
+from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels, VoxelBatch, VoxelPreparation
+from asca_pillars.models.trainable import Trainable
+from asca_pillars.models.two_stage.layers import Refinements, zero_of_weights
 from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
-from asca_pillars.models.two_stage.pillar_refiner import Refinements, zero_of_weights
-from asca_pillars.ops.pv_rcnn.proposals import AnchorProposals, propose_anchors
-from asca_pillars.ops.sparse.batching import stack_rows
+from asca_pillars.ops.sparse.rulebooks import stack_rows
 from asca_pillars.ops.two_stage.decode import reported_frames
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
-from asca_pillars.ops.two_stage.roi_targets import match_proposals, roi_targets, sample_rois
+from asca_pillars.ops.two_stage.rois import match_proposals, roi_targets, sample_rois
 
 _DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
 
@@ -39,13 +39,15 @@ class PvRcnnOutputs(NamedTuple):
     """Of each frame: in training those drawn, otherwise all."""
 
 
-class PvRcnnDetector(nn.Module):
+class PvRcnnDetector(Trainable):
     """PV-RCNN with its proposals, targets and loss.
 
     Args:
         model: its section of the configuration.
         network: made for it.
     """
+
+    preparation: VoxelPreparation
 
     def __init__(self, model: PvRcnnModel, network: PvRcnn) -> None:
         super().__init__()
@@ -69,7 +71,7 @@ class PvRcnnDetector(nn.Module):
         """Head maps, proposals and their refinements; training draws the proposals that it learns from."""
         scans = batch.scans
         if self.training and min(len(scans.keypoints), *(len(level.cells) for level in scans.levels)) < 2:
-            return self._silence(scans)  # no statistics of a batch
+            return self._zero_outputs(scans)  # no statistics of a batch
         first = self.network.propose(scans)
         proposals = self._proposals(first.maps, batch)
         with torch.autocast(first.canvas.device.type, enabled=False):  # positions need float32, `SetAbstraction`
@@ -129,7 +131,7 @@ class PvRcnnDetector(nn.Module):
         self, scans: VoxelBatch[Tensor], first: FirstStageOutputs, proposals: Sequence[Detections]
     ) -> Refinements:
         levels, canvas = [level.float() for level in first.levels], first.canvas.float()
-        features, keypoint_logits = self.network.describe(scans, levels, canvas)
+        features, keypoint_logits = self.network.encode_keypoints(scans, levels, canvas)
         if self.training and not sum(map(len, proposals)):
             nothing = zero_of_weights(self.network.refine)
             return Refinements(
@@ -149,7 +151,7 @@ class PvRcnnDetector(nn.Module):
         confidence, residuals = self.network.refine(scans.keypoints, features, points, indices)
         return Refinements(confidence, residuals, keypoint_logits)
 
-    def _silence(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
+    def _zero_outputs(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
         nothing, frames = zero_of_weights(self), len(scans.frame_keypoints)
         height, width, anchors, _ = self.model.spec.anchors.shape

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.pillar.loss import focal_loss
-from asca_pillars.models.two_stage.pillar_refiner import Refinements
+from asca_pillars.models.two_stage.layers import Refinements
 
 _RESIDUAL_BETA, _CORNER_BETA = 1 / 9, 1.0
 _FOCAL_ALPHA, _FOCAL_GAMMA = 0.25, 2.0
@@ -98,7 +98,7 @@ def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tens
 def corners_in_frames(residuals: Tensor, sizes: Tensor) -> Tensor:
     """Corners of refined boxes, seen from their proposals of these sizes: (R, 7), (R, 3) -> (R, 8, 3) metres.
 
-    The order is that of `geometry.boxes.corners`; residuals as in `ops.two_stage.box_residuals`.
+    The order is that of `geometry.boxes.corners`; residuals as in `ops.two_stage.rois`.
     """
     center, half = _boxes_in_frames(residuals, sizes)
     signs = half.new_tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]]).tile(2, 1)  # (8, 2)

@@ -14,7 +14,7 @@ Columns run along x and rows along y; a pillar's flat index is row * nx + column
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.ops.pillar.fitting import HEAD_STRIDE, MAX_ZONES, NECK_STRIDE, fits, x_advice, y_advice
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
 
@@ -249,3 +248,115 @@ def _interval(values: NDArray[np.float32], edges: NDArray[np.float32]) -> NDArra
 def _read_only(array: NDArray[np.float64]) -> NDArray[np.float64]:
     array.flags.writeable = False
     return array
+
+
+Array = TypeVar("Array")
+Value = TypeVar("Value", np.float32, np.uint8)
+
+
+class MapCells(NamedTuple, Generic[Array]):
+    """The M cells of the map that P pillars occupy."""
+
+    cells: Array
+    """(M,) flat index row * columns + column on the map, ascending."""
+    pillars: Array
+    """(E,) rows of the pillars of one cell after those of the other."""
+    counts: Array
+    """(M,) pillars of each cell, at least 1."""
+
+
+def map_cells(cells: NDArray[np.int64], grid: PillarGrid) -> MapCells[NDArray[np.int64]] | None:
+    """Where pillars at these cells (P,) of the grid, ascending, stand on the map; None where both are the same."""
+    if not grid.pools:
+        return None
+    rows, columns = np.divmod(cells, grid.nx)
+    copies = grid.map_copies[columns]
+    pillars = np.repeat(np.arange(len(cells)), copies)
+    first = np.repeat(rows * grid.map_shape[1] + grid.map_columns[columns], copies)
+    place = (
+        first + np.arange(len(pillars)) - np.repeat(np.cumsum(copies) - copies, copies)
+    )  # ascending, as the cells are
+    starts = np.flatnonzero(np.diff(place, prepend=-1))
+    return MapCells(place[starts], pillars, np.diff(starts, append=len(place)))
+
+
+def pool_pillars(
+    features: NDArray[Value], cells: NDArray[np.int64], grid: PillarGrid
+) -> tuple[NDArray[Value], NDArray[np.int64]]:
+    """Features (P, C) of pillars at cells (P,) of the grid -> (M, C) and (M,) of the map.
+
+    Steps of a quantized graph may be pooled as well: their order is that of the values.
+    """
+    found = map_cells(cells, grid)
+    if found is None:
+        return features, cells
+    starts = np.cumsum(found.counts) - found.counts
+    pooled = features[found.pillars[starts]]
+    for further in range(1, int(found.counts.max(initial=1))):
+        shared = np.flatnonzero(found.counts > further)
+        pooled[shared] = np.maximum(pooled[shared], features[found.pillars[starts[shared] + further]])
+    return pooled, found.cells
+
+
+NECK_STRIDE = 8  # stride of the coarsest map in the paper's Table 1
+HEAD_STRIDE = 2  # stride of the map that the head reads, Table 1
+MAX_ZONES = 5
+
+# How far from a whole number a count of pillars may be: room for float dust (69.12 / 0.32 is not exactly 216)
+# and for sizes written with seven digits, and still under a millimetre.
+_PILLAR_TOLERANCE = 1e-3
+
+
+def fits(span_m: tuple[float, float], pillar_m: float, zones: int = 1) -> bool:
+    """Whether each of `zones` equal parts of a range is a multiple of NECK_STRIDE of the first one's pillars.
+
+    Columns double from zone to zone, so the map has an odd multiple (2^K - 1) of the first zone's columns,
+    and the neck's stride must divide these. Then every zone also holds a multiple of HEAD_STRIDE columns,
+    and the borders of zones fall between head cells.
+    """
+    pillars = (span_m[1] - span_m[0]) / (zones * pillar_m)
+    groups = round(pillars / NECK_STRIDE)
+    return groups >= 1 and abs(pillars - groups * NECK_STRIDE) <= _PILLAR_TOLERANCE
+
+
+def x_advice(span_m: tuple[float, float], v_max_m: float, zones: int) -> str:
+    """Why an x range does not fit, and the nearest ranges, pillar depth and numbers of zones that do."""
+    step_m = NECK_STRIDE * zones * v_max_m
+    advice = f"x_range_m {_nearest_ranges(span_m, step_m)}, or v_max_m {_nearest_size(span_m, v_max_m, zones)}"
+    working = [str(k) for k in range(1, MAX_ZONES + 1) if fits(span_m, v_max_m, k)]
+    if working:
+        advice += f", or zones {' or '.join(working)}"
+    return (
+        f"x_range_m {_show(span_m)} must be a multiple of {step_m:.7g} m "
+        f"({zones} zones x {NECK_STRIDE} columns x v_max_m {v_max_m:g}): use {advice}"
+    )
+
+
+def y_advice(span_m: tuple[float, float], v_y_m: float) -> str:
+    """Why a y range does not fit, and the nearest ranges and pillar width that do."""
+    step_m = NECK_STRIDE * v_y_m
+    return (
+        f"y_range_m {_show(span_m)} must be a multiple of {step_m:.7g} m "
+        f"({NECK_STRIDE} rows x v_y_m {v_y_m:g}): "
+        f"use y_range_m {_nearest_ranges(span_m, step_m)}, or v_y_m {_nearest_size(span_m, v_y_m, zones=1)}"
+    )
+
+
+def _nearest_ranges(span_m: tuple[float, float], step_m: float) -> str:
+    """The next shorter and longer range: about the origin if `span_m` is, else from the same minimum."""
+    low, high = span_m
+    steps = math.floor((high - low) / step_m)
+    ranges = []
+    for length_m in (n * step_m for n in (steps, steps + 1) if n > 0):
+        start_m = -length_m / 2 if low == -high else low
+        ranges.append(_show((start_m, start_m + length_m)))
+    return " or ".join(ranges)
+
+
+def _nearest_size(span_m: tuple[float, float], pillar_m: float, zones: int) -> str:
+    group_m = (span_m[1] - span_m[0]) / (zones * NECK_STRIDE)
+    return f"{group_m / max(1, round(group_m / pillar_m)):.7g}"
+
+
+def _show(span_m: tuple[float, float]) -> str:
+    return f"[{span_m[0]:.10g}, {span_m[1]:.10g}]"

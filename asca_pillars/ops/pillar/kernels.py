@@ -1,4 +1,4 @@
-"""The loops of `pillarize`, compiled; what they compute is said there, in NumPy.
+"""The loops of `pillarize`, compiled; tests/ops/numpy_kernels.py has them in NumPy.
 
 Indices are unsigned where it matters: with others, numba looks for negative ones, which count from the end.
 """
@@ -21,7 +21,7 @@ _BLOCK = 16  # cells of the grid that are looked at together
 
 
 def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, _Integers]:
-    """`pillarize._sort_points`, by counting: points (N, 4) -> indices (K,) of those inside, cells (Q,), counts (Q,)."""
+    """`numpy_kernels._sort_points`, by counting: (N, 4) -> indices (K,) of the points inside, cells, counts (Q,)."""
     size = -(-grid.ny * grid.nx // _BLOCK) * _BLOCK
     # In one piece: glibc gives several pieces back to the system, and gets them page by page again for the next scan.
     memory = np.empty(5 * len(points) + size, np.uint32)
@@ -112,7 +112,7 @@ def fill_pillars(
     max_points: int,
     grid: PillarGrid,
 ) -> tuple[_Floats, _Integers, _Integers]:
-    """`pillarize._fill_pillars`, in one pass: features (M, 9), pillar indices (M,) and counts of points (P,)."""
+    """`numpy_kernels._fill_pillars`, in one pass: features (M, 9), pillar indices (M,) and counts of points (P,)."""
     point_counts = np.minimum(counts[kept], max_points)
     features = np.empty((point_counts.sum(), 9), np.float32)
     pillar_index = np.empty(len(features), np.int64)

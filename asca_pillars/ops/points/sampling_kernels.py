@@ -1,4 +1,4 @@
-"""The loops of `columns`, `farthest_points` and `bilinear`, compiled; what they compute is said there, in NumPy."""
+"""The loops of `columns`, `farthest_points` and `bilinear`, compiled; tests/ops/numpy_kernels.py has them in NumPy."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import compiled, given, inner, written
-from asca_pillars.ops.points.columns import Columns
+from asca_pillars.ops.points.sampling import Columns
 
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int32]
@@ -31,14 +31,14 @@ _COLUMNS = (
 def sort(
     xyz: _Floats, x_low: np.float32, y_low: np.float32, per_m: np.float32, ny: int, nx: int
 ) -> tuple[_Integers, _Integers]:
-    """`columns._sort`, by counting: (N, 3) in metres -> `Columns.order` (N,) and `Columns.starts` (ny * nx + 1,)."""
+    """`numpy_kernels._sort`, by counting: (N, 3), metres -> `Columns.order` (N,), `Columns.starts` (ny * nx + 1,)."""
     order, starts = np.empty(len(xyz), np.int32), np.zeros(ny * nx + 1, np.int32)
     _sort(xyz, x_low, y_low, per_m, nx, np.empty(len(xyz), np.int32), order, starts)
     return order, starts
 
 
 def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
-    """`farthest_points._farthest_points`, column by column: (N, 3) in metres -> indices (S,), S at most `count`."""
+    """`numpy_kernels._farthest_points`, column by column: (N, 3) in metres -> indices (S,), S at most `count`."""
     cells = len(columns.starts) - 1
     chosen = np.empty(min(count, len(xyz)), np.int32)
     found = _farthest_points(
@@ -50,7 +50,7 @@ def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
 
 
 def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats:
-    """`farthest_points._near_circles`: rows (N, 4), circles (R, 2) in metres, (R,) in m² -> rows (M, 4)."""
+    """`numpy_kernels._near_circles`: rows (N, 4), circles (R, 2) in metres, (R,) in m² -> rows (M, 4)."""
     if not len(centers):
         return points[:0]
     reach = np.sqrt(squared)[:, None]
@@ -67,7 +67,7 @@ def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats
 
 
 def read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats) -> _Floats:
-    """`bilinear._read_map`: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
+    """`numpy_kernels._read_map`: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
     read = np.zeros((len(cells), rows.shape[1]), np.float32)
     (_read_steps if rows.dtype == np.uint8 else _read_floats)(rows, cells, weights, read)
     return read

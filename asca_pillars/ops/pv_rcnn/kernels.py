@@ -1,4 +1,4 @@
-"""The loops of `voxelize`, compiled; what they compute is said there, in NumPy."""
+"""The loops of `voxelize`, compiled; tests/ops/numpy_kernels.py has them in NumPy."""
 
 import math
 
@@ -7,8 +7,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import compiled, given, written
-from asca_pillars.ops.sparse.convolution import Shape
 from asca_pillars.ops.sparse.kernels import bits_of, bits_set
+from asca_pillars.ops.sparse.rulebooks import Shape
 
 _Floats = NDArray[np.float32]
 _Integers = NDArray[np.int64]
@@ -28,7 +28,7 @@ def cells_of_points(
     shape: Shape,
     cells: _Integers,
 ) -> None:
-    """`voxels._cells_of_points`: (M, >=3) in metres -> flat indices (M,)."""
+    """`numpy_kernels._cells_of_points`: (M, >=3) in metres -> flat indices (M,)."""
     for i in range(len(points)):
         cells[i] = -1
         if (

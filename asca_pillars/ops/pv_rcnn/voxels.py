@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.strict import Strict
-from asca_pillars.ops.sparse.convolution import Shape
-from asca_pillars.ops.sparse.rulebook import MAX_Z_CELLS, CellMap
+from asca_pillars.ops.sparse.rulebooks import MAX_Z_CELLS, CellMap, Shape
 
 KERNELS = "asca_pillars.ops.pv_rcnn.kernels"
 _TOLERANCE = 1e-2  # of a number of voxels: room for float dust and for sizes written with few digits
@@ -105,11 +104,8 @@ class VoxelGrid(Strict):
         sizes_m = np.array(self.size_m, np.float32)
         z, y, x = self.shape
         last = np.array([x, y, z - self.empty_layers]) - 1
-        kernels = load_kernels(KERNELS)
-        if kernels is None:
-            return _cells_of_points(points[:, :3], lows_m, highs_m, sizes_m, last, self.shape)
         cells = np.empty(len(points), np.int64)
-        kernels.cells_of_points(points, lows_m, highs_m, sizes_m, last, self.shape, cells)
+        load_kernels(KERNELS).cells_of_points(points, lows_m, highs_m, sizes_m, last, self.shape, cells)
         return cells
 
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -147,44 +143,10 @@ def voxelize(points: NDArray[np.float32], grid: VoxelGrid, cell_map: CellMap) ->
     points = np.require(points, np.float32, ["C", "ALIGNED"])
     cell_of_point = grid.cells(points)
     cell_map.activate_points(cell_of_point)
-    kernels = load_kernels(KERNELS)
-    if kernels is None:
-        features = _means(points, cell_of_point, cell_map.cells, grid.max_points)
-    else:
-        sums = np.zeros((len(cell_map), points.shape[1]))
-        features = np.empty(sums.shape, np.float32)
-        counts = np.zeros(len(cell_map), np.int64)
-        columns = cell_map.columns
-        kernels.sum_points(points, cell_of_point, grid.shape[0], *columns, grid.max_points, sums, counts, features)
+    sums = np.zeros((len(cell_map), points.shape[1]))
+    features = np.empty(sums.shape, np.float32)
+    counts = np.zeros(len(cell_map), np.int64)
+    load_kernels(KERNELS).sum_points(
+        points, cell_of_point, grid.shape[0], *cell_map.columns, grid.max_points, sums, counts, features
+    )
     return Voxels(features, cell_map.cells, int((cell_of_point < 0).sum()))
-
-
-def _cells_of_points(
-    xyz: NDArray[np.float32],
-    lows_m: NDArray[np.float32],
-    highs_m: NDArray[np.float32],
-    sizes_m: NDArray[np.float32],
-    last: NDArray[np.int64],
-    shape: Shape,
-) -> NDArray[np.int64]:
-    """(M,) flat index of each point's voxel, -1 outside; a border belongs to the voxel above it."""
-    inside = ((xyz >= lows_m) & (xyz < highs_m)).all(axis=1)
-    # float32 throughout, and the quotient may round up to the range's end: its last voxel has the point.
-    chosen = np.floor((xyz[inside] - lows_m) / sizes_m).astype(np.int64)
-    x, y, z = np.minimum(chosen, last).T
-    cells = np.full(len(xyz), -1, np.int64)
-    cells[inside] = (y * shape[2] + x) * shape[0] + z
-    return cells
-
-
-def _means(
-    points: NDArray[np.float32], cell_of_point: NDArray[np.int64], cells: NDArray[np.int64], max_points: int
-) -> NDArray[np.float32]:
-    order = np.argsort(cell_of_point, kind="stable")
-    order = order[cell_of_point[order] >= 0]
-    voxel = np.searchsorted(cells, cell_of_point[order])
-    first = np.arange(len(order)) - np.searchsorted(voxel, voxel) < max_points
-    order, voxel = order[first], voxel[first]
-    counts = np.bincount(voxel, minlength=len(cells))
-    sums = [np.bincount(voxel, weights=points[order, c], minlength=len(cells)) for c in range(points.shape[1])]
-    return (np.stack(sums, axis=-1) / counts[:, None]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The loops of `cell_map`, compiled; what they compute is said there, in NumPy.
+"""The loops of `CellMap`, compiled; tests/ops/numpy_kernels.py has them in NumPy.
 
 Masks stay uint64 throughout, because numba turns a sum of uint64 and int64 into a float; indices are unsigned where it
 matters, because with others it looks for negative ones, which count from the end.

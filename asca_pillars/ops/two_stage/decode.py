@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from asca_pillars.detection.decode import PostProcess, nms_by_class, sigmoid
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.ops.two_stage.box_residuals import decode_refinement
+from asca_pillars.ops.two_stage.rois import decode_refinement
 
 Scores = Literal["second", "both"]
 """Whose score a refined box has: the second stage's, or the geometric mean of its own and of its proposal's."""

@@ -10,10 +10,9 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.proposals import ProposalSettings, propose
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.ops.points.bilinear import bilinear_cells, read_map
-from asca_pillars.ops.points.farthest_points import farthest_points, points_near_boxes
-from asca_pillars.ops.two_stage.proposals import ProposalSettings, propose
+from asca_pillars.ops.points.sampling import bilinear_cells, farthest_points, points_near_boxes, read_map
 
 
 class FirstPass(NamedTuple):

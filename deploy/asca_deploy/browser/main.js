@@ -2,16 +2,13 @@
 
 import { Scene, cssColor } from "./scene.js";
 
-// As in the pictures of `asca detect`.
-const CLASS_COLORS = { Car: [1, 0.65, 0.16], Pedestrian: [1, 0.31, 0.59], Cyclist: [0.24, 0.92, 0.47] };
-const OTHER_COLORS = [[0.27, 0.78, 1], [0.78, 0.47, 1], [0.9, 0.9, 0.35], [0.78, 0.78, 0.78]];
 const SAMPLE = "sample.bin";
 
 const element = (id) => document.getElementById(id);
 const worker = new Worker("worker.js", { type: "module" });
 const waiting = new Map();
 let scene;
-let classes = [];
+let colors = {}; // of the classes, red, green, blue 0..255: those of the pictures of `asca detect`
 let last; // the file that is shown
 let busy = false;
 let asked = 0;
@@ -34,11 +31,15 @@ worker.addEventListener("error", (event) => fail(event.message || "worker.js can
 async function start() {
   scene = new Scene(element("scene"), element("labels"));
   const manifest = await ask("open");
-  classes = manifest.spec.classes.map(({ name }) => name);
+  colors = (await (await fetched("page.json")).json()).colors;
   element("model").textContent = `${manifest.name}, ${manifest.precision}, in this browser`;
-  const response = await fetch(SAMPLE);
-  if (!response.ok) throw new Error(`${SAMPLE}: ${response.status} ${response.statusText}`);
-  await detect({ name: SAMPLE, buffer: await response.arrayBuffer() });
+  await detect({ name: SAMPLE, buffer: await (await fetched(SAMPLE)).arrayBuffer() });
+}
+
+async function fetched(file) {
+  const response = await fetch(file);
+  if (!response.ok) throw new Error(`${file}: ${response.status} ${response.statusText}`);
+  return response;
 }
 
 /** Run one file; `document.body.dataset.state` says when it is done. */
@@ -61,8 +62,7 @@ async function detect(file) {
 }
 
 function show(file, { points, remarks, detections, timesMs, counts }) {
-  const colorOf = (name) => CLASS_COLORS[name] ?? OTHER_COLORS[classes.indexOf(name) % OTHER_COLORS.length];
-  const colored = detections.map((found) => ({ ...found, color: colorOf(found.class) }));
+  const colored = detections.map((found) => ({ ...found, color: colors[found.class].map((value) => value / 255) }));
   scene.show(points, colored);
   const total = Object.values(timesMs).reduce((sum, time) => sum + time, 0);
   const seen = counts.points - counts.points_outside;

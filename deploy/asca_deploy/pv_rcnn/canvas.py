@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from asca_pillars.ops.sparse.convolution import Shape
+from asca_pillars.ops.sparse.rulebooks import Shape
 
 
 class VoxelCanvas:

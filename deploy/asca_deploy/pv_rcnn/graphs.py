@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import PvRcnnBundle, PvRcnnSection
 from asca_deploy.graph import Interface, Tensor
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.ops.points.ball_query import ball_query
+from asca_pillars.ops.points.neighbors import ball_query
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, SourceBalls, VoxelScan, VoxelSetSettings
 from asca_pillars.ops.pv_rcnn.rulebooks import SUBMANIFOLD, VoxelLevel
 

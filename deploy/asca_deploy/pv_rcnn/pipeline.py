@@ -32,15 +32,14 @@ from asca_deploy.pv_rcnn.graphs import (
 from asca_deploy.two_stage.pipeline import OUTPUTS
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.report import ScanCounts
-from asca_pillars.ops.points import ball_query, columns
-from asca_pillars.ops.points.bilinear import read_map
+from asca_pillars.detection.detections import Detections, ScanCounts
+from asca_pillars.detection.proposals import propose_anchors
+from asca_pillars.ops.points import neighbors, sampling
+from asca_pillars.ops.points.sampling import read_map
 from asca_pillars.ops.pv_rcnn import voxels
 from asca_pillars.ops.pv_rcnn.prepare import VoxelizedScan, VoxelScan, voxel_levels, with_neighbors
-from asca_pillars.ops.pv_rcnn.proposals import propose_anchors
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
-from asca_pillars.ops.sparse import rulebook as cell_map
+from asca_pillars.ops.sparse import rulebooks
 from asca_pillars.ops.two_stage.decode import reported_detections
 from asca_pillars.ops.two_stage.prepare import GridNeighbors, grid_neighbors
 
@@ -99,7 +98,7 @@ class PvRcnnPipeline:
         precision: providers.Precision = "float32",
         threads: int = 1,
     ) -> None:
-        for kernels in (ball_query.KERNELS, columns.KERNELS, cell_map.KERNELS, voxels.KERNELS):
+        for kernels in (neighbors.KERNELS, sampling.KERNELS, rulebooks.KERNELS, voxels.KERNELS):
             load_kernels(kernels)  # here rather than in the first scan
         self.spec: VoxelSpec = bundle.spec
         self.settings, self.scores = bundle.pv_rcnn.settings, bundle.pv_rcnn.scores
@@ -121,7 +120,7 @@ class PvRcnnPipeline:
         self._deform = opened(DEFORM, deform_interface(bundle)) if self.settings.deformed else None
         self._map_channels, self._map_type = map_channels(bundle), map_type(bundle)
         self._canvases = [self._new_canvas()]
-        self._builders = [self.spec.table_builder()]
+        self._builders = [self.spec.rulebook_builder()]
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedVoxels:
         """Points (N, 4), metres, LiDAR frame, and reflectance -> the map seen from above."""
@@ -168,7 +167,7 @@ class PvRcnnPipeline:
         laps.append(("keypoints", perf_counter()))
         balls = balls_around(raw.scan, self.settings, places)
         laps.append(("neighbors", perf_counter()))
-        features = self.describe(raw.scan, raw.levels, raw.bev, places, balls)
+        features = self.encode_keypoints(raw.scan, raw.levels, raw.bev, places, balls)
         laps.append(("keypoints", perf_counter()))
         grid = grid_neighbors(raw.scan.keypoints, proposals.boxes, self.settings, self.settings.vector_cells)
         laps.append(("neighbors", perf_counter()))
@@ -178,7 +177,7 @@ class PvRcnnPipeline:
 
     def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
         """Points (N, 4), metres, LiDAR frame, and reflectance -> what voxels.onnx reads."""
-        builder = take_free(self._builders, self.spec.table_builder)
+        builder = take_free(self._builders, self.spec.rulebook_builder)
         voxelized = voxel_levels(points, self.spec, builder)
         self._builders.append(builder)
         return voxelized
@@ -202,7 +201,7 @@ class PvRcnnPipeline:
         names = list(self._deform.outputs)
         return dict(zip(names, run_graph(self._deform, names, deform_inputs(scan, self.settings, levels)), strict=True))
 
-    def describe(
+    def encode_keypoints(
         self,
         scan: VoxelScan,
         levels: Mapping[str, NDArray[np.float32]],

@@ -19,7 +19,7 @@ from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.pillar.prepare import PillarCounts
 from asca_pillars.ops.pillar.spec import PillarSpec
-from asca_pillars.ops.points import ball_query, columns
+from asca_pillars.ops.points import neighbors, sampling
 from asca_pillars.ops.points.ball_layouts import BallGroup, GroupedBalls, gather_balls, group_balls, group_widths
 from asca_pillars.ops.two_stage.decode import reported_detections
 from asca_pillars.ops.two_stage.first_stage import FirstPass, proposed_from
@@ -76,7 +76,7 @@ class RefinePipeline:
     ) -> None:
         if bundle.refine is None:
             raise BundleError(f"{folder}: a bundle of kind {bundle.kind} has no second stage")
-        for kernels in (ball_query.KERNELS, columns.KERNELS):
+        for kernels in (neighbors.KERNELS, sampling.KERNELS):
             load_kernels(kernels)  # here rather than in the first scan
         self.spec: PillarSpec = bundle.spec
         self.section = bundle.refine

@@ -1,9 +1,9 @@
-"""A checkpoint of the second stage becomes a bundle with both stages, or a clear refusal."""
+"""A checkpoint of the second stage becomes a bundle with both stages."""
 
 import dataclasses
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +17,25 @@ from asca_deploy.shipped import find_bundle
 from asca_deploy.two_stage.pipeline import RefinePipeline
 from asca_export import graphs
 from asca_export.int8 import MAX_LOGIT_ERROR, calibration_scans, logit_error, write_quantized
-from asca_export.pillar.export import draft_bundle, export_bundle, require_parity_scans, write_proven
-from asca_export.two_stage.first_stage import BundleFirstStage
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_proven
+from asca_export.two_stage.first_stage import (
+    BundleFirstStage,
+    add_neck_output,
+    add_neck_steps,
+    is_checkpoint,
+    open_exported,
+    scale_bev,
+)
 from asca_export.two_stage.graphs import export_refine
-from asca_export.two_stage.neck_output import add_neck_output, add_neck_steps, scale_bev
 from asca_export.two_stage.parity import prove_refine_parity
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.tree import pillar_spec
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector
-from asca_pillars.models.two_stage.open_first_stage import CHECKPOINT_SUFFIX, open_first_stage, with_first_stage
 from asca_pillars.ops.two_stage.first_stage import FirstStage
 
 
@@ -36,59 +43,56 @@ def export_refine_bundle(
     checkpoint: Checkpoint,
     out: str | Path,
     scans: Sequence[NDArray[np.float32]],
-    *,
-    trained_on: str = "not stated",
-    command: str = "not stated",
-    calibration: Sequence[NDArray[np.float32]] | None = None,
-    weights: Path | None = None,
-    progress: Callable[[str], None] = lambda _: None,
+    options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """Write the first stage's graphs, refine.onnx and bundle.json, and prove on `scans` that they are the checkpoint's.
+    """`asca_export.export.export_bundle` of kind pillar_refine: the first stage's graphs and refine.onnx.
 
-    Arguments as of `pillar.export.export_bundle`. The first stage is the one that the checkpoint was trained on. With
-    `calibration` it then gives way to its 8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint
-    one made on those scans. The second stage stays in float32.
+    The first stage is the one that the checkpoint was trained on. With `options.calibration` it then gives way to its
+    8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint one made on those scans. The second
+    stage stays in float32.
 
     Raises:
-        ExportError: too few scans, or PyTorch and onnxruntime differ; names the first stage that does. Or the 8-bit
-            form is not that of this first stage.
+        ExportError: as `export_bundle`, or the 8-bit form is not that of this first stage.
         AscaError: the first stage is not there any more, or another one, or has no 8-bit form.
     """
-    require_parity_scans(scans)
     config, detector = checkpoint.config, checkpoint.detector
-    if not isinstance(detector, RefineDetector):
-        raise ExportError(f"model.kind {config.model.kind}: not a second stage")
-    model = with_first_stage(dataclasses.replace(detector.model, spec=pillar_spec(config)))
-    stage = open_first_stage(model.first_stage)
+    assert isinstance(detector, RefineDetector), "it is of kind pillar_refine"
+    require_parity_scans(scans)
+    stage = open_exported(detector.model.first_stage)
+    model = with_first_stage(dataclasses.replace(detector.model, spec=pillar_spec(config)), stage)
+    calibration = options.calibration
     if calibration is not None:  # too few are told before the work, not after it
         calibration = calibration_scans(calibration, scans, model.spec).used
     with tempfile.TemporaryDirectory() as temporary, atomic_directory(out, *BUNDLE_FOLDER) as folder:
-        first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, progress)
+        in_float = ExportOptions(progress=options.progress)
+        first = _first_bundle(model.first_stage, Path(temporary) / "first", scans, in_float)
         proposing = load_pillar_bundle(first)
         _copy_first_stage(first, proposing, folder)
-        progress("Exporting the second stage and proving parity")
-        path, classes = graphs.graph_path(folder, REFINE), len(model.spec.classes)
+        options.progress("Exporting the second stage and proving parity")
         section = RefineSection(model.bev_channels, model.refine.seen, model.refine.neighbors, model.refine.scores)
-        export_refine(detector.refiner, section, classes, path)
+        export_refine(detector.refiner, section, len(model.spec.classes), graphs.graph_path(folder, REFINE))
         draft = draft_bundle(
-            checkpoint._replace(config=dataclasses.replace(config, model=model)),
+            PillarBundle,
+            model.spec,
+            checkpoint,
             scans,
-            trained_on,
-            command,
+            options,
+            kind="pillar_refine",
             pillar=proposing.pillar,
             backbone_gmac=proposing.backbone_gmac,
             refine=section,
         )
 
-        def prove(signed: PillarBundle) -> Parity:
-            pipeline = RefinePipeline(folder, signed, threads=default_threads())
+        def prove(opened: PillarBundle) -> Parity:
+            pipeline = RefinePipeline(folder, opened, threads=default_threads())
             return prove_refine_parity(detector.refiner, stage, pipeline, model, scans)
 
-        bundle = write_proven(folder, draft, prove, weights)
+        bundle = write_proven(folder, draft, prove, options.weights)
         if calibration is None:
             return bundle
-        progress("Putting the first stage in 8 bits")
-        eight_bit = _first_bundle(model.first_stage, Path(temporary) / "int8", scans, progress, calibration)
+        options.progress("Putting the first stage in 8 bits")
+        in_steps = dataclasses.replace(in_float, calibration=calibration)
+        eight_bit = _first_bundle(model.first_stage, Path(temporary) / "int8", scans, in_steps)
         return _in_eight_bits(folder, bundle, first, eight_bit, scans, calibration)
 
 
@@ -142,15 +146,9 @@ def _neck_gains(
     return np.where(silent, 1, products / np.where(silent, 1, squares)).astype(np.float32)
 
 
-def _first_bundle(
-    source: str,
-    temporary: Path,
-    scans: Sequence[NDArray[np.float32]],
-    progress: Callable[[str], None],
-    calibration: Sequence[NDArray[np.float32]] | None = None,
-) -> Path:
-    """Folder of the first stage, with `calibration` in 8 bits; a checkpoint is exported to `temporary`."""
-    if Path(source).suffix != CHECKPOINT_SUFFIX:
-        return find_bundle(source if calibration is None else f"{source.rstrip('/')}_int8")
-    export_bundle(load_checkpoint(source), temporary, scans, calibration=calibration, progress=progress)
+def _first_bundle(source: str, temporary: Path, scans: Sequence[NDArray[np.float32]], options: ExportOptions) -> Path:
+    """Folder of the first stage, with `options.calibration` in 8 bits; a checkpoint is exported to `temporary`."""
+    if not is_checkpoint(source):
+        return find_bundle(source if options.calibration is None else f"{source.rstrip('/')}_int8")
+    export_pillar_bundle(load_checkpoint(source), temporary, scans, options)
     return temporary

@@ -21,7 +21,7 @@ from asca_pillars.data.inspection.measurements import measure_scan
 from asca_pillars.data.inspection.proposal import differences, propose
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.ops.pv_rcnn.voxels import voxelize
-from asca_pillars.ops.sparse.rulebook import CellMap
+from asca_pillars.ops.sparse.rulebooks import CellMap
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.training.dataset import open_dataset
 from tests.data.boxes.box_scenes import write_box_dataset

@@ -20,7 +20,7 @@ from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_export import graphs, reissue
 from asca_export.fast_forms import FastBackbone
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pillar import CpaReading
 from asca_pillars.data.kitti import KittiSplit
@@ -71,7 +71,7 @@ def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
         encode.norm.weight.mul_(1e5)
         encode.norm.bias.mul_(1e5)
         first.weight.div_(1e5)
-    parity = export_bundle(checkpoint, tmp_path, SCANS).parity
+    parity = export_pillar_bundle(checkpoint, tmp_path, SCANS).parity
     assert parity is not None and parity.head_maps_max_abs_error <= MAP_TOLERANCE
 
 
@@ -114,7 +114,7 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
     wrong = FastBackbone(other)
     monkeypatch.setattr(graphs, "export_backbone", lambda _, shape, path: export_backbone(wrong, shape, path))
     with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime part at stage head `boxes`: .* 0\.01"):
-        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS)
+        export_pillar_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS)
     assert {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["bundle"], "temporary files are left"
 
@@ -124,7 +124,7 @@ def test_the_expected_input_is_the_checkpoints_own(exported: Exports, tmp_path: 
     assert measured.expected_input == measure_expected_input(SCANS, checkpoint.config.data.camera_view)
     assert measured.expected_input_from == "export"
     known = ExpectedInput((1, 2), (0.1, 0.2), None, camera_view=False)
-    copied = export_bundle(checkpoint._replace(expected_input=known), tmp_path / "copied", SCANS)
+    copied = export_pillar_bundle(checkpoint._replace(expected_input=known), tmp_path / "copied", SCANS)
     assert load_pillar_bundle(tmp_path / "copied") == copied
     assert (copied.expected_input, copied.expected_input_from) == (known, "training")
 
@@ -149,16 +149,16 @@ def test_a_bundle_issued_again_runs_the_same_networks(exported: Exports, tmp_pat
 
 def test_too_few_scans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="7 scans given"):
-        export_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS[:7])
+        export_pillar_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS[:7])
 
 
 @pytest.mark.parametrize("neck", ["dense", "sparse"])
 def test_parity_is_not_proven_on_nothing(neck: str, tmp_path: Path) -> None:
     behind = [points * np.array([-1, 1, 1, 1], np.float32) for points in SCANS]
     with pytest.raises(ExportError, match="none of the scans given to prove parity on has a point"):
-        export_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", behind)
+        export_pillar_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", behind)
     assert not list(tmp_path.iterdir())
-    bundle = export_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", [*SCANS, behind[0]])
+    bundle = export_pillar_bundle(tiny_checkpoint("none", neck=neck), tmp_path / "bundle", [*SCANS, behind[0]])
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS)
 
 
@@ -225,7 +225,7 @@ def test_parity_on_real_scans_on_the_papers_grid(tmp_path: Path, cpa: CpaReading
     scans = [read_scan(split.scan_path(frame_id)).points for frame_id in split.frame_ids]
     # Attention among the points of every pillar takes seconds a scan in PyTorch: a quarter of the pillars then.
     limits = PillarLimits(max_pillars=3000) if cpa == "point" else PillarLimits()
-    parity = export_bundle(tiny_checkpoint(cpa, PillarSpec(limits=limits)), tmp_path, scans).parity
+    parity = export_pillar_bundle(tiny_checkpoint(cpa, PillarSpec(limits=limits)), tmp_path, scans).parity
     assert parity is not None and parity.scans == len(scans)
     assert parity.box_max_error_m <= 0.01 and parity.yaw_max_error_rad <= np.deg2rad(0.5)
 

@@ -10,15 +10,17 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
-from asca_export.pillar.export import export_bundle
+from asca_export.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
 from asca_export.pillar.masked_forms import NEVER, MarkedEncoder, MaskedBackbone
+from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage.first_stage import BundleFirstStage
 from asca_pillars.base.errors import ExportError
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pillar.preparation import batch_pillars
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 from tests.deploy.conftest import needs_openvino
 from tests.export.test_sparse_bundle import NOTHING, ONE_POINT, sparse_checkpoint
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint, tiny_detector
@@ -33,8 +35,8 @@ LEFT = [points[points[:, 1] > 4] for points in SCANS]
 def bundles(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The same weights with tables and with masks."""
     folder, checkpoint = tmp_path_factory.mktemp("bundles"), sparse_checkpoint(request.param)
-    export_bundle(checkpoint, folder / "sparse", SCANS)
-    export_bundle(checkpoint, folder / "dense", SCANS, dense_neck=True)
+    export_pillar_bundle(checkpoint, folder / "sparse", SCANS)
+    export_pillar_bundle(checkpoint, folder / "dense", SCANS, ExportOptions(dense_neck=True))
     return folder / "sparse", folder / "dense"
 
 
@@ -55,7 +57,7 @@ def _canvas(detector: PillarDetector, features: Tensor, cells: Tensor) -> Tensor
     return F.pad(image, (0, 0, 1, 0, 1, 0))
 
 
-def _rows(maps: tuple[Tensor, ...], tables: NeckTables[Tensor]) -> HeadMaps[Tensor]:
+def _rows(maps: tuple[Tensor, ...], tables: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
     return HeadMaps(*(part.flatten(0, 2)[tables.head_cells.long()] for part in maps))
 
 
@@ -117,12 +119,17 @@ def test_openvino_runs_it(bundles: tuple[Path, Path]) -> None:
 def test_a_graph_with_scores_elsewhere_is_no_proof(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("asca_export.parity.NEVER", -9.0)
     with pytest.raises(ExportError, match="head `scores` of inactive cells"):
-        export_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", LEFT, dense_neck=True)
+        export_pillar_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", LEFT, ExportOptions(dense_neck=True))
     assert not (tmp_path / "bundle").exists()
 
 
 def test_what_has_no_such_form_is_refused_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="--dense-neck: the neck of this model is dense"):
-        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, dense_neck=True)
+        export_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS, ExportOptions(dense_neck=True))
     with pytest.raises(ExportError, match="--dense-neck with --int8"):
-        export_bundle(sparse_checkpoint("sub"), tmp_path / "bundle", SCANS, dense_neck=True, calibration=CALIBRATION)
+        export_bundle(
+            sparse_checkpoint("sub"),
+            tmp_path / "bundle",
+            SCANS,
+            ExportOptions(dense_neck=True, calibration=CALIBRATION),
+        )

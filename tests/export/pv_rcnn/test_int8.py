@@ -20,6 +20,7 @@ from asca_deploy.pv_rcnn.graphs import OUT, voxel_inputs
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export import graphs, int8
 from asca_export.int8 import logit_error
+from asca_export.proven_bundle import ExportOptions
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle
 from asca_export.pv_rcnn.voxel_forms import VoxelProducts, VoxelSample, scale_voxels_to_steps
@@ -44,7 +45,7 @@ def random_checkpoint() -> Checkpoint:
     scans = batch(detector, frame(50), frame(51)).scans
     with torch.no_grad():
         first = detector.network.train().propose(scans)
-        detector.network.describe(scans, first.levels, first.canvas)
+        detector.network.encode_keypoints(scans, first.levels, first.canvas)
         for part in (detector.network.head.scores, detector.network.head.boxes):
             part.weight.normal_(0, 0.02)
     model = dataclasses.replace(MODEL, spec=SPEC.with_score_threshold(0.02))
@@ -134,7 +135,7 @@ def test_what_the_second_stage_reads_is_what_it_was(folders: tuple[Path, Path]) 
             assert found.levels[name].dtype == np.float32 and error < 0.1, name
         first = [pipeline.infer(each, []) for pipeline, each in ((floating, wanted), (eight_bit, found))]
         features = [
-            pipeline.describe(each.scan, each.levels, each.bev, {}, each.scan.ball_indices)
+            pipeline.encode_keypoints(each.scan, each.levels, each.bev, {}, each.scan.ball_indices)
             for pipeline, each in zip((floating, eight_bit), first, strict=True)
         ]
         errors.append(np.sqrt(np.square(features[1] - features[0]).mean()) / features[0].std())
@@ -226,11 +227,11 @@ def test_layers_that_hurt_stay_in_floating_point(
 
 def test_what_is_not_put_in_8_bits(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="8 were left out because parity is proven on them"):
-        export_pv_rcnn_bundle(random_checkpoint(), tmp_path / "bundle", SCANS, calibration=SCANS)
+        export_pv_rcnn_bundle(random_checkpoint(), tmp_path / "bundle", SCANS, ExportOptions(calibration=SCANS))
     model = dataclasses.replace(MODEL, network=dataclasses.replace(NETWORK, attention="rda"))
     attentive = Checkpoint(tiny_config(model), tiny_detector(network=model.network).eval(), 0)
     with pytest.raises(ExportError, match=r"model\.network\.attention rda: .* leave --int8 out"):
-        export_pv_rcnn_bundle(attentive, tmp_path / "bundle", SCANS, calibration=CALIBRATION)
+        export_pv_rcnn_bundle(attentive, tmp_path / "bundle", SCANS, ExportOptions(calibration=CALIBRATION))
     assert not list(tmp_path.iterdir())
 
 

@@ -17,7 +17,8 @@ from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.two_stage.pipeline import RefinePipeline
 from asca_export.int8 import MAX_LOGIT_ERROR
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
+from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage import export as refine_exporter
 from asca_export.two_stage.export import export_refine_bundle
 from asca_export.two_stage.graphs import fold_norms
@@ -45,11 +46,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         last = train(config, write_dataset(folder / "data", 5), folder / "run")
 
         def export_and_keep(checkpoint: Checkpoint, out: Path, *rest: Any, **options: Any) -> None:
-            export_bundle(checkpoint, out, *rest, **options)
+            export_pillar_bundle(checkpoint, out, *rest, **options)
             shutil.copytree(out, folder / "first_stage")
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(refine_exporter, "export_bundle", export_and_keep)
+            patch.setattr(refine_exporter, "export_pillar_bundle", export_and_keep)
             export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
 
     folder = made_once(tmp_path_factory, "refine", make)
@@ -94,7 +95,9 @@ def test_a_sparse_neck_on_a_pooled_map_proposes(tmp_path: Path) -> None:
 
 def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Path) -> None:
     checkpoint = load_checkpoint(trained[0])
-    quantized = export_refine_bundle(checkpoint, tmp_path / "a", SCANS, calibration=CALIBRATION, weights=trained[0])
+    quantized = export_refine_bundle(
+        checkpoint, tmp_path / "a", SCANS, ExportOptions(calibration=CALIBRATION, weights=trained[0])
+    )
     assert load_checkpoint(tmp_path / "a" / "weights.ckpt").config == checkpoint.config
     assert (quantized.name, quantized.precision, quantized.kind) == ("tiny_refine_int8", "int8", "pillar_refine")
     assert load_pillar_bundle(tmp_path / "a") == quantized
@@ -112,23 +115,24 @@ def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Pat
 def test_eight_bits_of_other_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bundle's 8-bit form goes by its name; another network may stand there."""
     monkeypatch.chdir(tmp_path)
-    export_bundle(tiny_checkpoint("channel"), "first", SCANS)
+    save_checkpoint(Path("first.ckpt"), tiny_checkpoint("channel"))
+    export_pillar_bundle(tiny_checkpoint("channel"), "first", SCANS, ExportOptions(weights=Path("first.ckpt")))
     config = opened_config(Path("first"))
     torch.manual_seed(0)
     detector = build_model(config.model)
     assert isinstance(detector, RefineDetector)
     checkpoint = Checkpoint(config, detector.eval(), 0)
     with pytest.raises(ExportError, match="0 scans with points on the grid given to calibrate on, at least 8"):
-        export_refine_bundle(checkpoint, "out", SCANS, calibration=SCANS)
+        export_refine_bundle(checkpoint, "out", SCANS, ExportOptions(calibration=SCANS))
     with pytest.raises(BundleError, match="first_int8: no such folder"):
-        export_refine_bundle(checkpoint, "out", SCANS, calibration=CALIBRATION)
+        export_refine_bundle(checkpoint, "out", SCANS, ExportOptions(calibration=CALIBRATION))
     other = tiny_checkpoint("channel")
     with torch.no_grad():
         assert isinstance(other.detector, PillarDetector)
         other.detector.head.scores.weight.mul_(-1)
-    export_bundle(other, "first_int8", SCANS, calibration=CALIBRATION)
+    export_pillar_bundle(other, "first_int8", SCANS, ExportOptions(calibration=CALIBRATION))
     with pytest.raises(ExportError, match="it is not its 8-bit form"):
-        export_refine_bundle(checkpoint, "out", SCANS, calibration=CALIBRATION)
+        export_refine_bundle(checkpoint, "out", SCANS, ExportOptions(calibration=CALIBRATION))
     assert not Path("out").exists()
 
 
@@ -192,7 +196,7 @@ def test_a_refiner_with_other_weights_is_no_parity(
 ) -> None:
     first_stage = trained[1].with_name("first_stage")  # as exported above
     monkeypatch.setattr(
-        refine_exporter, "export_bundle", lambda _, out, *rest, **options: shutil.copytree(first_stage, out)
+        refine_exporter, "export_pillar_bundle", lambda _, out, *rest, **options: shutil.copytree(first_stage, out)
     )
     checkpoint = load_checkpoint(trained[0])
     assert isinstance(checkpoint.detector, RefineDetector)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from asca_deploy import Detector
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
@@ -154,7 +154,7 @@ def test_boxes_are_decoded_as_theirs() -> None:
 
 def test_it_runs_as_a_bundle_with_its_direction_bins(foreign: PointPillars, tmp_path: Path) -> None:
     checkpoint = imported(foreign, tmp_path)
-    bundle = export_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    bundle = export_pillar_bundle(checkpoint, tmp_path / "bundle", SCANS)
     assert bundle.spec.direction_offset_rad == -math.pi / 2
     assert_same_detector(checkpoint, tmp_path / "bundle", tmp_path)
     detections = Detector(tmp_path / "bundle")(SCANS[0])

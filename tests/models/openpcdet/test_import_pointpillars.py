@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from asca_deploy.browser_page import write_page
-from asca_export.pillar.export import export_bundle
+from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import BundleError, ConfigError, TrainingError
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config, load_config
@@ -131,7 +131,7 @@ def test_boxes_are_decoded_as_theirs() -> None:
 
 
 def test_it_runs_as_a_bundle(imported: Checkpoint, tmp_path: Path) -> None:
-    bundle = export_bundle(imported, tmp_path / "bundle", SCANS)
+    bundle = export_pillar_bundle(imported, tmp_path / "bundle", SCANS)
     assert bundle.parity is not None and bundle.provenance.steps == 18560
     assert bundle.spec.anchor_places == "ends" and bundle.spec.anchor_scores == "every"
     assert_same_detector(imported, tmp_path / "bundle", tmp_path)

@@ -22,7 +22,7 @@ from asca_pillars.ops.two_stage.prepare import grid_neighbors
 from tests.models.openpcdet.foreign_networks import PvRcnn, pooled, random_weights, write_foreign
 from tests.models.pv_rcnn import tiny_pv_rcnn
 from tests.models.pv_rcnn.tiny_pv_rcnn import NETWORK, SETTINGS, batch, frame
-from tests.ops.sparse.test_rulebook import at_cells, dense
+from tests.ops.sparse.test_rulebooks import at_cells, dense
 
 SPEC = dataclasses.replace(  # with the strides of the published model, which has no other kernels
     tiny_pv_rcnn.SPEC, grid=VoxelGrid((4.8, 24.0), (-6.4, 6.4), (-3.0, 1.0), (0.2, 0.2, 0.1)), last_stride=2
@@ -139,7 +139,7 @@ def assert_same_parts(theirs: Parts, ours: OurNetwork) -> None:
         for ours_map, their_map in zip(first.maps, theirs.head(theirs.backbone(seen_from_above)), strict=True):
             torch.testing.assert_close(ours_map, their_map, atol=1e-4, rtol=1e-3)
 
-        described, logits = ours.describe(scans, first.levels, first.canvas)
+        described, logits = ours.encode_keypoints(scans, first.levels, first.canvas)
         cells = seen_from_above[0].flatten(1).T
         parts: Any = [sum(cells[scans.bev_cells[:, i]] * scans.bev_weights[:, i, None] for i in range(4))]
         sources = {"points": scans.points[:, 3:], "conv2": first.levels[1], "conv4": first.levels[3]}

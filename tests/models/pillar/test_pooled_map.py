@@ -10,7 +10,7 @@ import torch
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
-from asca_pillars.ops.pillar.map_pooling import pool_pillars
+from asca_pillars.ops.pillar.grid import pool_pillars
 from tests.scenes import SPEC, make_scene
 
 POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled"))

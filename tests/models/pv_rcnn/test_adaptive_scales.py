@@ -9,10 +9,9 @@ import torch
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.models.pv_rcnn.adaptive_scales import AdaptiveScales, Adjustment
-from asca_pillars.ops.points.ball_query import three_nearest
-from asca_pillars.ops.points.farthest_points import farthest_points
-from asca_pillars.ops.points.point_scales import PointScale, point_scales
+from asca_pillars.models.pv_rcnn.keypoints import AdaptiveScales, Adjustment
+from asca_pillars.ops.points.neighbors import PointScale, point_scales, three_nearest
+from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import VARIANTS, batch, frame, tiny_detector
 from tests.ops.points.clouds import cloud

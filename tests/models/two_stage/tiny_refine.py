@@ -6,10 +6,10 @@ from pathlib import Path
 from asca_pillars.config.pillar import CpaReading
 from asca_pillars.config.tree import AugmentConfig, Config, DataConfig, TrainConfig
 from asca_pillars.config.two_stage import RefineConfig, RefineModel, RefineNetwork
-from asca_pillars.models.two_stage.open_first_stage import with_first_stage
+from asca_pillars.detection.proposals import ProposalSettings
+from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings, KeypointSettings
 from asca_pillars.ops.two_stage.prepare import RefineSettings
-from asca_pillars.ops.two_stage.proposals import ProposalSettings
 from tests.export.tiny import tiny_checkpoint
 from tests.saved_checkpoint import save_checkpoint
 

@@ -208,7 +208,7 @@ def test_advice_on_x_works(start_m: float | None, length_m: float, v_max_m: floa
     for proposed in ranges:
         PillarGrid(x_range_m=proposed, v_max_m=v_max_m, zones=zones)
         assert abs((proposed[1] - proposed[0]) - length_m) <= max(step_m, 1e-3)  # one of the two nearest
-        assert (proposed[0] == -proposed[1]) if start_m is None else (proposed[0] == start_m)
+        assert (proposed[0] == -proposed[1]) if span[0] == -span[1] else (proposed[0] == start_m)
     (size,) = re.findall(r"v_max_m (\S+?)(?:,|$)", advice)
     PillarGrid(x_range_m=span, v_max_m=float(size), zones=zones)
     for k in re.findall(r"\d", advice.split("zones ")[1]) if "zones" in advice else []:

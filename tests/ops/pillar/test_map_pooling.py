@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from asca_pillars.ops.pillar.grid import PillarGrid
-from asca_pillars.ops.pillar.map_pooling import map_cells, pool_pillars
+from asca_pillars.ops.pillar.grid import PillarGrid, map_cells, pool_pillars
 
 
 def pooled_grid(zones: int) -> PillarGrid:

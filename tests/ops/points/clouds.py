@@ -1,28 +1,7 @@
-"""Clouds of points, and the forms of a function: numba's and NumPy's."""
-
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from typing import Any
-from unittest.mock import patch
+"""Clouds of points."""
 
 import numpy as np
 from hypothesis import strategies as st
-
-_MODULES = ("columns", "farthest_points", "ball_query", "bilinear", "cube_neighbors")
-
-
-def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The function's result where numba is not installed."""
-    with ExitStack() as stack:
-        for name in _MODULES:
-            stack.enter_context(patch(f"asca_pillars.ops.points.{name}.load_kernels", lambda _: None))
-        return function(*arguments)
-
-
-def both_forms(function: Callable[..., Any], *arguments: Any) -> Iterator[Any]:
-    """The result of numba's form and that of NumPy's."""
-    yield function(*arguments)
-    yield by_numpy(function, *arguments)
 
 
 def cloud(seed: int, count: int, spread_m: float, coarse: bool) -> np.ndarray:

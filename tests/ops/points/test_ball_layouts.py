@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asca_pillars.ops.points.ball_layouts import gather_balls, group_balls, group_widths
-from asca_pillars.ops.points.ball_query import ball_query
+from asca_pillars.ops.points.neighbors import ball_query
 from tests.ops.points.clouds import CLOUDS
 
 RADII = st.sampled_from([0.05, 1.0, 2.5, 50.0])

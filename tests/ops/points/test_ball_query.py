@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.ball_query import ball_query, three_nearest
-from tests.ops.points.clouds import CLOUDS, both_forms, cloud
+from asca_pillars.ops.points.neighbors import ball_query, three_nearest
+from tests.ops.numpy_kernels import both_forms
+from tests.ops.points.clouds import CLOUDS, cloud
 
 RADII = st.sampled_from([0.05, 0.4, 1.0, 2.5, 50.0])
 

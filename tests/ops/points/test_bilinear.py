@@ -6,8 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.bilinear import bilinear_cells, read_map
-from tests.ops.points.clouds import both_forms
+from asca_pillars.ops.points.sampling import bilinear_cells, read_map
+from tests.ops.numpy_kernels import both_forms
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.cube_neighbors import cube_cells_m, nearest_in_cubes
-from tests.ops.points.clouds import CLOUDS, both_forms
+from asca_pillars.ops.points.neighbors import cube_cells_m, nearest_in_cubes
+from tests.ops.numpy_kernels import both_forms
+from tests.ops.points.clouds import CLOUDS
 
 
 @given(CLOUDS, CLOUDS, st.sampled_from([0.05, 0.8, 1.6, 40.0]), st.integers(1, 3))

@@ -6,8 +6,9 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_pillars.ops.points.farthest_points import farthest_points, points_near_boxes
-from tests.ops.points.clouds import CLOUDS, both_forms, by_numpy, cloud
+from asca_pillars.ops.points.sampling import farthest_points, points_near_boxes
+from tests.ops.numpy_kernels import both_forms, by_numpy
+from tests.ops.points.clouds import CLOUDS, cloud
 
 
 def plain(points: np.ndarray, count: int) -> list[int]:

@@ -1,23 +1,16 @@
 """Voxels against a loop over points, and the compiled loops against NumPy's."""
 
-from unittest.mock import patch
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, Voxels, voxelize
-from asca_pillars.ops.sparse.rulebook import CellMap
-from tests.ops.sparse.test_rulebook import numpy_map
+from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, voxelize
+from asca_pillars.ops.sparse.rulebooks import CellMap
+from tests.ops import numpy_kernels
 
 GRID = VoxelGrid((1.0, 4.0), (-2.0, 1.2), (-1.5, 0.5), (0.3, 0.2, 0.1), max_points=3)
-
-
-def in_numpy(points: np.ndarray, grid: VoxelGrid) -> Voxels:
-    with patch("asca_pillars.ops.pv_rcnn.voxels.load_kernels", lambda _: None):
-        return voxelize(points, grid, numpy_map(grid.shape))
 
 
 def cloud(seed: int, count: int, spread_m: float, odd: float) -> np.ndarray:
@@ -42,7 +35,7 @@ def cloud(seed: int, count: int, spread_m: float, odd: float) -> np.ndarray:
 def test_voxels_are_the_same_in_numpy(seed: int, count: int, spread_m: float, odd: float) -> None:
     points, cell_map = cloud(seed, count, spread_m, odd), CellMap(GRID.shape)
     voxelize(cloud(seed + 1, count, spread_m, odd), GRID, cell_map)  # of which nothing may stay
-    found, expected = voxelize(points, GRID, cell_map), in_numpy(points, GRID)
+    found, expected = voxelize(points, GRID, cell_map), numpy_kernels.voxels(points, GRID)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one, other)
     assert found.features.dtype == expected.features.dtype == np.float32
@@ -57,14 +50,15 @@ def test_the_last_point_of_a_range_is_in_its_last_voxel(count: int, size_m: floa
     ends = np.array([low_m, low_m + count * size_m], np.float32)
     points = np.array([[ends[0], 0.15, 0.15], [np.nextafter(ends[1], ends[0]), 0.15, 0.15]], np.float32)
     cells = grid.cells(points)
-    with patch("asca_pillars.ops.pv_rcnn.voxels.load_kernels", lambda _: None):
-        np.testing.assert_array_equal(cells, grid.cells(points))
+    np.testing.assert_array_equal(cells, numpy_kernels.voxel_cells(points, grid))
     assert grid.shape == (2, 2, count)
     columns = (0, count - 1)
     assert cells.tolist() == [(count + column) * 2 + 1 for column in columns], "second row of y, second layer of z"
 
 
-@pytest.mark.parametrize("form", [lambda p: voxelize(p, GRID, CellMap(GRID.shape)), lambda p: in_numpy(p, GRID)])
+@pytest.mark.parametrize(
+    "form", [lambda p: voxelize(p, GRID, CellMap(GRID.shape)), lambda p: numpy_kernels.voxels(p, GRID)]
+)
 def test_voxels_hold_the_mean_of_their_first_points(form: object) -> None:
     points = cloud(7, 400, 0.5, 0.0)
     nz, ny, nx = GRID.shape

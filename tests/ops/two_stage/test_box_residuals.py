@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.ops.two_stage.box_residuals import decode_refinement, encode_refinement
+from asca_pillars.ops.two_stage.rois import decode_refinement, encode_refinement
 from tests.ops.points.boxes_near import CHANGES, PROPOSALS, changed
 
 

@@ -5,8 +5,8 @@ import numpy as np
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.detections import Detections
-from asca_pillars.ops.two_stage.box_residuals import encode_refinement
 from asca_pillars.ops.two_stage.decode import refined_detections, refined_scores, reported_detections
+from asca_pillars.ops.two_stage.rois import encode_refinement
 
 NAMES = ("Car", "Cyclist")
 POST = PostProcess(nms_iou=0.1, max_detections=3)

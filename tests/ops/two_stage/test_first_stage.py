@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.proposals import ProposalSettings
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, KeypointSettings, propose_on
-from asca_pillars.ops.two_stage.proposals import ProposalSettings
 from tests.models.two_stage.random_stage import CHANNELS, SETTINGS, RandomStage
 from tests.scenes import SPEC, make_scene
 

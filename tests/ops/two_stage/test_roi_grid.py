@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asca_pillars.geometry.boxes import corners, points_in_boxes, wrap_angle
-from asca_pillars.ops.two_stage.roi_grid import (
+from asca_pillars.ops.two_stage.rois import (
     boxes_from_frames,
     boxes_in_frames,
     from_box_frames,

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.detections import Detections
-from asca_pillars.ops.two_stage.box_residuals import decode_refinement
-from asca_pillars.ops.two_stage.roi_targets import (
+from asca_pillars.ops.two_stage.rois import (
     FOREGROUND_IOU,
     HARD_IOU,
     Overlaps,
+    decode_refinement,
     keypoint_states,
     match_proposals,
     roi_targets,

@@ -1,0 +1,167 @@
+"""Neighbors of queries: in balls (PointNet++), the nearest three, in cells of cubes (VectorPool), at several scales.
+
+Index N, one past the last point, stands for nothing: whoever gathers rows appends a row of zeros.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.kernels import load_kernels
+from asca_pillars.ops.points.sampling import require_points, sort_into_columns
+
+KERNELS = "asca_pillars.ops.points.ball_kernels"
+# A column is a little narrower than a quarter of the radius: a ball has about 69 columns, and the first visited do not
+# all lie on one side. Of many points at least eight columns get a share.
+_COLUMNS_PER_RADIUS = 4.01
+_COLUMNS_TO_FILL = 8
+_ROUNDING = 1e-3  # of a column: how far float32 may misplace a point that stands on a border
+
+
+def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, samples: int) -> NDArray[np.int32]:
+    """For each query the indices of up to `samples` points nearer than the radius: (N, 3), (Q, 3) -> (Q, samples).
+
+    A ball of fewer points has them as they are stored, then its first one again and again; one without any has N.
+
+    The columns of a full ball are visited in a pseudo-random order that depends on their number alone, the points of a
+    column as they are stored, and the first `samples` found are taken: at first no more than an eighth of them from one
+    column, then, if that is not enough, the others. PointNet++ takes the first in the order of storage, which in a scan
+    are all of one ring.
+
+    Args:
+        points: (N, >=3) finite x, y, z in metres; N may be 0.
+        queries: (Q, >=3) finite x, y, z in metres, anywhere.
+        radius_m: squared distances in float32 must be below its square.
+
+    Raises:
+        ValueError: another shape, or a coordinate that is not finite.
+    """
+    xyz, centers = require_points(points), require_points(queries)
+    columns = sort_into_columns(xyz, radius_m / _COLUMNS_PER_RADIUS)
+    offsets = _visiting_order(radius_m * float(columns.per_m))
+    squared = np.float32(radius_m) * np.float32(radius_m)
+    query = load_kernels(KERNELS).ball_query
+    return np.asarray(query(xyz, centers, columns, offsets, squared, samples, -(-samples // _COLUMNS_TO_FILL)))
+
+
+def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The three points nearest to each query and their weights: (N, 3), (Q, 3) -> (Q, 3) indices, (Q, 3) weights.
+
+    Weights are inverse distances that sum to 1 (PointNet++, section 3.4). Nearest first, of equally near ones the
+    earlier; with fewer than three points the rest is index N with weight 0.
+
+    Raises:
+        ValueError: another shape, or a coordinate that is not finite.
+    """
+    xyz, centers = require_points(points), require_points(queries)
+    column_m = math.sqrt(_area_m2(xyz) / max(len(xyz), 1)) + 1e-3  # about one point in each
+    nearest, squared = load_kernels(KERNELS).three_nearest(xyz, centers, sort_into_columns(xyz, column_m))
+    found = nearest < len(xyz)
+    weights = np.where(found, 1 / (np.sqrt(squared) + np.float32(1e-8)), np.float32(0))
+    total = weights.sum(axis=1, keepdims=True)
+    return nearest, np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
+
+
+@lru_cache(maxsize=64)  # the radius in columns follows the scan where that is wide
+def _visiting_order(radius: float) -> NDArray[np.int32]:
+    """(row, column) offsets (M, 2) of the columns that a ball of so many columns' radius can reach, shuffled."""
+    reach = math.ceil(radius + _ROUNDING)
+    offsets = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - reach
+    gap = np.maximum(np.abs(offsets) - 1 - _ROUNDING, 0)
+    offsets = offsets[np.hypot(*gap.T) < radius]
+    order = np.random.Generator(np.random.PCG64(len(offsets))).random(len(offsets)).argsort()
+    offsets = offsets[order].astype(np.int32)
+    offsets.flags.writeable = False
+    return offsets
+
+
+def _area_m2(xyz: NDArray[np.float32]) -> float:
+    if not len(xyz):
+        return 0.0
+    return float(np.prod(np.ptp(xyz[:, :2].astype(np.float64), axis=0)))
+
+
+_CUBE_ROUNDING = 1e-2  # of a column: how far float32 may misplace a point that stands on a border
+
+
+def cube_cells_m(half_length_m: float, cells: int) -> NDArray[np.float32]:
+    """Centers of the cells of a cube, seen from its own: (cells^3, 3) metres; z varies fastest, x slowest."""
+    share = (np.indices((cells, cells, cells)).reshape(3, -1).T + 0.5) * (2 / cells) - 1
+    return np.ascontiguousarray(half_length_m * share, np.float32)
+
+
+def nearest_in_cubes(
+    points: NDArray[Any], queries: NDArray[Any], half_length_m: float, cells: int
+) -> NDArray[np.int32]:
+    """The three points nearest to each cell of a cube around each query: (N, 3), (Q, 3) -> (Q, cells^3, 3) indices.
+
+    Points count that are less than twice the half length away from the query along every axis (VectorPool; AV PV-RCNN,
+    eq. 12 and 13). Nearest first, of equally near ones the earlier; with fewer than three points the rest is index N.
+
+    Args:
+        points: (N, >=3) finite x, y, z in metres; N may be 0.
+        queries: (Q, >=3) finite x, y, z in metres, anywhere.
+        half_length_m: half the length of the cube, whose edges are along the axes.
+        cells: of the cube along each axis.
+
+    Raises:
+        ValueError: another shape, or a coordinate that is not finite.
+    """
+    xyz, centers = require_points(points), require_points(queries)
+    offsets, reach_m = cube_cells_m(half_length_m, cells), np.float32(2 * half_length_m)
+    columns = sort_into_columns(xyz, float(reach_m))
+    around = (centers[:, 1::-1].astype(np.float64) - columns.origin_m[::-1]) * float(columns.per_m)  # row, column
+    reach = float(reach_m) * float(columns.per_m) + _CUBE_ROUNDING
+    most = np.array(columns.shape) - 1
+    first = np.floor(np.maximum(around - reach, 0)).clip(max=most + 1).astype(np.int64)
+    last = np.floor(np.minimum(around + reach, most)).clip(min=-1).astype(np.int64)
+    return np.asarray(load_kernels(KERNELS).nearest_in_cubes(xyz, centers, columns, first, last, offsets, reach_m))
+
+
+_FEWER = 4  # a scale has a quarter of the positions of the one before
+
+Array = TypeVar("Array")
+
+
+class PointScale(NamedTuple, Generic[Array]):
+    """M positions with a group around each: of points on the finest scale, then of positions of the scale before.
+
+    Of one scan (NumPy) or of a batch (tensors).
+    """
+
+    positions: Array
+    """(M, 3), metres, LiDAR frame."""
+    groups: Array
+    """(M, samples) what is around each, see `ball_query`."""
+    nearest: Array
+    """Of each position of the scale before the three nearest of these, (_, 3); of the finest scale (0, 3)."""
+    nearest_weights: Array
+    """Likewise inverse distances, sum 1."""
+
+
+def point_scales(
+    points: NDArray[np.float32], keypoints: NDArray[np.float32], radii_m: Sequence[float], samples: int
+) -> tuple[PointScale[NDArray[Any]], ...]:
+    """A scale for each radius, the finest first: all keypoints, the first quarter of them, the first sixteenth.
+
+    Keypoints are farthest points in the order in which they were taken, so that the first of them are what sampling
+    the keypoints again would take.
+
+    Args:
+        points: (N, >=3) finite, metres, LiDAR frame.
+        keypoints: (K, 3) see `farthest_points`.
+        radii_m: of the groups.
+        samples: of each group at most.
+    """
+    scales: list[PointScale[NDArray[Any]]] = []
+    finer, positions = points, keypoints
+    for radius_m in radii_m:
+        groups = ball_query(finer, positions, radius_m, samples)
+        nearest, weights = three_nearest(positions, finer[:0] if not scales else finer)
+        scales.append(PointScale(positions, groups, nearest, weights))
+        finer, positions = positions, positions[: -(-len(positions) // _FEWER)]
+    return tuple(scales)

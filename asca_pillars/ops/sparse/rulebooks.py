@@ -1,0 +1,231 @@
+"""Sparse convolutions: which cells a kernel joins, the active cells of a lattice, and the rulebooks between two.
+
+A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row
+at which its column starts plus the number of bits set below it. No hash, no sort. Active cells are ordered by
+(y, x, z), z running fastest, which makes every rulebook and every network output independent of threads and machine.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.kernels import load_kernels
+
+Shape = tuple[int, int, int]
+"""Cells along z, y, x; a map seen from above has one along z."""
+
+
+class Links(NamedTuple):
+    """What each tap joins a cell of one lattice with on another, axis by axis.
+
+    Tap (kz, ky, kx) joins cell (z, y, x) with (links.z[z, kz], links.y[y, ky], links.x[x, kx]), or with nothing where
+    one of them is -1.
+    """
+
+    z: NDArray[np.int64]
+    """(nz, kernel along z), as the other two along theirs."""
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """A convolution's geometry; tap (kz, ky, kx) is number (kz * kernel_y + ky) * kernel_x + kx, as PyTorch stores it.
+
+    Raises:
+        ConfigError: a size that is not positive, or a padding as large as the kernel.
+    """
+
+    kernel: Shape
+    stride: Shape
+    padding: Shape
+
+    def __post_init__(self) -> None:
+        for kernel, stride, padding in zip(self.kernel, self.stride, self.padding, strict=True):
+            if kernel < 1 or stride < 1 or not 0 <= padding < kernel:
+                raise ConfigError(
+                    f"a convolution with kernel {self.kernel}, stride {self.stride} and padding {self.padding}: kernel "
+                    "and stride must be at least 1, the padding less than the kernel"
+                )
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Cells of the output for an input of this shape."""
+        sizes = zip(shape, self.kernel, self.stride, self.padding, strict=True)
+        z, y, x = ((size + 2 * padding - kernel) // stride + 1 for size, kernel, stride, padding in sizes)
+        return z, y, x
+
+    @property
+    def taps(self) -> int:
+        """K, the kernel's cells."""
+        return math.prod(self.kernel)
+
+    def inputs(self, outputs: Shape, inputs: Shape) -> Links:
+        """From an output to the inputs that it reads, on lattices of these shapes."""
+        return _links(self, outputs, inputs, backward=False)
+
+    def outputs(self, inputs: Shape, outputs: Shape) -> Links:
+        """From an input to the outputs that read it."""
+        return _links(self, inputs, outputs, backward=True)
+
+
+def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convolution:
+    """Of a map seen from above: nothing happens along z."""
+    return Convolution((1, kernel, kernel), (1, stride, stride), (0, padding, padding))
+
+
+@lru_cache(maxsize=256)  # the same few for every map
+def _links(convolution: Convolution, shape: Shape, other: Shape, *, backward: bool) -> Links:
+    axes = []
+    for axis in range(3):
+        taps, stride, padding = np.arange(convolution.kernel[axis]), convolution.stride[axis], convolution.padding[axis]
+        places = np.arange(shape[axis])[:, None]
+        joined, rest = np.divmod(places + padding - taps, stride) if backward else (places * stride - padding + taps, 0)
+        exists = (rest == 0) & (joined >= 0) & (joined < other[axis])
+        axes.append(np.where(exists, joined, -1))
+        axes[-1].flags.writeable = False
+    return Links(*axes)
+
+
+KERNELS = "asca_pillars.ops.sparse.kernels"
+MAX_Z_CELLS = 64  # the bits of a column's mask
+
+
+class Columns(NamedTuple):
+    """The lattice column by column, (ny * nx,) each."""
+
+    mask: NDArray[np.uint64]
+    """Bit z: the cell is active. A lattice one cell high has none, and -1 as the start of a column without any."""
+    start: NDArray[np.int32]
+    """Row of the column's first active cell."""
+
+
+class CellMap:
+    """Which cells of a lattice are active; made once, its memory is kept from scan to scan.
+
+    Changing the active cells clears only the columns that were in use.
+
+    Args:
+        shape: cells along z, y, x.
+
+    Raises:
+        ConfigError: more than MAX_Z_CELLS along z, or more cells in all than an int32 can number.
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        if min(shape) < 1 or shape[0] > MAX_Z_CELLS:
+            raise ConfigError(
+                f"a lattice of {shape[2]} x {shape[1]} x {shape[0]} cells: at least 1 along each axis and at most "
+                f"{MAX_Z_CELLS} along z; choose taller cells or a smaller z range"
+            )
+        if np.prod(shape, dtype=np.int64) > np.iinfo(np.int32).max:
+            raise ConfigError(
+                f"a lattice of {shape[2]} x {shape[1]} x {shape[0]} cells: too many to number; choose larger ones"
+            )
+        self.shape = shape
+        self.cells: NDArray[np.int64] = np.empty(0, np.int64)
+        """(N,) active cells, flat index (y * nx + x) * nz + z, ascending."""
+        self._kernels = load_kernels(KERNELS)
+        columns = shape[1] * shape[2]
+        masks = 0 if shape[0] == 1 else columns
+        self.columns = Columns(np.zeros(masks, np.uint64), np.full(columns + 1, -1, np.int32))
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def activate(self, cells: NDArray[np.int64]) -> None:
+        """Make these cells (N,) the active ones: flat indices, ascending, none twice."""
+        cells = np.ascontiguousarray(cells, np.int64)
+        self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
+        self._kernels.enter_cells(cells, self.shape[0], *self.columns)
+        self.cells = cells
+
+    def activate_points(self, cell_of_point: NDArray[np.int64]) -> None:
+        """Make active the cells of these points (M,): flat indices in any order, -1 for none."""
+        self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
+        self._list_cells(self._kernels.mark_points(cell_of_point, self.shape[0], *self.columns))
+
+    def activate_joined(self, sources: Sequence[tuple["CellMap", Links]]) -> None:
+        """Make active what any tap joins with an active cell of any of the sources, none of which may be this map."""
+        self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
+        found = 0
+        for source, links in sources:
+            found += self._kernels.mark_joined(source.cells, *links, self.shape[2], *self.columns)
+        self._list_cells(found)
+
+    def _list_cells(self, count: int) -> None:
+        """Make active what the kernels have marked, so many cells."""
+        cells = np.empty(count + 1, np.int64)
+        self._kernels.list_cells(*self.columns, self.shape[0], cells)
+        self.cells = cells[:count]
+
+    def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
+        """Index of the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
+
+        With `Convolution.inputs` it is what the convolution from `source` to this map reads. With `outputs` it is
+        the inverse that its backward pass reads: which output, of the map `source`, each input was read by.
+        """
+        table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in links)), np.int32)
+        self._kernels.fill_table(self.cells, *links, source.shape[2], *source.columns, len(source), table)
+        return table
+
+    def places(self, parents: "CellMap", halvings: int) -> NDArray[np.int32]:
+        """Row of each active cell of this map among the outputs of an upsampling that does not overlap.
+
+        Seen from above (one cell along z). Each parent cell has s^2 outputs, s = 2^halvings, its row of them before
+        the next parent's, (y, x) within the parent: (N,) int32, len(parents) * s^2 where the parent is not active.
+        """
+        missing = len(parents) << (2 * halvings)
+        places = np.empty(len(self.cells), np.int32)
+        self._kernels.fill_places(
+            self.cells, self.shape[2], parents.shape[2], parents.columns.start, missing, halvings, places
+        )
+        return places
+
+
+class Join(NamedTuple):
+    """A convolution between two maps; made once, as they are, for scan after scan."""
+
+    source: CellMap
+    target: CellMap
+    inputs: Links
+    """From the cells of `target` to those of `source` that they read."""
+    outputs: Links
+    """From the cells of `source` to those of `target` that read them."""
+
+    def table(self) -> NDArray[np.int32]:
+        """What the convolution reads: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
+        return self.target.table(self.source, self.inputs)
+
+    def inverse(self) -> NDArray[np.int32]:
+        """What its backward pass reads: (cells of `source`, K) rows of `target`."""
+        return self.source.table(self.target, self.outputs)
+
+
+def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
+    """The convolution from one map to another."""
+    inputs = convolution.inputs(target.shape, source.shape)
+    return Join(source, target, inputs, convolution.outputs(source.shape, target.shape))
+
+
+def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
+    """Tables (M_i, ...) of indices into features of `rows[i]` rows each -> one into all of them, (sum of M_i, ...).
+
+    What is missing, row rows[i], becomes row sum(rows).
+    """
+    starts, total = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32), sum(rows)
+    moved = [
+        np.where(table == count, np.int32(total), table + start)
+        for table, count, start in zip(tables, rows, starts[:-1], strict=True)
+    ]
+    return np.concatenate(moved)
+
+
+def stack_cells(cells: Sequence[NDArray[np.int32]], cells_per_frame: int) -> NDArray[np.int32]:
+    """Flat indices (M_i,) on each frame's map -> (sum of M_i,) on the maps of all frames, one after the other."""
+    return np.concatenate([each + np.int32(frame * cells_per_frame) for frame, each in enumerate(cells)])
