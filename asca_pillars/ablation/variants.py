@@ -17,29 +17,29 @@ class Row(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the variant."""
+        """Name of the variant."""
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """For `asca train -s`."""
+        """Settings for `asca train -s`."""
 
     @property
     def components(self) -> tuple[str, ...]:
         """Cells of the table's first columns."""
 
     def misfit(self, model: Any) -> str | None:
-        """Why the row would change more of a base's `model` than its cells say; None if it would not."""
+        """Reason why the row would change more of a base's `model` than its cells show; None if it would not."""
 
 
 class Family(NamedTuple):
     """The ablation of one family of detectors."""
 
     variants: Mapping[str, Row]
-    """By name, the baseline first."""
+    """Variants by name, the baseline first."""
     tables: Mapping[str, tuple[str, ...]]
     """Names of the rows of each table, by its title."""
     components: tuple[str, ...]
-    """Heads of the columns that say what a row has."""
+    """Headings of the columns of components."""
 
 
 _FINE_M = 0.08
@@ -61,9 +61,9 @@ class Variant:
     """Overlap from which an anchor is positive and below which it is negative, of every class but cars; None for the
     base configuration's."""
     assigner: str | None = None
-    """What matches anchors with boxes, see `model.loss`; None for the base configuration's."""
+    """Assigner of anchors to boxes, see `model.loss`; None for the base configuration's."""
     score_target: str | None = None
-    """What scores are to be, likewise."""
+    """Target of the scores, see `model.loss`; None for the base configuration's."""
     fine_pillars: bool = False
     """Pillars of 0.08 m, which make cells of the head as small as pillars are otherwise; of one zone."""
 
@@ -104,7 +104,7 @@ class Variant:
 
     @property
     def _learnt(self) -> tuple[str, ...]:
-        """Which anchors learn, and what."""
+        """Settings of the loss that this variant changes."""
         choices = {"assigner": self.assigner, "score_target": self.score_target}
         chosen = tuple(f"model.loss.{name}={choice}" for name, choice in choices.items() if choice is not None)
         if self.person_ious is None:
@@ -218,7 +218,7 @@ class TwoStageVariant:
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """For `asca train -s`."""
+        """Settings for `asca train -s`."""
         return (
             f"model.settings.deform={self.deform}",
             f"model.network.gate={self.gate}",

@@ -1,1 +1,1 @@
-"""Work over many machines: shards, what happens to one whose worker dies, and Ray, which runs them."""
+"""Work over many machines: shards, their recovery when a worker dies, and Ray, which runs them."""

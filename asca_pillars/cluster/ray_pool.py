@@ -21,17 +21,17 @@ _CONNECT_S = 10.0
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[str]:
-    """Join the cluster at an address, or start Ray on this machine for `local`; yields what there is, in words.
+    """Join the cluster at an address, or start Ray on this machine for `local`; yields a description of it.
 
     Raises:
         ClusterError: there is no such cluster, or it does not let this process in.
     """
     import ray
 
-    own = {"num_cpus": default_threads(), "include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES}
+    local = {"num_cpus": default_threads(), "include_dashboard": False, "object_store_memory": _OBJECT_STORE_BYTES}
     try:
-        _knock(address)
-        ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **(own if address == LOCAL else {}))
+        _require_listener(address)
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **(local if address == LOCAL else {}))
     except (OSError, RuntimeError, ValueError) as error:
         reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise ClusterError(
@@ -50,8 +50,8 @@ class RayPool(Generic[Result]):
     Args:
         job: called with a shard on a worker; it and its result have to be picklable.
         seen: a file that every machine must see, so that results do not go to a disk that nobody looks at.
-        cpus: that a job takes.
-        gpus: that a job takes.
+        cpus: CPUs of a job.
+        gpus: GPUs of a job.
     """
 
     def __init__(self, job: Callable[[Shard], Result], seen: Path, *, cpus: int = 1, gpus: int = 0) -> None:
@@ -65,7 +65,7 @@ class RayPool(Generic[Result]):
         self._limit, self._limit_until = 0, 0.0
 
     def has_room(self) -> bool:
-        """Whether one more shard is wanted: each worker shall have one to go on with, and the queue stay short."""
+        """Whether to submit one more shard: each worker has one waiting, and the queue stays short."""
         import ray
 
         if time.monotonic() >= self._limit_until:  # machines come and go
@@ -95,7 +95,7 @@ class RayPool(Generic[Result]):
         return [_outcome(reference, self._running.pop(reference)) for reference in ended]
 
 
-def _knock(address: str) -> None:
+def _require_listener(address: str) -> None:
     """Raise OSError if nothing listens at HOST:PORT: Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
@@ -119,8 +119,8 @@ def _outcome(reference: Any, shard: Shard) -> Outcome[Any]:
 
 def _on_worker(job: Callable[[Shard], Result], shard: Shard, seen: Path, version: str | None) -> Result:
     host = socket.gethostname()
-    if (own := _version()) != version:
-        raise ClusterError(f"{host}: has asca-pillars {own}, the command {version}; install one version everywhere")
+    if (local := _version()) != version:
+        raise ClusterError(f"{host}: has asca-pillars {local}, the command {version}; install one version everywhere")
     if not seen.is_file():
         raise ClusterError(f"{host}: does not see {seen}; write to a folder that every machine mounts at that place")
     return job(shard)

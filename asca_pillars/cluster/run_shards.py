@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.base.locks import recover
 from asca_pillars.cluster.ray_pool import RayPool, connected
-from asca_pillars.cluster.shards import Outcome, Result, Shard, cut, work_off
+from asca_pillars.cluster.shards import Outcome, Result, Shard, cut, process_shards
 
 
 def run_shards(
@@ -27,16 +27,16 @@ def run_shards(
     gpus: int = 0,
     progress: bool = True,
 ) -> Iterator[Outcome[Result]]:
-    """Do a job for each shard on a cluster; yields each one as it ends, as `schedule.work_off`.
+    """Do a job for each shard on a cluster; yields each one as it ends, as `process_shards`.
 
     Args:
         job: as for `RayPool`, as are `seen`, `cpus` and `gpus`.
-        shards: to be done.
-        address: of the cluster; `local` for this machine alone.
-        folders: that the job writes into. What killed workers left there is removed before the run and after it.
-        title: for the progress, which counts items.
-        done: items that an earlier run has done.
-        progress: whether it is shown.
+        shards: shards to do.
+        address: address of the cluster; `local` for this machine alone.
+        folders: folders that the job writes into. Leftovers of killed workers are removed before and after the run.
+        title: title of the progress bar, which counts items.
+        done: number of items that an earlier run has done.
+        progress: whether to show the bar.
 
     Raises:
         ClusterError: the cluster cannot be used.
@@ -57,7 +57,7 @@ def run_shards(
                 console.print(
                     f"no machine of the cluster has {needed}, which each worker takes: waiting for one to join"
                 )
-            for outcome in work_off(shards, pool):
+            for outcome in process_shards(shards, pool):
                 bar.advance(task, len(outcome.shard.items))
                 yield outcome
     finally:

@@ -1,4 +1,4 @@
-"""Work cut into shards whose results appear at once or not at all, and which shard is done next when a worker dies."""
+"""Work cut into shards whose results appear at once or not at all, and the order of retries when a worker dies."""
 
 import hashlib
 import json
@@ -24,12 +24,12 @@ class Shard(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Different for other items."""
+        """File name of the shard; it differs for other items."""
         return f"{self.first:09d}-{hashlib.sha256(json.dumps(self.items).encode()).hexdigest()[:12]}"
 
     @property
     def halves(self) -> tuple["Shard", "Shard"]:
-        """Two shards of these items, of which there must be two at least."""
+        """Two shards of these items; there must be at least two."""
         middle = len(self.items) // 2
         return Shard(self.first, self.items[:middle]), Shard(self.first + middle, self.items[middle:])
 
@@ -45,8 +45,8 @@ class ShardFolder:
 
     path: Path
 
-    def claim(self, settings: dict[str, Any], shard_size: int) -> int:
-        """Note what the results depend on, or make sure that the run found there is the same one.
+    def begin(self, settings: dict[str, Any], shard_size: int) -> int:
+        """Write the settings that the results depend on, or check that those of the run found there are the same.
 
         Args:
             settings: plain values by name.
@@ -64,13 +64,13 @@ class ShardFolder:
             return shard_size
         try:
             begun = json.loads(path.read_text(encoding="utf-8"))
-            found, size = {**begun["settings"]}, int(begun["shard_size"])
+            stored, size = {**begun["settings"]}, int(begun["shard_size"])
         except (ValueError, KeyError, TypeError):
             raise OutputError(f"{path}: is damaged; choose another folder, or delete {self.path}") from None
-        for name in {**settings, **found}:
-            if found.get(name) != settings.get(name):
+        for name in {**settings, **stored}:
+            if stored.get(name) != settings.get(name):
                 raise OutputError(
-                    f"{path}: the run there was started with {name} = {found.get(name)}, now {settings.get(name)}; "
+                    f"{path}: the run there was started with {name} = {stored.get(name)}, now {settings.get(name)}; "
                     f"choose another folder, or delete {self.path}"
                 )
         return size
@@ -150,19 +150,19 @@ Result = TypeVar("Result")
 
 TRIES = {"worker": 3, "machine": 10, "file system": 3}
 """After so many deaths of the worker or the machine under it a shard is halved, or given up if it is a single item. A
-machine's death says little of the shard; a worker's may well be its work. A file system gets so many tries."""
+machine's death says little about the shard; a worker's may be its fault. A file system gets so many tries."""
 
 
 @dataclass(frozen=True)
 class Outcome(Generic[Result]):
-    """How a shard ended.
+    """The end of a shard: its result, or what stopped it.
 
     Attributes:
-        shard: which.
-        result: what the job returned.
-        error: what the job raised.
-        died: what ended before the job did.
-        repeats: how often the shard had to be begun again.
+        shard: the shard.
+        result: return value of the job.
+        error: exception of the job.
+        died: part that ended before the job did.
+        repeats: number of times the shard was restarted.
     """
 
     shard: Shard
@@ -176,7 +176,7 @@ class Pool(Protocol[Result]):
     """Workers that do a job for one shard after another."""
 
     def has_room(self) -> bool:
-        """Whether one more shard is wanted."""
+        """Whether to submit one more shard."""
 
     def submit(self, shard: Shard) -> None:
         """Begin a shard, or let it wait for a free worker."""
@@ -185,14 +185,14 @@ class Pool(Protocol[Result]):
         """Wait until shards have ended; none if all have."""
 
 
-def work_off(shards: Iterable[Shard], pool: Pool[Result]) -> Iterator[Outcome[Result]]:
-    """Have all shards done; yields each one as it ends, in any order.
+def process_shards(shards: Iterable[Shard], pool: Pool[Result]) -> Iterator[Outcome[Result]]:
+    """Process all shards; yields each one as it ends, in any order.
 
     A shard whose worker died is done again. One that ends its workers every time is halved until the item that does
     so is alone; that one is yielded with `died` instead of a result.
 
     Raises:
-        Exception: that of the job. An OSError is tried again before: network mounts have bad moments.
+        Exception: that of the job. An OSError is tried again before: network mounts fail now and then.
     """
     coming, again = iter(shards), deque[Shard]()
     failures = Counter[tuple[str, str]]()

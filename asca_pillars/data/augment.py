@@ -11,8 +11,8 @@ from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import bev_intersection
 from asca_pillars.geometry.rotations import transform_points
 
-FEWEST_POINTS = 5  # an object keeps so many, or it is not cut, for it could not be found
-WIDEST_CUT = 0.5  # of an object's extent in azimuth or elevation
+FEWEST_POINTS = 5  # that a cut object keeps; with fewer it could not be detected
+WIDEST_CUT = 0.5  # share of an object's extent in azimuth or elevation
 
 
 def corrupt_objects(
@@ -27,9 +27,9 @@ def corrupt_objects(
     Args:
         points: (N, 4) x, y, z in metres (LiDAR frame), reflectance 0..1; they stay as they are.
         boxes: (M, 7) labelled boxes, LiDAR frame.
-        config: which changes, and how strong.
-        rng: draws them.
-        sensor_m: where the sensor is in the points' frame: it is from there that a cut is seen.
+        config: the changes and their strength.
+        rng: generator of the changes.
+        sensor_m: position of the sensor in the points' frame, from which cuts are seen.
 
     Returns:
         (K, 4), K <= N, without the points that were cut out.
@@ -41,14 +41,14 @@ def corrupt_objects(
     points = points.copy()
     kept = np.ones(len(points), dtype=bool)
     for inside in points_in_boxes(points, boxes).T:
-        own = np.flatnonzero(inside)
+        indices = np.flatnonzero(inside)
         if brighten:
             gain = np.exp(rng.uniform(np.log(low), np.log(high)))  # twice as bright is as likely as half
-            points[own, 3] = np.minimum(points[own, 3] * gain, 1)
+            points[indices, 3] = np.minimum(points[indices, 3] * gain, 1)
         if shake:
-            points[own, :3] += rng.normal(0, config.object_jitter_m, (len(own), 3))
+            points[indices, :3] += rng.normal(0, config.object_jitter_m, (len(indices), 3))
         if config.object_cut_probability and rng.random() < config.object_cut_probability:
-            rows = own[kept[own]]
+            rows = indices[kept[indices]]
             cut = _cut(points[rows, :3] - np.array(sensor_m, np.float32), rng)
             if len(rows) - np.count_nonzero(cut) >= FEWEST_POINTS:
                 kept[rows[cut]] = False
@@ -56,7 +56,7 @@ def corrupt_objects(
 
 
 def lose_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np.random.Generator) -> None:
-    """Some sensors give no reflectance for part of the points (N, 4), or for all: set it, in place, in some samples.
+    """Overwrite the reflectance of some or all points (N, 4), in place, in some samples: some sensors report none.
 
     Half of these samples get 0 for a random share of the points, the other half one value for all.
     """
@@ -69,7 +69,7 @@ def lose_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np
 
 
 def _cut(xyz: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of an object's points (N, 3), seen from the origin, lie in a random sector or in a random group of rings.
+    """Mask of an object's points (N, 3) in a random sector, or in a random group of rings, seen from the origin.
 
     Something thin in front takes away a sector of azimuth, a hedge or a beam that fails a range of elevation.
     """
@@ -88,7 +88,7 @@ def _cut(xyz: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_
     return (angle >= start) & (angle <= start + width)
 
 
-OBJECT_TRIES = 10  # draws of one object's new pose before it stays where it is
+OBJECT_TRIES = 10  # draws of an object's new pose before it keeps the old one
 
 
 def augment(
@@ -100,10 +100,10 @@ def augment(
     """Per-object noise, corruption, flip, rotation, scaling, height shift and point dropout, in this order.
 
     Args:
-        frame: it stays as it was.
-        config: which changes, and how strong.
-        rng: draws them.
-        sensor_m: where the sensor is in the frame of the points.
+        frame: not changed.
+        config: the changes and their strength.
+        rng: generator of the changes.
+        sensor_m: position of the sensor in the frame of the points.
     """
     frame = replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
     move_objects(frame, config, rng)
@@ -165,10 +165,10 @@ def move_objects(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Gene
             moved[6] = wrap_angle(moved[6] + turn_rad)
             if not bev_intersection(moved[None], others).any():
                 # Looked up only now: where labelled boxes overlap, a point goes with the first that takes it.
-                own = points_in_boxes(frame.points, frame.boxes[index : index + 1])[:, 0]
-                local = frame.points[own, :3] - frame.boxes[index, :3]
+                inside = points_in_boxes(frame.points, frame.boxes[index : index + 1])[:, 0]
+                local = frame.points[inside, :3] - frame.boxes[index, :3]
                 transform_points(local[:, :2], _rotation(turn_rad), out=local[:, :2])
-                frame.points[own, :3] = local + moved[:3]
+                frame.points[inside, :3] = local + moved[:3]
                 frame.boxes[index] = moved
                 break
 

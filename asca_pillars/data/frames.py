@@ -1,4 +1,4 @@
-"""Labelled frames: points with the boxes and classes that a detector is to find in them."""
+"""Labelled frames: points with their ground-truth boxes and classes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.ranges import Ranges
 
-# What KITTI's protocol treats as neither right nor wrong for a class.
+# Types that KITTI's protocol counts neither as true nor as false for a class.
 NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
@@ -26,7 +26,7 @@ def _letters(name: str) -> str:
 
 
 class Motion(NamedTuple):
-    """How augmentation moved a scene as a whole, in this order: mirrored about the x axis, turned, scaled, raised."""
+    """Global augmentation of a scene, in this order: mirrored about the x axis, turned, scaled, raised."""
 
     flipped: bool = False
     rotation_rad: float = 0.0
@@ -46,7 +46,7 @@ class LabeledFrame:
         points: (N, 4) float32 x, y, z, reflectance.
         boxes: (M, 7) float32.
         labels: (M,) int64 class index, or IGNORED.
-        motion: of the scene since it was read from its file.
+        motion: global augmentation applied so far.
     """
 
     frame_id: str

@@ -1,4 +1,4 @@
-"""What a dataset is to training, inspection, insertion and evaluation, whatever its files look like.
+"""Interface of a dataset for training, inspection, insertion and evaluation, whatever its files look like.
 
 `data.kitti.KittiSplit` reads KITTI's layout, `data.boxes.box_split.BoxSplit` the layout with boxes in the LiDAR frame
 (docs/DATA.md); `data.open_split` tells them apart.
@@ -31,30 +31,30 @@ class LabeledSplit(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the list; "training" is every frame."""
+        """Name of the list; "training" is every frame."""
 
     @property
     def pool(self) -> str:
-        """What frame ids are unique in: lists of one pool share what is computed per frame."""
+        """Namespace of the frame ids: lists of one pool share what is computed per frame."""
 
     @property
     def has_camera(self) -> bool:
-        """Whether labels stand only where a camera sees."""
+        """Whether objects are labelled only where a camera sees."""
 
     @property
     def mounting(self) -> Mounting:
-        """How the scans' own frame lies to that of `points` and `labeled_boxes`, and how high, if that is stated."""
+        """Pose of the scans' own frame in that of `points` and `labeled_boxes`, with the height if it is stated."""
 
     @property
     def to_sensor(self) -> FrameChange:
-        """From the frame of `points` to the same with the sensor at its origin: where what it sees is seen from."""
+        """Change from the frame of `points` to the same with the sensor at its origin, for occlusion."""
 
     @property
     def frame_ids(self) -> tuple[str, ...]:
-        """Sorted; DatasetError if the list is missing or wrong."""
+        """Sorted frame ids; DatasetError if the list is missing or wrong."""
 
     def scan_path(self, frame_id: str) -> Path:
-        """The frame's scan, to be named to the user; `points` reads it."""
+        """Path of the frame's scan, for messages; `points` reads it."""
 
     def input_paths(self, frame_id: str) -> tuple[Path, ...]:
         """The files that the frame is read from: when one changes, what was computed from it is outdated."""
@@ -69,7 +69,7 @@ class LabeledSplit(Protocol):
         """
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which of the positions (N, 3), metres, frame of `points`, lie where objects are labelled."""
+        """Mask of the positions (N, 3), metres, frame of `points`, where objects are labelled."""
 
     @property
     def one_reflectance_scale(self) -> bool:

@@ -1,4 +1,4 @@
-"""Datasets by the layout of their folder: one of its lists, and the labels beside a scan."""
+"""Open datasets by the layout of their folder, and find the labels of a single scan."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -27,7 +27,7 @@ def open_split(root: str | Path, name: str = "training") -> LabeledSplit:
 DEPTH = 6  # folders above a scan in which a dataset.yaml is looked for
 
 
-def labels_beside(scan: Path) -> NDArray[np.float32] | None:
+def labels_of_scan(scan: Path) -> NDArray[np.float32] | None:
     """Labelled boxes (M, 7) in the scan's own frame, metres and radians; None if there are no labels.
 
     ../label_2 and ../calib of a scan in a folder velodyne/, or a dataset.yaml above the scan whose scans it is one of.
@@ -52,5 +52,5 @@ def labels_beside(scan: Path) -> NDArray[np.float32] | None:
 
 @lru_cache(maxsize=1)
 def _split(root: Path) -> BoxSplit:
-    """Opened once for the scans of a folder."""
+    """Open the dataset once for the scans of a folder."""
     return BoxSplit(root)

@@ -1,4 +1,4 @@
-"""A look at the labels before a training: without a box that can be learnt it would run to its end in vain."""
+"""Check of the labels before a training, which would be in vain without a box that can be learnt."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -11,14 +11,14 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import other_spelling, read_frame, within_ranges
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.data.yaw_units import doubt_of_yaws
+from asca_pillars.data.yaw_units import check_yaws
 
 FRAMES_WITH_POINTS = 50
-"""Frames with boxes whose points are looked at before all of them are taken to be without points."""
+"""Number of frames with boxes whose points are counted before all are taken to be without points."""
 
 
 FEWEST_FRAMES = 20
-"""Frames whose yaws are looked at, if there are so many."""
+"""Largest number of frames whose yaws are checked."""
 
 
 @dataclass
@@ -33,13 +33,13 @@ class _Labels:
 
 
 def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: bool = True) -> list[str]:
-    """Make sure that a list has boxes of the classes that are to be learnt; a line for whatever else looks wrong.
+    """Make sure that a list has boxes of the classes to be learnt; returns a line for each other problem.
 
     That is a class without a box, and yaws that look like degrees. Frames are read only until every class was found.
 
     Args:
         split: the training or the validation list.
-        config: classes, ranges, and how many points a box needs.
+        config: classes, ranges, and the points that a box needs.
         training: whether it is refused if there is no box at all. A validation list is refused only if its labels spell
             the classes in another way.
         bar: show a progress bar on the terminal.
@@ -69,10 +69,10 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: b
             f"{place}: none of the boxes in {labels.frames_read} frames has data.min_points = {config.data.min_points} "
             "points inside; labels (and calib) must belong to the scans: see `asca inspect`"
         )
-    doubt = doubt_of_yaws(labels.yaws)
+    warning = check_yaws(labels.yaws)
     cannot = "it cannot be learnt" if training else "its recall cannot be measured"
     lines = [f"{place} has no box of {name}, {cannot}: {_why([name], labels)}" for name in missing]
-    return lines if doubt is None else [*lines, f"{place}: {doubt}"]
+    return lines if warning is None else [*lines, f"{place}: {warning}"]
 
 
 def _add(labels: _Labels, split: LabeledSplit, frame_id: str, config: Config) -> None:
@@ -81,9 +81,9 @@ def _add(labels: _Labels, split: LabeledSplit, frame_id: str, config: Config) ->
     labels.yaws.append(split.label_yaws(frame_id))
     labels.types.update(types)
     held = spec.ranges.hold_centers(boxes)
-    own = [name for name, inside in zip(types, held, strict=True) if inside and name in spec.class_names]
-    labels.in_ranges.update(own)
-    if own and not labels.one_with_points and labels.frames_read < FRAMES_WITH_POINTS:
+    names = [name for name, inside in zip(types, held, strict=True) if inside and name in spec.class_names]
+    labels.in_ranges.update(names)
+    if names and not labels.one_with_points and labels.frames_read < FRAMES_WITH_POINTS:
         labels.frames_read += 1
         view = data.camera_view and split.has_camera
         frame = read_frame(split, frame_id, spec.class_names, camera_view=view, min_points=data.min_points)

@@ -19,16 +19,16 @@ from asca_pillars.detection.spec import DetectorSpec
 class TrainingFrames:
     """Frames of one list, changed at random where `augmentation` is given.
 
-    What a frame holds depends on the seed, the epoch and the frame alone.
+    The result depends on the seed, the epoch and the frame alone.
 
     Attributes:
         split: the list.
-        spec: classes that are labels.
+        spec: classes to be learnt.
         camera_view: keep only the points that the camera sees.
         min_points: an object with fewer points inside its box is IGNORED.
         augmentation: random changes; None for validation.
         inserter: puts objects of other frames in, before anything else is changed.
-        seed: of all that is drawn.
+        seed: seed of all random draws.
     """
 
     split: LabeledSplit
@@ -41,7 +41,7 @@ class TrainingFrames:
 
     @cached_property
     def frame_ids(self) -> tuple[str, ...]:
-        """Of the list; DatasetError if it is missing or wrong."""
+        """Frame ids of the list; DatasetError if it is missing or wrong."""
         return self.split.frame_ids
 
     def draw(self, epoch: int, number: int) -> tuple[LabeledFrame, np.random.Generator | None]:

@@ -1,4 +1,4 @@
-"""Yaws are radians; what looks like degrees is refused or named, because nothing else would tell of it."""
+"""Yaws are radians: refuse or report those that look like degrees, which nothing else would reveal."""
 
 import math
 from collections.abc import Sequence
@@ -9,23 +9,23 @@ from numpy.typing import ArrayLike, NDArray
 LARGEST_YAW_RAD = 2 * math.pi + 0.01
 """A yaw may be counted from -pi to pi or from 0 to 2 pi, and be rounded."""
 _ENOUGH = 2
-"""Yaws other than 0 that have to be whole before a dataset is doubted."""
+"""Least number of yaws other than 0 for a warning."""
 _WHOLE = 1e-4
 
 
-def why_no_yaw(yaw: float) -> str | None:
-    """One clause about a yaw that cannot be in radians; None if it can."""
+def yaw_error(yaw: float) -> str | None:
+    """Clause for an error about a yaw that cannot be in radians; None if it can."""
     if abs(yaw) <= LARGEST_YAW_RAD:
         return None
     return f"is {yaw:g}, more than a turn of 6.28: radians are wanted; multiply degrees by pi / 180 (0.0174533)"
 
 
-def doubt_of_yaws(yaws: Sequence[ArrayLike]) -> str | None:
-    """One sentence if all yaws of a dataset, each wrapped into a turn or not, are whole numbers; None if not.
+def check_yaws(yaws: Sequence[ArrayLike]) -> str | None:
+    """Sentence for a warning if all yaws of a dataset, wrapped into a turn or not, are whole numbers; None if not.
 
-    Those that are 0 say nothing: many boxes are labelled along the axes.
+    Zeros do not count: many boxes are labelled along the axes.
     """
-    values = np.concatenate([np.zeros(0), *(np.ravel(own).astype(np.float64) for own in yaws)])
+    values = np.concatenate([np.zeros(0), *(np.ravel(frame).astype(np.float64) for frame in yaws)])
     values = values[np.abs(values) > _WHOLE]
     turns = 2 * np.pi * np.array([-1.0, 0.0, 1.0])
     stated = values[:, None] + turns

@@ -1,1 +1,1 @@
-"""How good detections are."""
+"""Evaluation of detections against labels."""

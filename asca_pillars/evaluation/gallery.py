@@ -90,7 +90,7 @@ def most_different_frames(first: Matches, second: Matches, count: int) -> list[t
 
 
 def _difference(first: ScoreMatches, second: ScoreMatches) -> int:
-    """How many objects only one of the two finds, and how many more false detections one of them has."""
+    """Number of objects that only one of the two finds, plus the difference of their false detections."""
     found = np.logical_xor(first.found, second.found).sum()
     return int(found) + abs(int(first.false_positive.sum()) - int(second.false_positive.sum()))
 

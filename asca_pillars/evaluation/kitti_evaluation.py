@@ -17,7 +17,7 @@ from asca_pillars.base.own_files import is_own_picture, require_own_file
 from asca_pillars.base.progress import Reporter
 from asca_pillars.base.system import describe_environment
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.yaw_units import doubt_of_yaws
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
@@ -151,7 +151,7 @@ def warn_of_unlike_scans(model: Model, scans: int, reporter: Reporter) -> None:
 def warn_of_degrees(reporter: Reporter, **yaws: Sequence[NDArray[np.floating]]) -> None:
     """Say of which files, labels or predictions, the yaws look like degrees."""
     for what, own in yaws.items():
-        if (doubt := doubt_of_yaws(own)) is not None:
+        if (doubt := check_yaws(own)) is not None:
             reporter.remark(f"{what}: {doubt}")
 
 

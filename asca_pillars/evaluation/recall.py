@@ -1,7 +1,7 @@
 """Recall and false detections per frame at a fixed score: what one watches while training.
 
-The official KITTI protocol ranks detections by score over a whole set; this one answers the question of somebody who
-runs the detector at its thresholds.
+The official KITTI protocol ranks detections by score over a whole set; this one describes a detector that
+runs at its thresholds.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class RecallRow(NamedTuple):
 
     @property
     def false_per_frame(self) -> float:
-        """Detections per frame that found nothing and excused nothing."""
+        """False detections per frame."""
         return self.false / max(self.frames, 1)
 
 
@@ -70,18 +70,18 @@ class RecallTally:
         """Count one frame.
 
         Args:
-            detections: of the frame, at the threshold in question, by descending score.
+            detections: detections of the frame above the threshold, by descending score.
             boxes: (N, 7) labelled boxes, LiDAR frame, metres and radians.
-            labels: (N,) class index, negative for boxes that excuse a detection of any class but need not be found.
+            labels: (N,) class index, negative for ignored boxes: they match any class, and need not be found.
         """
         self.counts[-1, 0] += 1
         for index, name in enumerate(self.class_names):
-            own = detections.labels == index
-            chosen = (labels == index) | (labels < 0)
+            of_class = detections.labels == index
+            related = (labels == index) | (labels < 0)
             self.counts[index] += _count(
-                detections.boxes[own],
-                boxes[chosen],
-                labels[chosen] == index,
+                detections.boxes[of_class],
+                boxes[related],
+                labels[related] == index,
                 BEV_IOU.get(name, SMALL_BEV_IOU),
             )
 
@@ -94,11 +94,11 @@ class RecallTally:
 
 
 def _count(
-    found_boxes: NDArray[np.float32],
+    detections: NDArray[np.float32],
     boxes: NDArray[np.float32],
-    wanted: NDArray[np.bool_],
+    counted: NDArray[np.bool_],
     min_iou: float,
 ) -> tuple[int, int, int]:
     """Objects, found and false detections of one class in one frame; detections by descending score."""
-    matched, objects = match_by_overlap(bev_iou(found_boxes, boxes), min_iou)
-    return int(wanted.sum()), int(wanted[objects].sum()), len(found_boxes) - len(matched)
+    matched, objects = match_by_overlap(bev_iou(detections, boxes), min_iou)
+    return int(counted.sum()), int(counted[objects].sum()), len(detections) - len(matched)

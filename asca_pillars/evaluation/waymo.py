@@ -374,7 +374,7 @@ def _labels(objects: FrameObjects, class_names: Sequence[str]) -> NDArray[np.int
 
 @dataclass(frozen=True)
 class WaymoReport:
-    """What was evaluated by Waymo's metric, and every number about it."""
+    """Result of an evaluation by Waymo's metric, with all its numbers."""
 
     subject: str
     """The model or folder and the data, in words."""
@@ -409,7 +409,7 @@ def waymo_table(report: WaymoReport) -> TextTable:
 
 
 def waymo_notes(report: WaymoReport) -> list[str]:
-    """What one must know to read the table."""
+    """Notes for the reader of the table."""
     if report.has_points:
         return []
     return ["LEVEL_1 is not evaluated: levels come from the LiDAR points in the boxes; give --data ROOT with the scans"]

@@ -1,4 +1,4 @@
-"""The box convention, said once, and what is computed of single boxes: corners, points inside, residuals.
+"""The box convention, and operations on single boxes: corners, points inside, residuals.
 
 Frame: LiDAR, metres. x forward, y left, z up; yaw counter-clockwise about +z from +x, in [-pi, pi).
 
@@ -24,14 +24,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 DIRECTION_OFFSET_RAD = math.pi / 4
-"""Where direction bin 0 begins unless a detector says otherwise: it holds the yaws in [pi/4, 5pi/4), bin 1 the others.
+"""Yaw at which direction bin 0 begins by default: it holds the yaws in [pi/4, 5pi/4), bin 1 the others.
 
-Most boxes stand near an anchor's yaw, and near a bin's border the bin is hard to tell: so no border lies on an anchor's
-yaw.
+Most boxes stand near an anchor's yaw, and bins are hard to tell near their borders: no border lies on an anchor's yaw.
 """
 
-# Nothing is a hundred times as long as its anchor, but exp() of what an untrained or overflowing network
-# answers can be infinite, and an infinite box makes NaN of every overlap it takes part in.
+# Nothing is a hundred times as long as its anchor, but exp() of an untrained or overflowing network's output
+# can be infinite, and an infinite box makes NaN of every overlap it takes part in.
 _MAX_LOG_RATIO = math.log(100.0)
 
 # Signs of the length and the width of the corners 0..3.
@@ -85,7 +84,7 @@ def corners(boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
 def points_in_boxes(
     points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[Any]], margin_m: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Which points lie in which boxes, faces included: (P, >=3), (N, 7) -> (P, N) bool.
+    """Mask of the points in each box, faces included: (P, >=3), (N, 7) -> (P, N) bool.
 
     Args:
         points: columns x, y, z in metres, LiDAR frame; non-finite ones are in no box.
@@ -95,12 +94,12 @@ def points_in_boxes(
     xyz = np.ascontiguousarray(points[:, :3].T)
     for row, (x, y, z, length, width, height, yaw) in zip(inside, boxes.astype(np.float64), strict=True):
         reach = math.hypot(length / 2 + margin_m, width / 2 + margin_m)
-        # A quick look along x first, with some slack for float32; few points are near any one box.
-        near = np.flatnonzero(np.abs(xyz[0] - x) <= reach + 1e-3)
-        dx, dy, dz = (xyz[axis, near].astype(np.float64) - center for axis, center in enumerate((x, y, z)))
+        # Select along x first, with some slack for float32: few points are near any one box.
+        candidates = np.flatnonzero(np.abs(xyz[0] - x) <= reach + 1e-3)
+        dx, dy, dz = (xyz[axis, candidates].astype(np.float64) - center for axis, center in enumerate((x, y, z)))
         along = math.cos(yaw) * dx + math.sin(yaw) * dy
         across = math.cos(yaw) * dy - math.sin(yaw) * dx
-        row[near] = (
+        row[candidates] = (
             (np.abs(along) <= length / 2 + margin_m)
             & (np.abs(across) <= width / 2 + margin_m)
             & (np.abs(dz) <= height / 2 + margin_m)
@@ -113,7 +112,7 @@ def encode_boxes(
     anchors: NDArray[np.floating[Any]],
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Boxes as the network learns them: boxes and anchors (..., 7) -> residuals (..., 7), direction (...,).
+    """Encode boxes as regression targets: boxes and anchors (..., 7) -> residuals (..., 7), direction (...,).
 
     dx and dy over the anchor's diagonal, dz over its height, logarithms of the size ratios, and the yaw
     difference in [-pi, pi); direction is the bin 0 or 1 of the box's yaw. The paper's eq. 12 as printed

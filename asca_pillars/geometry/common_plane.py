@@ -1,4 +1,4 @@
-"""The plane that most of some points lie on, by RANSAC: a wall, cars and leaves among them do not move it."""
+"""RANSAC for the plane that most points lie on: a wall, cars and leaves among them do not move it."""
 
 import math
 from typing import Any
@@ -37,8 +37,8 @@ def most_common_plane(
     heights = planes[:, :1] * x + planes[:, 1:2] * y + planes[:, 2:]
     plane = planes[(np.abs(z - heights) < band_m).sum(axis=1).argmax()]
     for _ in range(_REFITS):
-        near = np.abs(z - plane_heights(plane, points)) < band_m
-        refit = _least_squares(x[near], y[near], z[near])
+        inliers = np.abs(z - plane_heights(plane, points)) < band_m
+        refit = _least_squares(x[inliers], y[inliers], z[inliers])
         if refit is None:
             return None
         plane = refit

@@ -8,15 +8,12 @@ import math
 
 import numpy as np
 from numba import types
-from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import compiled, given, inner, written
-
-_Doubles = NDArray[np.float64]
-_Integers = NDArray[np.int64]
+from asca_pillars.geometry.arrays import Floats, Ints
 
 
-def nms(boxes: _Doubles, iou_threshold: float, limit: int) -> _Integers:
+def nms(boxes: Floats, iou_threshold: float, limit: int) -> Ints:
     """`numpy_kernels._nms`, box by box: boxes (N, 7), best first -> indices (K,) of those kept."""
     kept = np.empty(len(boxes), np.int64)
     count = _nms(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
@@ -69,9 +66,7 @@ def _shared_area(x: float, y: float, cos: float, sin: float, al: float, aw: floa
     *(given(types.float64, 2), types.float64, types.int64),
     *(written(types.float64, 2), written(types.float64, 2), written(types.int64)),
 )
-def _nms(
-    boxes: _Doubles, iou_threshold: float, limit: int, circles: _Doubles, shapes: _Doubles, kept: _Integers
-) -> int:
+def _nms(boxes: Floats, iou_threshold: float, limit: int, circles: Floats, shapes: Floats, kept: Ints) -> int:
     """`circles`: x, y and radius of the kept boxes; `shapes`: half length, half width, area, cosine and sine."""
     count = 0
     for i in range(len(boxes)):

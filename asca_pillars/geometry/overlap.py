@@ -1,4 +1,4 @@
-"""How much boxes overlap, seen from above and in 3D.
+"""Intersection and IoU of boxes, seen from above and in 3D.
 
 Exact for rotated boxes and computed in float64. Only pairs whose circumscribed circles meet are computed.
 """
@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
 from asca_pillars.geometry.boxes import wrap_angle
 
-_Boxes = NDArray[np.floating[Any]]
-_Doubles = NDArray[np.float64]
-_Point = tuple[_Doubles, _Doubles]  # x and y of K points, each (K,)
+_Point = tuple[Floats, Floats]  # x and y of K points, each (K,)
 
 
-def bev_intersection(a: _Boxes, b: _Boxes) -> _Doubles:
+def bev_intersection(a: Floating, b: Floating) -> Floats:
     """Area shared by footprints, square metres: (N, 7), (M, 7) -> (N, M); exactly 0 for disjoint boxes."""
     first, second = a.astype(np.float64), b.astype(np.float64)
     shared = np.zeros((len(a), len(b)))
@@ -24,7 +23,7 @@ def bev_intersection(a: _Boxes, b: _Boxes) -> _Doubles:
     return shared
 
 
-def paired_bev_intersection(a: _Doubles, b: _Doubles) -> _Doubles:
+def paired_bev_intersection(a: Floats, b: Floats) -> Floats:
     """Area shared by the footprints of a[k] and b[k], square metres: (K, 7), (K, 7) float64 -> (K,).
 
     In b's own frame b is |x| <= bl, |y| <= bw. The area of a inside it is the line integral of -y dx around
@@ -47,7 +46,7 @@ def paired_bev_intersection(a: _Doubles, b: _Doubles) -> _Doubles:
     return np.where(paired_bev_touch(a, b), np.clip(area, 0.0, 4 * np.minimum(al * aw, bl * bw)), 0.0)
 
 
-def paired_bev_touch(a: _Doubles, b: _Doubles) -> NDArray[np.bool_]:
+def paired_bev_touch(a: Floats, b: Floats) -> Mask:
     """Whether the footprints of a[k] and b[k] share any area: (K, 7), (K, 7) float64 -> (K,).
 
     By the separating axes: several times as fast as the area.
@@ -61,7 +60,7 @@ def paired_bev_touch(a: _Doubles, b: _Doubles) -> NDArray[np.bool_]:
     return ~apart
 
 
-def _relative(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles, _Doubles, _Doubles]:
+def _relative(a: Floats, b: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Center x, y of a[k] in the frame of b[k], and cosine and sine of its heading there: 4 x (K,)."""
     cos, sin = np.cos(b[:, 6]), np.sin(b[:, 6])
     dx, dy = a[:, 0] - b[:, 0], a[:, 1] - b[:, 1]
@@ -69,29 +68,29 @@ def _relative(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles, _Doubles, _
     return cos * dx + sin * dy, cos * dy - sin * dx, np.cos(turn), np.sin(turn)
 
 
-def bev_iou(a: _Boxes, b: _Boxes) -> _Doubles:
+def bev_iou(a: Floating, b: Floating) -> Floats:
     """IoU of footprints: boxes (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
     a, b = a.astype(np.float64), b.astype(np.float64)
     return _over_union(bev_intersection(a, b), (a[:, 3] * a[:, 4])[:, None], b[:, 3] * b[:, 4])
 
 
-def iou_3d(a: _Boxes, b: _Boxes) -> _Doubles:
+def iou_3d(a: Floating, b: Floating) -> Floats:
     """IoU of volumes: boxes (N, 7), (M, 7) -> (N, M) in [0, 1]; exactly 1 for equal boxes."""
     a, b = a.astype(np.float64), b.astype(np.float64)
     shared = bev_intersection(a, b) * _shared_length(a[:, 2, None], a[:, 5, None], b[:, 2], b[:, 5])
     return _over_union(shared, _volumes(a)[:, None], _volumes(b))
 
 
-def paired_iou_3d(a: _Doubles, b: _Doubles) -> _Doubles:
+def paired_iou_3d(a: Floats, b: Floats) -> Floats:
     """IoU of the volumes of a[k] and b[k]: boxes (K, 7), (K, 7) float64 -> (K,) in [0, 1]; exactly 1 for equal ones."""
     shared = paired_bev_intersection(a, b) * _shared_length(a[:, 2], a[:, 5], b[:, 2], b[:, 5])
     return _over_union(shared, _volumes(a), _volumes(b))
 
 
-def aligned_bev_iou(a: _Boxes, b: _Boxes) -> NDArray[np.float32]:
+def aligned_bev_iou(a: Floating, b: Floating) -> Singles:
     """IoU of footprints, each turned to its nearest axis first: boxes (N, 7), (M, 7) -> (N, M) float32 in [0, 1].
 
-    What anchors are matched by (PointPillars): cheap enough for every anchor of a map.
+    PointPillars matches anchors by it: cheap enough for every anchor of a map.
     """
     ax, ay, al, aw = (part[:, None] for part in _aligned(a))
     bx, by, bl, bw = _aligned(b)
@@ -99,7 +98,7 @@ def aligned_bev_iou(a: _Boxes, b: _Boxes) -> NDArray[np.float32]:
     return _over_union(shared, al * aw, bl * bw)
 
 
-def _near_pairs(a: _Doubles, b: _Doubles) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _near_pairs(a: Floats, b: Floats) -> tuple[Ints, Ints]:
     """Row and column of the pairs whose circumscribed circles meet."""
     squared = np.square(a[:, None, 0] - b[None, :, 0]) + np.square(a[:, None, 1] - b[None, :, 1])
     reach = np.hypot(a[:, 3], a[:, 4])[:, None] + np.hypot(b[:, 3], b[:, 4])[None, :]
@@ -107,7 +106,7 @@ def _near_pairs(a: _Doubles, b: _Doubles) -> tuple[NDArray[np.int64], NDArray[np
     return rows, columns
 
 
-def _pressed_integral(start: _Point, end: _Point, x_limit: _Doubles, y_limit: _Doubles) -> _Doubles:
+def _pressed_integral(start: _Point, end: _Point, x_limit: Floats, y_limit: Floats) -> Floats:
     """Integral of y dx along K straight edges, with x held within +-x_limit and y within +-y_limit."""
     (x0, y0), (x1, y1) = start, end
     left, right = np.clip(x0, -x_limit, x_limit), np.clip(x1, -x_limit, x_limit)
@@ -120,13 +119,13 @@ def _pressed_integral(start: _Point, end: _Point, x_limit: _Doubles, y_limit: _D
     return (right - left) * ((low + high) / 2 + (before - after) * (low - high) / 2)
 
 
-def _share(part: _Doubles, whole: _Doubles) -> _Doubles:
+def _share(part: Floats, whole: Floats) -> Floats:
     """part / whole held within [0, 1]; 1 where the whole is smaller than the part, or 0."""
     share = np.divide(part, whole, out=np.ones_like(part), where=np.abs(part) < np.abs(whole))
     return np.maximum(share, 0.0)
 
 
-def _shared_length(a: _Boxes, a_size: _Boxes, b: _Boxes, b_size: _Boxes) -> NDArray[Any]:
+def _shared_length(a: Floating, a_size: Floating, b: Floating, b_size: Floating) -> NDArray[Any]:
     """Length shared by intervals given by center and size: any shapes that broadcast.
 
     Written so that equal intervals share exactly their size, whatever the center's rounding.
@@ -144,12 +143,12 @@ def _over_union(shared: NDArray[Any], a_size: NDArray[Any], b_size: NDArray[Any]
     return ratio
 
 
-def _volumes(boxes: _Boxes) -> NDArray[Any]:
+def _volumes(boxes: Floating) -> NDArray[Any]:
     volumes: NDArray[Any] = boxes[:, 3] * boxes[:, 4] * boxes[:, 5]
     return volumes
 
 
-def _aligned(boxes: _Boxes) -> tuple[NDArray[np.float32], ...]:
+def _aligned(boxes: Floating) -> tuple[Singles, ...]:
     """x, y and the extents along x and y of the footprints turned to their nearest axis, each (N,)."""
     x, y, _, length, width, _, yaw = boxes.astype(np.float32).T
     sideways = np.abs(wrap_angle(yaw, np.pi)) > np.pi / 4

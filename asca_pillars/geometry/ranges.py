@@ -15,12 +15,12 @@ class Ranges(NamedTuple):
     z_m: tuple[float, float]
 
     def shifted(self, by_m: Sequence[float] | NDArray[np.float64]) -> "Ranges":
-        """Where they lie after everything moved by (3,) metres."""
+        """The ranges after everything moved by (3,) metres."""
         x, y, z = ((low + by, high + by) for (low, high), by in zip(self, by_m, strict=True))
         return Ranges(x, y, z)
 
     def behind(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which points (N, >=2), metres, LiDAR frame, lie in a direction in which the detector does not look: (N,).
+        """Mask (N,) of points (N, >=2), metres, LiDAR frame, in directions in which the detector does not look.
 
         It looks in a direction if it sees as far there as it does ahead or to its nearer side, whichever is less; where
         its range begins is no matter. None of the points, if it does not see ahead and to both sides.
@@ -30,6 +30,6 @@ class Ranges(NamedTuple):
         return np.asarray((reach_m > 0) & (x * reach_m < min(self.x_m[0], 0.0) * np.hypot(x, y)))
 
     def hold_centers(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which boxes (N, 7), metres, LiDAR frame, have their center inside, seen from above: (N,)."""
+        """Mask (N,) of the boxes (N, 7), metres, LiDAR frame, whose center is inside, seen from above."""
         x, y = boxes[:, 0], boxes[:, 1]
         return np.asarray((x >= self.x_m[0]) & (x < self.x_m[1]) & (y >= self.y_m[0]) & (y < self.y_m[1]))

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_Doubles = NDArray[np.float64]
+from asca_pillars.geometry.arrays import Floats
 
 
-def of_quaternions(quaternions: NDArray[Any]) -> _Doubles:
+def of_quaternions(quaternions: NDArray[Any]) -> Floats:
     """(..., 3, 3) of (..., 4) w, x, y, z, of any length; not numbers where that is 0 or not finite."""
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(np.asarray(quaternions, np.float64), axis=-1, keepdims=True)
@@ -22,7 +22,7 @@ def of_quaternions(quaternions: NDArray[Any]) -> _Doubles:
     )
 
 
-def of_roll_pitch_yaw(angles_rad: NDArray[Any]) -> _Doubles:
+def of_roll_pitch_yaw(angles_rad: NDArray[Any]) -> Floats:
     """(..., 3, 3) of (..., 3): about x by roll, then about y by pitch, then about z by yaw."""
     angles = np.moveaxis(np.asarray(angles_rad, np.float64), -1, 0)
     (sr, sp, sy), (cr, cp, cy) = np.sin(angles), np.cos(angles)
@@ -69,5 +69,5 @@ def transform_columns(columns: NDArray[Any], matrix: NDArray[Any], shift: NDArra
     return transformed
 
 
-def _matrices(rows: list[list[_Doubles]]) -> _Doubles:
+def _matrices(rows: list[list[Floats]]) -> Floats:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

@@ -19,11 +19,11 @@ def read_npy(path: Path) -> StoredPoints:
     Raises:
         ScanError: no such array, or one that lies on its side.
     """
-    # Mapped, not loaded: mapping compares the header's claim with the file's size before memory is taken, and
+    # Mapped, not loaded: mapping compares the header with the file's size before memory is taken, and
     # refuses pickled objects.
     try:
         with warnings.catch_warnings():
-            # NumPy reads the header as Python source, and Python would talk to the user about what it finds there.
+            # NumPy reads the header as Python source, and Python would print warnings about it.
             warnings.simplefilter("error", SyntaxWarning)
             warnings.simplefilter("error", DeprecationWarning)
             array = np.lib.format.open_memmap(path, mode="r")

@@ -1,4 +1,4 @@
-"""What the scans of a training looked like: kept in the bundle, compared with by `input_check`."""
+"""Statistics of the training scans: kept in the bundle, compared with by `input_check`."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ _HIGHEST_M = 100.0  # ground below or above a sensor; farther, it is no measurem
 
 @dataclass(frozen=True)
 class ExpectedInput(Strict):
-    """What the training scans looked like: (lowest, highest) over scans."""
+    """Statistics of the training scans: (lowest, highest) over scans."""
 
     points_per_scan: tuple[int, int]
     """Finite points of a scan, cropped to the camera's view if `camera_view`."""

@@ -1,4 +1,4 @@
-"""Which files are scans, and under which name the results of each are written."""
+"""Search for scan files, and the names under which the results of each are written."""
 
 import hashlib
 import os
@@ -16,7 +16,7 @@ from asca_pillars.base.input_files import require_content
 SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
 PREPARED_FILE = "README.txt"
 PREPARED_NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
-"""What the file says in a folder that is computed from a dataset: what lies there are no scans."""
+"""Text of the file that marks a folder computed from a dataset: it holds no scans."""
 
 _LONGEST_NAME_BYTES = 240
 """Names of files have at most 255 bytes, and results append such as `_image.png` to the name of their scan."""
@@ -111,23 +111,23 @@ def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
     Raises:
         ScanError: a path without scans, or two scans whose results would have the same name even then.
     """
-    found: dict[tuple[tuple[int, int], str], tuple[Path, Path]] = {}  # (its folder, name) -> (scan, what was given)
+    origins: dict[tuple[tuple[int, int], str], tuple[Path, Path]] = {}  # (its folder, name) -> (scan, what was given)
     folder_identity, resolved = cache(_folder_identity), cache(Path.resolve)
     for given in map(Path, paths):
         for scan in find_scans(given):
             place = scan.resolve() if scan.is_symlink() and scan.exists() else scan
             key = folder_identity(place.parent), place.name
-            found.setdefault(key, (scan, given.parent if given.is_file() else given))
-    scans = [scan for scan, _ in found.values()]
-    below = [scan.relative_to(root) for scan, root in found.values()]
-    rooted = [resolved(root).name / name for (_, root), name in zip(found.values(), below, strict=True)]
+            origins.setdefault(key, (scan, given.parent if given.is_file() else given))
+    scans = [scan for scan, _ in origins.values()]
+    below = [scan.relative_to(root) for scan, root in origins.values()]
+    rooted = [resolved(root).name / name for (_, root), name in zip(origins.values(), below, strict=True)]
     names = [name.with_suffix("") for name in below]
     for others in ([name.with_suffix("") for name in rooted], below, rooted):
         names = _where_shared(names, others)
     names = [_shortened(name) for name in names]
     for name, count in Counter(names).items():
         if count > 1:
-            first, second, *_ = (scan for scan, own in zip(scans, names, strict=True) if own == name)
+            first, second, *_ = (scan for scan, other in zip(scans, names, strict=True) if other == name)
             raise ScanError(f"{first} and {second}: their results would have one name, {name}; run them one by one")
     return [NamedScan(scan, name) for scan, name in zip(scans, names, strict=True)]
 

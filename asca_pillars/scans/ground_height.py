@@ -1,4 +1,4 @@
-"""How high the sensor sits above the ground, estimated from scans: `--sensor-height auto`."""
+"""Height of the sensor above the ground, estimated from scans: `--sensor-height auto`."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ BAND_M = 0.12
 """Half the thickness of what counts as the plane: camber and kerbs within it."""
 MIN_CELLS = 40
 MIN_SHARE = 0.3
-"""Of the cells whose low point must lie on the plane."""
+"""Smallest share of the cells whose low point lies on the plane."""
 MAX_SHARE_BELOW = 0.3
 MAX_TILT_DEG = 5.0
 MAX_SPREAD_M = 0.3
@@ -28,16 +28,16 @@ class GroundPlane(NamedTuple):
     """The ground near one sensor, level frame."""
 
     height_m: float
-    """Of the origin above it."""
+    """Height of the origin above the plane."""
     tilt_deg: float
-    """Between its normal and z."""
+    """Angle between the normal and z."""
     share: float
-    """Of the cells of 1 m whose low point lies within BAND_M of the plane."""
+    """Share of the cells of 1 m whose low point lies within BAND_M of the plane."""
     share_below: float
-    """Of the cells whose low point lies further below it: a plane above others is no ground."""
+    """Share of the cells whose low point lies further below it: a plane above others is no ground."""
     cells: int
     normal: tuple[float, float, float]
-    """Of length 1, upwards."""
+    """Unit normal, upwards."""
 
     @property
     def doubt(self) -> str | None:
@@ -50,7 +50,7 @@ class GroundPlane(NamedTuple):
 
 
 class NamedPoints(NamedTuple):
-    """Points (N, >=3) of a scan, metres, and what to call it."""
+    """Points (N, >=3) of a scan, metres, and its name in messages."""
 
     name: str
     points: NDArray[Any]
@@ -60,9 +60,9 @@ class HeightEstimate(NamedTuple):
     """The sensor's height over several scans."""
 
     height_m: float
-    """Median."""
+    """Median over the scans."""
     spread_m: float
-    """Between the lowest and the highest scan."""
+    """Difference of the highest and the lowest scan."""
     share: float
     """Smallest `GroundPlane.share`."""
     scans: int
@@ -79,7 +79,7 @@ class HeightEstimate(NamedTuple):
 
 
 def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = None) -> HeightEstimate:
-    """How high the origin of a mounting's level frame is above the ground, from scans of one sensor.
+    """Estimate the height above the ground of the origin of a mounting's level frame, from scans of one sensor.
 
     Args:
         scans: (N, >=3) finite x, y, z in metres, as they come.
@@ -140,7 +140,7 @@ def measured_mounting(
 def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
     """The plane through most low points near the sensor: (N, >=3) level frame, metres; None: too few, or on a line.
 
-    One low point per square metre has a say, so that the dense rings near the sensor do not outvote the rest. The
+    One low point per square metre counts, so that the dense rings near the sensor do not outvote the rest. The
     draws are seeded: the same points give the same plane.
     """
     low = _low_points(points)
@@ -156,12 +156,12 @@ def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
 
 
 def _low_points(points: NDArray[Any]) -> NDArray[np.float64]:
-    """(C, 3) of each square metre near the sensor the point below which a tenth of its points lie."""
+    """Points (C, 3), one per square metre near the sensor: the one at the tenth percentile of z."""
     xyz = points[:, :3].astype(np.float64)
     squared = np.square(xyz[:, :2]).sum(axis=1)
-    near = xyz[(squared > NEAR_M[0] ** 2) & (squared < NEAR_M[1] ** 2)]
-    column, row = np.floor(near[:, :2] / CELL_M).astype(np.int64).T
+    ring = xyz[(squared > NEAR_M[0] ** 2) & (squared < NEAR_M[1] ** 2)]
+    column, row = np.floor(ring[:, :2] / CELL_M).astype(np.int64).T
     cells = 1000 * column + row
-    order = np.lexsort((near[:, 2], cells))
+    order = np.lexsort((ring[:, 2], cells))
     _, first, count = np.unique(cells[order], return_index=True, return_counts=True)
-    return near[order[(first + count // 10)[count >= 3]]]
+    return ring[order[(first + count // 10)[count >= 3]]]

@@ -1,25 +1,23 @@
-"""How far a scan is from those of the training, and whether its axes lie as they should, with the option that mends it.
+"""Compares a scan with those of the training and checks its axes; each difference comes with the option that mends it.
 
 A wrong reflectance scale, sensor height or axis ruins detection without any error; here it becomes a sentence.
 """
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asca_pillars.detection.detections import ScanCounts
+from asca_pillars.geometry.arrays import Floating, Mask, Singles
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.mounting import Mounting
-
-_Floats: TypeAlias = NDArray[np.floating[Any]]
 
 OUTSIDE_SHARE = 0.95
 FAR_M, FAR_SHARE = 1000.0, 0.05
 """A distance, metres, and the share of a LiDAR's points that may lie further away."""
 BEHIND_SHARE = 0.2
-"""Of the points beyond BODY_M: a revolution has about half of them behind its sensor, a view of 200 degrees a tenth."""
+"""Smallest share of points behind, beyond BODY_M: a revolution has about half, a view of 200 degrees a tenth."""
 BODY_M = 3.0
 """Nearer returns are mostly those of the vehicle itself."""
 SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
@@ -39,7 +37,7 @@ class InputWarning(NamedTuple):
 
 
 def check_input(
-    points: NDArray[np.float32],
+    points: Singles,
     counts: ScanCounts,
     expected: ExpectedInput,
     mounting: Mounting | None = None,
@@ -49,9 +47,9 @@ def check_input(
 
     Args:
         points: (N, 4) finite x, y, z in metres, model's frame, and reflectance.
-        counts: what became of them on the detector's grid.
-        expected: of the training scans.
-        mounting: by which they came into that frame.
+        counts: points inside and outside the detector's grid.
+        expected: statistics of the training scans.
+        mounting: the mounting by which the points came into that frame.
         looks_in: the detector's ranges; None: it looks in every direction.
     """
     mounting = mounting or Mounting()
@@ -62,15 +60,15 @@ def check_input(
     # Column by column in memory, which is how it is read: NumPy is slow along rows of four.
     sample = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLE_POINTS)].T).T
     if far := _far_warning(sample):
-        return [far]  # what the others would say follows from it
+        return [far]  # the other checks would only repeat it
     ground = ground_z_m(sample)
-    doubt = doubt_frame(sample[::_FRAME_STEP], ground)
+    axes = check_axes(sample[::_FRAME_STEP], ground)
     warnings = [_reflectance_warning(sample[:, 3], expected)]
-    if doubt is not None:
-        warnings.append(InputWarning(doubt.about, f"{doubt.text}: {_axes_remedy(doubt.axes, mounting)}"))
-    if doubt is None or doubt.about not in ("upside down", "tilt"):  # then the height means nothing
+    if axes is not None:
+        warnings.append(InputWarning(axes.about, f"{axes.text}: {_axes_remedy(axes.axes, mounting)}"))
+    if axes is None or axes.about not in ("upside down", "tilt"):  # then the height means nothing
         warnings.append(_height_warning(ground, expected, mounting))
-    if counts.points_outside > OUTSIDE_SHARE * counts.points and doubt is None:
+    if counts.points_outside > OUTSIDE_SHARE * counts.points and axes is None:
         share = 100 * counts.points_outside / counts.points
         text = (
             f"{share:.1f} % of the points lie outside the grid, where x is forward, y left, z up, in metres: "
@@ -82,7 +80,7 @@ def check_input(
     return [warning for warning in warnings if warning]
 
 
-def _far_warning(sample: NDArray[np.float32]) -> InputWarning | None:
+def _far_warning(sample: Singles) -> InputWarning | None:
     """Points that no LiDAR sees: their unit is not metres, or they lie in a map's frame."""
     sideways = sample[:, :2]
     share = np.count_nonzero((np.abs(sideways) > FAR_M).any(axis=1)) / len(sample)
@@ -100,7 +98,7 @@ def _far_warning(sample: NDArray[np.float32]) -> InputWarning | None:
     return InputWarning("range", text)
 
 
-def _reflectance_warning(reflectance: NDArray[np.float32], expected: ExpectedInput) -> InputWarning | None:
+def _reflectance_warning(reflectance: Singles, expected: ExpectedInput) -> InputWarning | None:
     low, high = expected.reflectance_mean
     largest, mean = float(reflectance.max()), float(reflectance.mean(dtype=np.float64))
     if largest > 1.5:
@@ -139,7 +137,7 @@ def _height_warning(ground: float | None, expected: ExpectedInput, mounting: Mou
     return InputWarning("height", text)
 
 
-def _behind_warning(points: NDArray[np.float32], looks_in: Ranges) -> InputWarning | None:
+def _behind_warning(points: Singles, looks_in: Ranges) -> InputWarning | None:
     away = points[np.abs(points[:, :2]).max(axis=1) > BODY_M]
     share = looks_in.behind(away).mean() if len(away) else 0.0
     if share < BEHIND_SHARE or np.hypot(*_mean_direction(*away[:, :2].T)) >= _SECTOR_LENGTH:
@@ -157,11 +155,11 @@ def _axes_remedy(axes: str | None, mounting: Mounting) -> str:
 
 
 _AXES = ("x,y,z", "y,-x,z", "-x,-y,z", "-y,x,z")
-"""Where forward and left are found in a scan whose own forward direction is that of the quadrant."""
+"""Axes (forward, left, up) of a scan whose forward direction is that of the quadrant, see `Mounting.axes`."""
 
 _EDGE_PERCENTILES = (5, 20, 80, 95)
 _SHARP_M = 0.5
-"""Between the outer two percentiles where the ground is: nothing lies beyond it. Walls and trees end gradually."""
+"""Largest distance between the outer two percentiles at the ground, which ends sharply; walls and trees do not."""
 _GROUND_ABOVE_M = 1.0
 
 _SECTOR_LENGTH = 0.6
@@ -173,7 +171,7 @@ _GROUND_BAND_M = 0.75
 _HALF_WIDTH_DEG = 25.0
 _MIN_POINTS = 20
 _MIN_ALONG = 0.85
-"""Median range of the ground ahead and behind over that to the sides: one sees further along a street than across.
+"""Least ratio of the median ground range ahead and behind to that at the sides: one sees further along a street.
 None of 200 simulated whole revolutions falls below; turned by a quarter, 90 % of them do."""
 
 _MAX_TILT_DEG = 6.0
@@ -184,15 +182,15 @@ _LOW_PERCENTILE = 10.0
 _MIN_GROUND_POINTS = 50
 
 
-class FrameDoubt(NamedTuple):
-    """What is odd about the axes: `about` names the kind, `axes` those that would mend it, if any would."""
+class AxesWarning(NamedTuple):
+    """A sign that the axes are wrong: `about` names the kind, `axes` those that would mend it, if any would."""
 
     about: str
     text: str
     axes: str | None
 
 
-def ground_z_m(points: NDArray[np.float32]) -> float | None:
+def ground_z_m(points: Singles) -> float | None:
     """Height of the ground around the sensor, metres: a low percentile of z in a near ring of the points.
 
     Takes finite points (N, >=3) in the LiDAR frame; None if the ring holds too few of them to tell.
@@ -201,14 +199,14 @@ def ground_z_m(points: NDArray[np.float32]) -> float | None:
     with np.errstate(over="ignore"):  # infinitely far is not near
         squared_range = x * x + y * y
     ring = np.flatnonzero((squared_range > _RING_M[0] ** 2) & (squared_range < _RING_M[1] ** 2))
-    near_z = points[:, 2].take(ring)
-    return _percentile(np.sort(near_z), _LOW_PERCENTILE) if len(near_z) >= _MIN_GROUND_POINTS else None
+    ring_z = points[:, 2].take(ring)
+    return _percentile(np.sort(ring_z), _LOW_PERCENTILE) if len(ring_z) >= _MIN_GROUND_POINTS else None
 
 
-def doubt_frame(points: NDArray[np.float32], ground_z_m: float | None) -> FrameDoubt | None:
-    """The first thing that is odd about the axes of a scan: z points down, turned axes, a tilt; None if nothing is.
+def check_axes(points: Singles, ground_z_m: float | None) -> AxesWarning | None:
+    """Check the axes of a scan: the first of z pointing down, turned axes and a tilt; None if they look right.
 
-    What cannot be seen: a scan that is turned by half, a mirror image, and a quarter turn on a square or a crossing.
+    Undetectable are half a turn, a mirror image, and a quarter turn on a square or a crossing.
 
     Args:
         points: (N, >=3) finite x, y, z in metres, in what should be the LiDAR frame; some thousands are enough.
@@ -217,20 +215,20 @@ def doubt_frame(points: NDArray[np.float32], ground_z_m: float | None) -> FrameD
     x, y, z = points[:, :3].T
     with np.errstate(over="ignore"):  # infinitely far is not near
         radius = np.hypot(x, y)
-    near = (radius > _RING_M[0]) & (radius < _RING_M[1])
-    if doubt := _upside_down(z[near]):
-        return doubt
-    if doubt := _sector(x, y, radius):
-        return doubt
+    ring = (radius > _RING_M[0]) & (radius < _RING_M[1])
+    if warning := _upside_down(z[ring]):
+        return warning
+    if warning := _sector(x, y, radius):
+        return warning
     if ground_z_m is None:
         return None
     ground = (z < ground_z_m + _GROUND_BAND_M) & (radius > _REACH_M[0]) & (radius < _REACH_M[1])
-    if doubt := _across(radius[ground], _quadrants(x[ground], y[ground], _HALF_WIDTH_DEG)):
-        return doubt
-    return _tilted(z[near], radius[near], _quadrants(x[near], y[near], 45.0))
+    if warning := _across(radius[ground], _quadrants(x[ground], y[ground], _HALF_WIDTH_DEG)):
+        return warning
+    return _tilted(z[ring], radius[ring], _quadrants(x[ring], y[ring], 45.0))
 
 
-def _upside_down(z: _Floats) -> FrameDoubt | None:
+def _upside_down(z: Floating) -> AxesWarning | None:
     """The points end sharply above the sensor, as they do at the ground, and gradually below it."""
     if len(z) < _MIN_POINTS:
         return None
@@ -239,10 +237,10 @@ def _upside_down(z: _Floats) -> FrameDoubt | None:
     if highest < _GROUND_ABOVE_M or highest - high > min(_SHARP_M, low - lowest):
         return None
     text = f"the points near the sensor end at z = {highest:.1f} m as at the ground: z may point down"
-    return FrameDoubt("upside down", text, "x,-y,-z")
+    return AxesWarning("upside down", text, "x,-y,-z")
 
 
-def _sector(x: _Floats, y: _Floats, radius: _Floats) -> FrameDoubt | None:
+def _sector(x: Floating, y: Floating, radius: Floating) -> AxesWarning | None:
     """The points fill a sector that is not ahead."""
     away = radius > 0
     if not away.any():
@@ -253,17 +251,17 @@ def _sector(x: _Floats, y: _Floats, radius: _Floats) -> FrameDoubt | None:
         return None
     quadrant = round(middle_deg / 90) % 4
     text = f"the points fill a sector about {middle_deg:+.0f} degrees, and ahead is 0: x may not be forward"
-    return FrameDoubt("axes", text, _AXES[quadrant])
+    return AxesWarning("axes", text, _AXES[quadrant])
 
 
-def _mean_direction(x: _Floats, y: _Floats) -> tuple[float, float]:
+def _mean_direction(x: Floating, y: Floating) -> tuple[float, float]:
     """Mean of the unit vectors towards points, (N,) each, none of them at the origin."""
     with np.errstate(over="ignore"):  # infinitely far has no direction
         radius = np.hypot(x, y)
     return float((x / radius).mean()), float((y / radius).mean())
 
 
-def _across(radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> FrameDoubt | None:
+def _across(radius: Floating, quadrants: list[Mask]) -> AxesWarning | None:
     """The ground is seen further to the sides than ahead and behind."""
     reach = []
     for quadrant in quadrants:
@@ -274,10 +272,10 @@ def _across(radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> FrameDoubt |
     if along >= _MIN_ALONG * across:
         return None
     text = f"the ground is seen {across / along:.1f} times as far to the sides as ahead and behind: y may be forward"
-    return FrameDoubt("axes", text, "y-forward")
+    return AxesWarning("axes", text, "y-forward")
 
 
-def _tilted(z: _Floats, radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> FrameDoubt | None:
+def _tilted(z: Floating, radius: Floating, quadrants: list[Mask]) -> AxesWarning | None:
     """The ground falls from one side to the other by more than streets do."""
     low = []
     for quadrant in quadrants:
@@ -289,17 +287,17 @@ def _tilted(z: _Floats, radius: _Floats, quadrants: list[NDArray[np.bool_]]) -> 
     tilt_deg = float(np.degrees(np.arctan(np.hypot(along, across))))
     if tilt_deg < _MAX_TILT_DEG:
         return None
-    return FrameDoubt("tilt", f"the ground near the sensor is tilted by {tilt_deg:.0f} degrees", None)
+    return AxesWarning("tilt", f"the ground near the sensor is tilted by {tilt_deg:.0f} degrees", None)
 
 
-def _quadrants(x: _Floats, y: _Floats, half_width_deg: float) -> list[NDArray[np.bool_]]:
-    """Which points lie within so many degrees, at most 45, of straight ahead, left, behind and right."""
+def _quadrants(x: Floating, y: Floating, half_width_deg: float) -> list[Mask]:
+    """Masks of the points within so many degrees, at most 45, of straight ahead, left, behind and right."""
     slope = float(np.tan(np.radians(half_width_deg)))
     along_x, along_y = np.abs(y) < slope * np.abs(x), np.abs(x) < slope * np.abs(y)
     return [along_x & (x > 0), along_y & (y > 0), along_x & (x < 0), along_y & (y < 0)]
 
 
-def _percentile(ordered: _Floats, percent: float) -> float:
+def _percentile(ordered: Floating, percent: float) -> float:
     """`np.percentile` of ascending values (n,), n at least 1, which takes ten times as long for a thousand of them."""
     place, part = divmod(percent / 100 * (len(ordered) - 1), 1)
     low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])

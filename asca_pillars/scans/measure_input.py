@@ -1,4 +1,4 @@
-"""Measures what the scans of a training look like, once, for the bundle."""
+"""Measures the scans of a training, once, for the bundle."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,4 @@
-"""Where a sensor sits and how its axes lie, so that a model sees its scans as it saw those of its training."""
+"""Place and axes of a sensor, so that a model sees its scans as it saw those of its training."""
 
 import math
 import re
@@ -30,7 +30,7 @@ _EXAMPLES = (
 
 @dataclass(frozen=True)
 class Mounting(Strict):
-    """How a scan's own frame lies to the model's: x forward, y left, z up, level, so high above the ground.
+    """Pose of a scan's frame in the model's: x forward, y left, z up, level, so high above the ground.
 
     Attributes:
         sensor_height_m: height above the ground of the frame's origin, after `axes` or `pose`: the sensor's for scans
@@ -64,20 +64,20 @@ class Mounting(Strict):
 
     @cached_property
     def level(self) -> FrameChange:
-        """From the scan to x forward, y left, z up about the same origin, or that of the pose."""
+        """Change from the scan to x forward, y left, z up about the same origin, or that of the pose."""
         if self.pose is None:
             return FrameChange(_signed_axes(self.axes), np.zeros(3))
-        refuse_axes_beside_pose(self.axes)
+        refuse_axes_with_pose(self.axes)
         pose = np.array(self.pose)
         if not is_rigid(pose):
             raise ConfigError("pose: must be a rotation and a shift, the last row 0 0 0 1")
         return FrameChange(pose[:3, :3], pose[:3, 3])
 
     def to_model(self, trained_height_m: float | None) -> FrameChange:
-        """From the scan to the model's frame.
+        """Change from the scan to the model's frame.
 
         Args:
-            trained_height_m: of the sensor in the scans that the model was trained on; None: unknown.
+            trained_height_m: height of the sensor in the scans that the model was trained on; None: unknown.
         """
         if self.sensor_height_m is None or trained_height_m is None:
             return self.level
@@ -85,8 +85,8 @@ class Mounting(Strict):
         return FrameChange(self.level.axes, self.level.shift_m + lift)
 
 
-def refuse_axes_beside_pose(axes: str) -> None:
-    """ConfigError where both are stated."""
+def refuse_axes_with_pose(axes: str) -> None:
+    """Raise ConfigError if axes are stated beside a pose."""
     if axes != "x-forward":
         raise ConfigError(f"axes {axes} and a pose: the pose turns the axes already; give one of them")
 

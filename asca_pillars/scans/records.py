@@ -29,12 +29,12 @@ class Field:
 
     @property
     def size_bytes(self) -> int:
-        """Of the whole field in one point."""
+        """Bytes of the whole field in one point."""
         return self.dtype.itemsize * self.count
 
 
 class StoredPoints(NamedTuple):
-    """What a file holds: `xyz` (N, 3) float32 in m, `reflectance` (N,) of any scale, or None if there is none.
+    """Points of a file: `xyz` (N, 3) float32 in m, `reflectance` (N,) of any scale, or None if there is none.
 
     `dtype` is the type that the file declares for the reflectance, and `remarks` say what the reader had to decide.
     """
@@ -56,7 +56,7 @@ def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field
     Raises:
         ScanError: lines are missing, not as long as the fields, or not of numbers; or there is no x, y and z.
     """
-    wanted, width = wanted_fields(source, fields), sum(field.count for field in fields)
+    selected, width = select_fields(source, fields), sum(field.count for field in fields)
     if len(lines) < count:
         raise ScanError(f"{source}: {len(lines)} lines where {count} points need {count}; {AGAIN}")
     rows = [line.split() for line in lines[:count]]
@@ -71,7 +71,9 @@ def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field
     except ValueError as error:
         raise ScanError(f"{source}: {error}; {AGAIN}") from error
     starts = np.cumsum([0] + [field.count for field in fields])
-    return assemble_points(count, [table[:, starts[index]] for index in wanted], [fields[index] for index in wanted])
+    return assemble_points(
+        count, [table[:, starts[index]] for index in selected], [fields[index] for index in selected]
+    )
 
 
 def points_from_bytes(
@@ -82,22 +84,22 @@ def points_from_bytes(
     Raises:
         ScanError: the body is shorter than `count` points, or the fields hold no x, y and z.
     """
-    wanted, size = wanted_fields(source, fields), sum(field.size_bytes for field in fields)
+    selected, size = select_fields(source, fields), sum(field.size_bytes for field in fields)
     if len(data) < count * size:
         raise ScanError(f"{source}: {len(data)} bytes where {count} points need {count * size}; {AGAIN}")
     raw = np.frombuffer(data, dtype=np.uint8, count=count * size)
     columns = []
-    for index in wanted:
+    for index in selected:
         start, field = sum(f.size_bytes for f in fields[:index]), fields[index]
         if by_field:
             column = raw[start * count : (start + field.size_bytes) * count]
         else:
             column = np.ascontiguousarray(raw.reshape(count, size)[:, start : start + field.size_bytes])
         columns.append(column.reshape(-1).view(field.dtype))
-    return assemble_points(count, columns, [fields[index] for index in wanted])
+    return assemble_points(count, columns, [fields[index] for index in selected])
 
 
-def wanted_fields(source: str, fields: Sequence[Field]) -> list[int]:
+def select_fields(source: str, fields: Sequence[Field]) -> list[int]:
     """Indices of x, y, z and, where there is one, the reflectance. CloudCompare writes scalar_Intensity.
 
     Raises:
@@ -108,14 +110,14 @@ def wanted_fields(source: str, fields: Sequence[Field]) -> list[int]:
         raise ScanError(
             f"{source}: no field {', '.join(missing)} among {', '.join(names) or 'none'}; export x, y and z"
         )
-    wanted = [names.index(name) for name in "xyz"]
-    wanted += [names.index(name) for name in _REFLECTANCE if name in names][:1]
-    for index in wanted:
+    selected = [names.index(name) for name in "xyz"]
+    selected += [names.index(name) for name in _REFLECTANCE if name in names][:1]
+    for index in selected:
         if fields[index].count != 1:
             raise ScanError(f"{source}: {names[index]} has {fields[index].count} values per point; export one")
         if names.count(names[index]) > 1:
             raise ScanError(f"{source}: there are {names.count(names[index])} fields {names[index]}; export one")
-    return wanted
+    return selected
 
 
 def assemble_points(count: int, columns: Sequence[NDArray[np.generic]], fields: Sequence[Field]) -> StoredPoints:

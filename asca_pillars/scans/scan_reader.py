@@ -36,7 +36,7 @@ _SLACK = 2.0  # a scan stored in 0..255 has many values above 2; values just abo
 
 @dataclass(frozen=True)
 class ScanNotes:
-    """What reading a scan changed, dropped or had to decide.
+    """Changes, dropped points and decisions of the reader.
 
     Attributes:
         dropped_points: with a coordinate or reflectance that is not finite.
@@ -102,7 +102,7 @@ def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
 
 
 def read_stored(path: Path, columns: int | None) -> StoredPoints:
-    """What a file holds, reflectances of any scale; `columns` as in `read_scan`.
+    """Read the points of a file, reflectances of any scale; `columns` as in `read_scan`.
 
     Raises:
         ScanError: as `read_scan`.
@@ -192,8 +192,8 @@ def _columns(path: Path, size: int, data: NDArray[np.float32]) -> int:
 def _plausible(table: NDArray[np.float32]) -> bool:
     """Whether columns can be x, y, z and a reflectance: hardly any far away, hardly any negative reflectance."""
     with np.errstate(invalid="ignore"):
-        near = (np.abs(table[:, :3]) <= _FAR_M).all(axis=1)
-        return bool(((table[:, 3] >= 0) & (table[:, 3] <= 65535) & near).mean() >= 0.99)
+        in_range = (np.abs(table[:, :3]) <= _FAR_M).all(axis=1)
+        return bool(((table[:, 3] >= 0) & (table[:, 3] <= 65535) & in_range).mean() >= 0.99)
 
 
 def _whole_and_small(values: NDArray[np.float32]) -> bool:

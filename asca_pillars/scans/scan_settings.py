@@ -1,4 +1,4 @@
-"""How scan files are read and where their sensor sat: the options of commands and the keys of a dataset.yaml, alike."""
+"""Reading of scan files and mounting of their sensor: the options of commands and the keys of a dataset.yaml, alike."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.strict import Strict
 from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints, estimate_named_height
-from asca_pillars.scans.mounting import Mounting, read_pose, refuse_axes_beside_pose
+from asca_pillars.scans.mounting import Mounting, read_pose, refuse_axes_with_pose
 from asca_pillars.scans.scan_reader import ReflectanceScale
 
 FEWEST_COLUMNS = 3
@@ -22,7 +22,7 @@ SEARCHED_SCANS = 32  # that are looked at for them
 
 @dataclass(frozen=True)
 class ScanSettings(Strict):
-    """What a scan file does not say of itself.
+    """Facts that a scan file does not state itself.
 
     Attributes:
         sensor_height: metres above the ground of the scans' origin, after `axes` or `pose`; "auto": estimated from the
@@ -45,7 +45,7 @@ class ScanSettings(Strict):
     def __post_init__(self) -> None:
         Mounting(self._stated_height_m, self.axes)  # refuses what it cannot use
         if self.pose is not None:
-            refuse_axes_beside_pose(self.axes)
+            refuse_axes_with_pose(self.axes)
         if self.columns is not None and self.columns < FEWEST_COLUMNS:
             raise ConfigError(f"columns {self.columns}: a .bin has at least x, y and z; give {FEWEST_COLUMNS} or more")
         if self.reflectance_scale != "auto" and not 0 < self.reflectance_scale < inf:

@@ -14,7 +14,7 @@ from asca_pillars.scans.scan_reader import ReflectanceScale, ambiguity, decide_s
 
 
 class FolderScale(NamedTuple):
-    """What the reflectances of scans that belong together are divided by, and why that may be wrong, if it may."""
+    """Divisor of the reflectances of scans that belong together, and why it may be wrong, if it may."""
 
     scale: ReflectanceScale
     doubt: str | None
@@ -24,7 +24,7 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
     """One reflectance scale for scans that belong together, from `sample` of them, evenly spaced.
 
     A dark scan among brighter ones is then not read on another scale. Scans that cannot be read, or have no points,
-    have no say; where none has reflectances, the scale is auto.
+    are ignored; where none has reflectances, the scale is auto.
     """
     chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
     stored = []
@@ -37,7 +37,7 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
 def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
     """One reflectance scale for scans that belong together: the largest that any of them is stored in.
 
-    Auto where none of them has reflectances; scans without points have no say.
+    Auto where none of them has reflectances; scans without points are ignored.
     """
     samples = [(one.reflectance, one.dtype) for one in stored if one.reflectance is not None and has_finite_point(one)]
     if not samples:

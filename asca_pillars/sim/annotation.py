@@ -117,6 +117,6 @@ def nearest_first(targets: tuple[Target, ...]) -> npt.NDArray[np.int64]:
 
 
 def evidence(hits: Hits, owner: Owners) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Of each object (M,): how many points are its own, by the `owner` (N,) of each, and its visible share."""
+    """Number of points of each object (M,), by the `owner` (N,) of each point, and its visible share."""
     points = np.bincount(owner[owner >= 0], minlength=len(hits.alone))
     return points, hits.visible / np.maximum(hits.alone, 1)

@@ -1,4 +1,4 @@
-"""Simulating frame after frame in several processes, into a folder that says what it holds."""
+"""Simulation of frames in several processes, into a folder that records its settings."""
 
 import json
 import tempfile
@@ -17,8 +17,8 @@ COMMAND = "asca simulate"
 Item = TypeVar("Item")
 
 
-def check_wishes(counts: dict[str, int], val_share: float) -> None:
-    """Refuse counts below 1 and a share outside 0..1, with a ConfigError."""
+def check_counts(counts: dict[str, int], val_share: float) -> None:
+    """Raise ConfigError for a count below 1 or a share outside 0..1."""
     for name, count in counts.items():
         if count < 1:
             raise ConfigError(f"{name} is {count}; it must be at least 1")
@@ -27,13 +27,13 @@ def check_wishes(counts: dict[str, int], val_share: float) -> None:
 
 
 def held_out(count: int, share: float) -> int:
-    """How many of so many frames or sequences are for validation: one at least, where one is left to train on."""
-    wanted = round(count * share)
-    return min(max(wanted, 1), count - 1) if 0 < share < 1 and count > 1 else wanted
+    """Number of frames or sequences for validation: at least one, where one is left to train on."""
+    rounded = round(count * share)
+    return min(max(rounded, 1), count - 1) if 0 < share < 1 and count > 1 else rounded
 
 
 def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool | Progress) -> None:
-    """Do a job for each item, in `workers` processes; the job has to be one that can be sent to a process."""
+    """Do a job for each item, in `workers` processes; the job must be picklable."""
     done = in_processes(job, todo, workers, "Simulating", progress=progress is True)
     for _ in done if isinstance(progress, bool) else Reporter(progress).track(done, "Simulating", len(todo)):
         pass
@@ -44,8 +44,8 @@ def require_own_simulation(root: Path, about_keys: Sequence[str], folders: Itera
 
     Args:
         root: the folder.
-        about_keys: of its simulation.json.
-        folders: below `root`, that frames are written into.
+        about_keys: keys of its simulation.json.
+        folders: folders below `root` for the frames.
 
     Raises:
         OutputError: something else is there, such as a list that was edited, or a link.
@@ -56,7 +56,7 @@ def require_own_simulation(root: Path, about_keys: Sequence[str], folders: Itera
 
 
 def write_once(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` make a file of a frame. One that is there with the same bytes, of a run that was killed, stays.
+    """Write a file of a frame with `write`. One with the same bytes, of a run that was killed, stays.
 
     Raises:
         OutputError: a file of other bytes is there.
@@ -67,19 +67,19 @@ def write_once(path: Path, write: Callable[[Path], None]) -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / path.name)
-        require_own_file(path, COMMAND, lambda there: there.read_bytes() == Path(folder, path.name).read_bytes())
+        require_own_file(path, COMMAND, lambda existing: existing.read_bytes() == Path(folder, path.name).read_bytes())
 
 
-def claim_simulation(root: Path, about: dict[str, Any], scans: Path) -> None:
-    """Note in simulation.json what the frames of a folder depend on; refuse a folder of other frames.
+def record_settings(root: Path, about: dict[str, Any], scans: Path) -> None:
+    """Write the settings of the frames of a folder to simulation.json, or refuse a folder of other frames.
 
     Args:
         root: the folder.
-        about: plain values.
+        about: the settings, plain values.
         scans: folder below it that holds the scans.
 
     Raises:
-        DatasetError: the scans there are of something else.
+        DatasetError: the scans there have other settings.
     """
     path = root / SIMULATION_FILE
     text = json.dumps(about, indent=2) + "\n"

@@ -1,4 +1,4 @@
-"""What the simulator draws at random, and between which bounds. Every number here may be changed by a config file."""
+"""Random quantities of the simulator and their bounds. Every number here may be changed by a config file."""
 
 from dataclasses import dataclass, fields
 
@@ -24,7 +24,7 @@ class SceneConfig(Strict):
     misc: float = 0.18
     sitting: float = 0.10
     beyond: float = 1.2  # cars out of the sensor's reach, which become DontCare
-    # Of the negative binomial counts: the smaller, the more often none or many. People come in crowds.
+    # Dispersion of the negative binomial counts: the smaller, the more often none or many. People come in crowds.
     dispersion: float = 2.1
     people_dispersion: float = 0.7
     empty_share: float = 0.12  # scenes without any labelled type
@@ -50,7 +50,7 @@ class SceneConfig(Strict):
     oncoming: float = 0.45
 
     pedestrian_uniform_heading: float = 0.45
-    # Of the others, those who cross the sensor's line of sight at a right angle, give or take 20 degrees; what is left
+    # Share of the others who cross the sensor's line of sight at a right angle, give or take 20 degrees; the rest
     # walks along the street.
     pedestrian_across_sight: float = 0.55
     in_company: float = 0.42
@@ -70,7 +70,7 @@ class SceneConfig(Strict):
     level_band_m: tuple[float, float] = (0.17, 0.02)
     # Standard deviation of a body's center about that of its label box.
     box_offset_sigma_m: float = 0.03
-    # How far a person's body stands behind the center of its label, seen from the sensor, mean and standard deviation.
+    # Distance of a person's body behind the center of its label, seen from the sensor, mean and standard deviation.
     person_behind_box_m: tuple[float, float] = (0.11, 0.03)
 
     warp_m: tuple[float, float] = (0.02, 0.06)  # by how much a smooth field at most moves the points of a body

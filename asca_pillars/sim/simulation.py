@@ -29,10 +29,10 @@ from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
 from asca_pillars.sim.parallel import (
-    check_wishes,
-    claim_simulation,
+    check_counts,
     for_each,
     held_out,
+    record_settings,
     require_own_simulation,
     write_once,
 )
@@ -77,7 +77,7 @@ _SHARD_FRAMES = 20  # of a cluster's worker: a second or two
 
 @dataclass(frozen=True)
 class SimulationConfig(Strict):
-    """What to simulate.
+    """Settings of a simulation.
 
     Attributes:
         field_of_view: "full" is a whole revolution like KITTI's files, of which only what the camera sees is labelled;
@@ -105,7 +105,7 @@ _BEYOND_THE_IMAGE_DEG = 1.0  # firings end at the image; what stands across its 
 
 
 def built_half_angle_rad(config: SimulationConfig) -> float:
-    """How far to each side of straight ahead bodies are built."""
+    """Angle to each side of straight ahead within which bodies are built."""
     if config.field_of_view != "camera":
         return np.pi
     return float(np.deg2rad(config.lidar.camera_half_angle_deg + _BEYOND_THE_IMAGE_DEG))
@@ -185,11 +185,11 @@ def simulate(
         ConfigError: a number of frames or workers below 1, or a share outside 0..1.
         DatasetError: `out` holds frames of another seed or configuration.
     """
-    check_wishes({"frames": frames, "workers": workers}, val_share)
+    check_counts({"frames": frames, "workers": workers}, val_share)
     root = Path(out)
     config = config or SimulationConfig()
     split = KittiSplit(root)
-    claim_simulation(root, {"seed": seed, **asdict(config)}, split.folder / "velodyne")
+    record_settings(root, {"seed": seed, **asdict(config)}, split.folder / "velodyne")
     todo = [index for index in range(frames) if not _is_complete(split, index)]
     job = partial(_write_frame, root.absolute(), seed, config)
     if cluster is not None:

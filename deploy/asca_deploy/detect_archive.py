@@ -179,7 +179,7 @@ def detect_archive(
     job = _job(scan_input.mounting, reading.columns, options, out, score=score, around=around)
     folder = ShardFolder(job.shards)
     wanted = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
-    size = folder.claim(_results_depend_on(job, scans), wanted)
+    size = folder.begin(_results_depend_on(job, scans), wanted)
     shards = cut([(str(path), scan_input.scale(path)) for path in scans], size)
     there = folder.done(reporter.track(shards, "Checking what is done"))
     todo = [shard for shard in shards if shard.name not in there]

@@ -30,7 +30,7 @@ from asca_pillars.base.own_files import (
 )
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import Calibration, is_detection_text, read_calibration
-from asca_pillars.data.open_split import labels_beside
+from asca_pillars.data.open_split import labels_of_scan
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page
@@ -249,7 +249,7 @@ class ResultWriter:
 
     def _labels(self, path: Path) -> NDArray[np.float32] | None:
         try:
-            return labels_beside(path)
+            return labels_of_scan(path)
         except AscaError as error:
             self.remarks.append(f"labels are not drawn: {error}")
             return None

@@ -102,7 +102,7 @@ def test_misses_are_counted_where_there_are_labels(tmp_path: Path, monkeypatch: 
     keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
     labels = np.array([[found[key] for key in keys]] * 3, np.float32)
     labels[1:, :2] = (40, 25), (-20, 0)
-    monkeypatch.setattr(result_files, "labels_beside", lambda path: labels)
+    monkeypatch.setattr(result_files, "labels_of_scan", lambda path: labels)
     detect([tmp_path / "scans"], out=tmp_path / "out", threads=1)
     (values,) = cards((tmp_path / "out" / "index.html").read_text()).values()
     assert values["missed"] == 1

@@ -12,7 +12,7 @@ import pytest
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.cluster import ray_pool
 from asca_pillars.cluster.run_shards import run_each, run_shards
-from asca_pillars.cluster.shards import Shard, cut, work_off
+from asca_pillars.cluster.shards import Shard, cut, process_shards
 
 pytest.importorskip("ray", reason="needs pip install -e '.[cluster]'")
 
@@ -79,11 +79,11 @@ def test_machines_that_are_not_alike_are_named(cluster: Any, tmp_path: Path, mon
         assert about.startswith("Ray: ") and about.endswith("CPUs")
         elsewhere = ray_pool.RayPool(partial(touch, tmp_path), tmp_path / "only here")
         with pytest.raises(ClusterError, match=r"does not see .*only here; write to a folder that every"):
-            list(work_off([Shard(0, (1,))], elsewhere))
+            list(process_shards([Shard(0, (1,))], elsewhere))
         monkeypatch.setattr(ray_pool, "_version", lambda: "9.9")
         (tmp_path / "only here").touch()
         with pytest.raises(ClusterError, match=r"has asca-pillars \S+, the command 9\.9; install one version"):
-            list(work_off([Shard(0, (1,))], elsewhere))
+            list(process_shards([Shard(0, (1,))], elsewhere))
         monkeypatch.undo()
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from asca_pillars.base.errors import BundleError
-from asca_pillars.cluster.shards import TRIES, Outcome, Shard, cut, work_off
+from asca_pillars.cluster.shards import TRIES, Outcome, Shard, cut, process_shards
 
 
 class MadeUpPool:
@@ -43,7 +43,7 @@ def test_all_are_done_once_while_machines_die() -> None:
     rng = random.Random(0)
     pool = MadeUpPool(lambda shard: died(shard, "machine") if rng.random() < 0.4 else done(shard))
     shards = cut(range(100), 7)
-    outcomes = list(work_off(shards, pool))
+    outcomes = list(process_shards(shards, pool))
     assert sorted(outcome.shard for outcome in outcomes) == shards
     assert sum(outcome.result or 0 for outcome in outcomes) == sum(range(100))
     assert sum(outcome.repeats for outcome in outcomes) == sum(pool.begun.values()) - len(shards) > 0
@@ -51,7 +51,7 @@ def test_all_are_done_once_while_machines_die() -> None:
 
 def test_the_item_that_ends_its_workers_is_found_and_the_others_are_done() -> None:
     pool = MadeUpPool(lambda shard: died(shard) if {13, 77} & set(shard.items) else done(shard))
-    outcomes = list(work_off(cut(range(100), 20), pool))
+    outcomes = list(process_shards(cut(range(100), 20), pool))
     assert sorted(item for outcome in outcomes for item in outcome.shard.items) == list(range(100))
     assert sorted(outcome.shard.items for outcome in outcomes if outcome.died) == [(13,), (77,)]
     assert max(pool.begun.values()) == TRIES["worker"]
@@ -64,7 +64,7 @@ def test_a_machine_is_not_taken_for_the_fault_of_the_shard() -> None:
         deaths[shard.name] += 1
         return died(shard, "machine") if deaths[shard.name] < TRIES["machine"] else done(shard)
 
-    (outcome,) = work_off([Shard(0, (1, 2))], MadeUpPool(end))
+    (outcome,) = process_shards([Shard(0, (1, 2))], MadeUpPool(end))
     assert (outcome.result, outcome.repeats) == (3, TRIES["machine"] - 1)
 
 
@@ -75,14 +75,14 @@ def test_a_bad_moment_of_the_file_system_is_waited_out_and_a_full_disk_is_not() 
         tries[shard.name] += 1
         return done(shard) if tries[shard.name] > good_after else Outcome(shard, error=OSError("no space"))
 
-    assert [one.result for one in work_off(cut([1, 2], 1), MadeUpPool(lambda shard: end(shard, 2)))] == [2, 1]
+    assert [one.result for one in process_shards(cut([1, 2], 1), MadeUpPool(lambda shard: end(shard, 2)))] == [2, 1]
     tries.clear()
     with pytest.raises(OSError, match="no space"):
-        list(work_off([Shard(0, (1,))], MadeUpPool(lambda shard: end(shard, 3))))
+        list(process_shards([Shard(0, (1,))], MadeUpPool(lambda shard: end(shard, 3))))
 
 
 def test_what_the_job_raises_ends_the_run() -> None:
     pool = MadeUpPool(lambda shard: Outcome(shard, error=BundleError("another bundle")))
     with pytest.raises(BundleError, match="another bundle"):
-        list(work_off([Shard(0, (1,))], pool))
-    assert list(work_off([], pool)) == []
+        list(process_shards([Shard(0, (1,))], pool))
+    assert list(process_shards([], pool)) == []

@@ -100,12 +100,12 @@ def test_a_result_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_other_settings_are_refused_and_the_size_stays(tmp_path: Path) -> None:
     folder = ShardFolder(tmp_path / "shards")
-    assert folder.claim({"score": None, "mounting": {"axes": "x-forward"}}, 16) == 16
-    assert folder.claim({"score": None, "mounting": {"axes": "x-forward"}}, 256) == 16
+    assert folder.begin({"score": None, "mounting": {"axes": "x-forward"}}, 16) == 16
+    assert folder.begin({"score": None, "mounting": {"axes": "x-forward"}}, 256) == 16
     with pytest.raises(OutputError, match=r"run\.json: .* score = None, now 0\.5; choose another folder"):
-        folder.claim({"score": 0.5, "mounting": {"axes": "x-forward"}}, 16)
+        folder.begin({"score": 0.5, "mounting": {"axes": "x-forward"}}, 16)
     with pytest.raises(OutputError, match="tilt = None, now 1"):
-        folder.claim({"score": None, "mounting": {"axes": "x-forward"}, "tilt": 1}, 16)
+        folder.begin({"score": None, "mounting": {"axes": "x-forward"}, "tilt": 1}, 16)
     for text in (
         "{",
         "[]",
@@ -114,4 +114,4 @@ def test_other_settings_are_refused_and_the_size_stays(tmp_path: Path) -> None:
     ):
         (tmp_path / "shards" / "run.json").write_text(text)
         with pytest.raises(OutputError, match="is damaged"):
-            folder.claim({}, 16)
+            folder.begin({}, 16)

@@ -12,7 +12,7 @@ from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.kitti import parse_object, read_labels
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.require_boxes import require_boxes
-from asca_pillars.data.yaw_units import doubt_of_yaws
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.geometry.boxes import wrap_angle
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.in_process import invoke
@@ -24,7 +24,7 @@ CAR = "Car 0 0 0 500 100 600 200 2 1.8 4.5 -3 1.7 12 {yaw}"
 @pytest.mark.parametrize("yaws", [[1.0, 2.0, 3.0], [0.0, 0.0, 4.0, 5.0], [[-1.0], [6.0, 6.0]], [3.0, -2.0, 0.0]])
 def test_whole_yaws_are_doubted_wrapped_or_not(yaws: list) -> None:
     for own in ([np.array(one) for one in yaws], [wrap_angle(np.array(one, np.float32)) for one in yaws]):
-        doubt = doubt_of_yaws(own)
+        doubt = check_yaws(own)
         assert doubt is not None and "radians" in doubt and "pi / 180" in doubt
 
 
@@ -32,7 +32,7 @@ def test_whole_yaws_are_doubted_wrapped_or_not(yaws: list) -> None:
     "yaws", [[], [0.0] * 50, [1.0], [0.0, 3.0], [1.0, 2.0, 1.57], [np.pi / 2, -np.pi / 2, np.pi], [0.1, 0.2]]
 )
 def test_right_yaws_are_not(yaws: list[float]) -> None:
-    assert doubt_of_yaws(yaws) is None
+    assert check_yaws(yaws) is None
 
 
 @pytest.mark.parametrize("yaw", ["90", "-90", "6.5", "235"])

@@ -1,4 +1,4 @@
-"""Boxes as JSON and CSV records: what `asca detect` writes, labels of one's own, and predictions from elsewhere.
+"""Boxes as JSON and CSV records: detections of `asca detect`, own labels, and predictions of other programs.
 
 A record has a class and seven numbers, in the LiDAR frame (x forward, y left, z up):
 
@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
-from asca_pillars.data.yaw_units import LARGEST_YAW_RAD, why_no_yaw
+from asca_pillars.data.yaw_units import LARGEST_YAW_RAD, yaw_error
 from asca_pillars.geometry.boxes import wrap_angle
 
 FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
 _SHORT = {name.rpartition("_")[0]: name for name in FIELDS}
-_TOO_LARGE = 1e6  # of any number; a box is never a thousand kilometres away
-_DECIMALS = 4  # that are written
+_TOO_LARGE = 1e6  # for any number; a box is never a thousand kilometres away
+_DECIMALS = 4  # in written files
 _LAST_TIME_S = 1e18  # beyond int64's nanoseconds
 
 
@@ -50,9 +50,9 @@ class BoxRecords(NamedTuple):
 
 
 class NamedRecords(NamedTuple):
-    """Records of a frame, the scan that they are said to belong to, and where they stand: FILE:LINE.
+    """Records of a frame, the path of its scan as stated, and their place in the file: FILE:LINE.
 
-    `time_s` is the frame's time stamp, `detector` what the records were found by; None where a line states none.
+    `time_s` is the frame's time stamp, `detector` the scope of the detector; None where a line states none.
     """
 
     scan: str
@@ -78,8 +78,8 @@ def read_frames(path: Path) -> Iterator[NamedRecords]:
                     f"{place}: no `scan`; a file for several frames says in each row which scan it is of"
                 )
             rows.setdefault(row["scan"], []).append((place, row))
-        for scan, own in rows.items():
-            yield NamedRecords(scan, _records(own), own[0][0])
+        for scan, placed in rows.items():
+            yield NamedRecords(scan, _records(placed), placed[0][0])
     else:
         raise DatasetError(f"{path}: labels of several frames are .jsonl or .csv; rename or convert the file")
 
@@ -144,7 +144,7 @@ def json_line(
 
 
 def can_be_written(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which boxes (N, 7), metres and radians, can be read again from what `json_line` writes of them."""
+    """Mask of the boxes (N, 7), metres and radians, that can be read again from the output of `json_line`."""
     written = np.round(np.asarray(boxes, np.float64), _DECIMALS)
     within = (np.abs(written) < _TOO_LARGE).all(axis=1)  # not where a number is not finite
     return np.asarray(within & (written[:, 3:6] > 0).all(axis=1) & (np.abs(written[:, 6]) <= LARGEST_YAW_RAD))
@@ -180,7 +180,7 @@ def _json_records(content: Any, place: str) -> BoxRecords:
 
 
 def _of_other_tool(content: Any) -> str | None:
-    """What to do with a file of a labelling tool that is known; None if it is of none."""
+    """Advice for the file of a known labelling tool; None if it is not one of these."""
     if isinstance(content, dict) and "boxes" not in content and isinstance(content.get("objects"), list):
         tool = ("Supervisely", "supervisely") if "figures" in content else ("labelCloud", "labelcloud")
     elif isinstance(content, list) and content and all(isinstance(item, dict) and "psr" in item for item in content):
@@ -239,7 +239,7 @@ def _records(placed: Iterable[tuple[str, Any]]) -> BoxRecords:
         for name, size in zip(FIELDS[3:6], box[3:6], strict=True):
             if size <= 0:
                 raise DatasetError(f"{place}: {name} is {size:g}; a box has a positive size: correct or remove it")
-        if (reason := why_no_yaw(box[6])) is not None:
+        if (reason := yaw_error(box[6])) is not None:
             raise DatasetError(f"{place}: yaw_rad {reason}")
         boxes.append(box)
         types.append(kind.strip())

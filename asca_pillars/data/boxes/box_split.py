@@ -38,7 +38,7 @@ from asca_pillars.scans.stored_scans import folder_reflectance_scale, stored_poi
 
 DATASET_FILE = "dataset.yaml"
 _DEEPEST = 64
-"""Folders of a path in a label that are looked at."""
+"""Largest number of folders of a scan's path in a label that are compared."""
 
 
 class BoxFrame(NamedTuple):
@@ -83,15 +83,15 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             if same != path:
                 raise DatasetError(f"{same} and {path}: both would be frame {frame_id_of(path, scans)}; rename one")
     for scan, records, place, time_s, _ in read_frames(labels):
-        found = _find_scan(scan, scans)
-        if found is None:
+        scan_path = _find_scan(scan, scans)
+        if scan_path is None:
             raise DatasetError(
                 f"{place}: no scan {scan[:200]} below {scans}; correct the name, or `scans` in {DATASET_FILE}"
             )
-        frame_id = frame_id_of(found, scans)
+        frame_id = frame_id_of(scan_path, scans)
         if frame_id in places:
             raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
-        frames[frame_id], places[frame_id] = BoxFrame(found, labels, records, time_s), place
+        frames[frame_id], places[frame_id] = BoxFrame(scan_path, labels, records, time_s), place
     if not frames:
         raise DatasetError(f"{labels}: no frame in it; write a line for each scan, as docs/DATA.md says")
     return frames
@@ -119,13 +119,13 @@ def _frames_of_folder(labels: Path, scans: Path) -> dict[str, BoxFrame]:
     frames: dict[str, BoxFrame] = {}
     for path in sorted(entry for entry in files_below(labels) if _is_label(entry.relative_to(labels))):
         frame_id = frame_id_of(path, labels)
-        there = [scan for suffix in SCAN_SUFFIXES if (scan := scans / f"{frame_id}{suffix}").is_file()]
-        if len(there) != 1:
-            found = " and ".join(scan.name for scan in there) or "none"
-            raise DatasetError(f"{path}: belongs to one scan {scans / frame_id}.*, there is {found}; rename the files")
+        candidates = [scan for suffix in SCAN_SUFFIXES if (scan := scans / f"{frame_id}{suffix}").is_file()]
+        if len(candidates) != 1:
+            names = " and ".join(scan.name for scan in candidates) or "none"
+            raise DatasetError(f"{path}: belongs to one scan {scans / frame_id}.*, there is {names}; rename the files")
         if frame_id in frames:
             raise DatasetError(f"{path}: {frames[frame_id].label_file.name} has labels of the scan already; remove one")
-        frames[frame_id] = BoxFrame(there[0], path, None)
+        frames[frame_id] = BoxFrame(candidates[0], path, None)
     if not frames:
         advice = "write one for each scan"
         if texts := visible_files(labels, "*.txt"):
@@ -142,13 +142,13 @@ ALL_AROUND_DEG = 360.0
 
 @dataclass(frozen=True)
 class BoxDataset(ScanSettings):
-    """dataset.yaml: where scans and labels are, and the settings of the scans, one for all of them.
+    """dataset.yaml: paths of scans and labels, and settings that hold for all scans.
 
     Attributes:
         scans: folder of the scans, relative to the dataset or absolute.
         labels: a .jsonl or .csv file for all frames, or a folder with a .json or .csv for each; relative or absolute.
-        labeled_view_deg: labels stand only within this angle, half of it to each side of straight ahead, as where a
-            camera looks: nothing is learnt from what lies outside. 360: everywhere.
+        labeled_view_deg: angle that is labelled, half of it to each side of straight ahead, such as a camera's view:
+            nothing is learnt from what lies outside. 360: everywhere.
         sensor_position: x, y, z of the sensor in the scans' own frame, metres, where that is the vehicle's: from there
             it follows what an inserted object hides.
     """
@@ -176,7 +176,7 @@ class BoxSplit:
 
     @property
     def has_camera(self) -> bool:
-        """Whether labels stand only within an angle ahead."""
+        """Whether objects are labelled only within an angle ahead."""
         return self.settings.labeled_view_deg < ALL_AROUND_DEG
 
     @cached_property
@@ -186,7 +186,7 @@ class BoxSplit:
 
     @cached_property
     def mounting(self) -> Mounting:
-        """Of the sensor; a height of "auto" is estimated when it is asked for.
+        """Mounting of the sensor; a height of "auto" is estimated on first use.
 
         Raises:
             ConfigError: the pose cannot be read.
@@ -197,13 +197,13 @@ class BoxSplit:
 
     @cached_property
     def to_sensor(self) -> FrameChange:
-        """From the level frame to the same with the sensor at its origin."""
+        """Change from the level frame to the same with the sensor at its origin."""
         (position,) = self._level.points(np.array([self.settings.sensor_position]))
         return FrameChange(np.eye(3), -position.astype(np.float64))
 
     @property
     def scans_folder(self) -> Path:
-        """Where the scans are."""
+        """Folder of the scans."""
         return Path(self.root) / self.settings.scans
 
     @property
@@ -220,13 +220,13 @@ class BoxSplit:
         """
         if self.name == "training":
             return tuple(sorted(self._frames))
-        wanted = read_image_set(Path(self.root), self.name)
-        if missing := sorted(wanted - set(self._frames)):
+        listed = read_image_set(Path(self.root), self.name)
+        if missing := sorted(listed - set(self._frames)):
             raise DatasetError(
                 f"{missing[0]}: listed in ImageSets/{self.name}.txt, but {self.labels_path} has no such frame "
-                f"({len(missing)} of {len(wanted)} are missing); a frame without objects needs an entry without boxes"
+                f"({len(missing)} of {len(listed)} are missing); a frame without objects needs an entry without boxes"
             )
-        return tuple(sorted(wanted))
+        return tuple(sorted(listed))
 
     @cached_property
     def times_s(self) -> dict[str, float]:
@@ -242,7 +242,7 @@ class BoxSplit:
         return self._frames[frame_id].scan, self._frames[frame_id].label_file
 
     def require_files(self) -> None:
-        """Labels name only scans that are there, so that reading the list is enough."""
+        """Raise DatasetError unless every frame has its files: reading the list checks it."""
         self.frame_ids  # noqa: B018
 
     def points(self, frame_id: str, *, camera_view: bool = False) -> NDArray[np.float32]:
@@ -251,7 +251,7 @@ class BoxSplit:
         return points[self.in_labeled_view(frame_id, points)] if camera_view else points
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which of the positions (N, 3 or more), metres, level frame, lie within the labelled angle."""
+        """Mask of the positions (N, 3 or more), metres, level frame, within the labelled angle."""
         if not self.has_camera:  # rounded, the angle straight behind is more than half a turn
             return np.ones(len(positions), bool)
         angles = np.arctan2(positions[:, 1], positions[:, 0])
@@ -305,7 +305,7 @@ class BoxSplit:
 
     @cached_property
     def _level(self) -> FrameChange:
-        """From the scans' own frame; needs no height."""
+        """Change from the scans' own frame to the level frame; needs no height."""
         return self.settings.stated_mounting(Path(self.root)).level
 
     def _read(self, path: Path) -> NDArray[np.float32]:

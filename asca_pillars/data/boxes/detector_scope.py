@@ -1,4 +1,4 @@
-"""What a detector could have found, as every line of its results states it: its classes, and where it looked."""
+"""Scope of a detector, stated in every line of its results: its classes and its ranges."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ class DetectorScope(NamedTuple):
     ranges_m: tuple[Interval, Interval] | None
 
     def holds(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which boxes (N, 7), metres and radians, level axes, have their center within the ranges: (N,)."""
+        """Mask (N,) of the boxes (N, 7), metres and radians, level axes, whose center lies within the ranges."""
         inside = np.ones(len(boxes), bool)
         for axis, (low, high) in enumerate(self.ranges_m or ()):
             inside &= (boxes[:, axis] >= low) & (boxes[:, axis] < high)
@@ -36,7 +36,7 @@ class DetectorScope(NamedTuple):
         return f"x {x_low:g} to {x_high:g} m and y {y_low:g} to {y_high:g} m"
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, which `scope_from_json` reads."""
+        """Convert to plain values, which `scope_from_json` reads."""
         ranges = None if self.ranges_m is None else [list(interval) for interval in self.ranges_m]
         return {"classes": list(self.classes), "ranges_m": ranges}
 

@@ -19,7 +19,7 @@ from asca_pillars.data.boxes.box_records import BoxRecords, can_be_written, json
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, find_frames, frame_id_of
 from asca_pillars.data.importing.foreign_values import LeftOut, text_of
 from asca_pillars.data.kitti import write_image_set
-from asca_pillars.data.yaw_units import doubt_of_yaws
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.scans.find_scans import natural_order
 
 COMMAND = "asca import"
@@ -198,7 +198,7 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
         write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
     write_text(out / DATASET_FILE, MARKER + settings)
     boxes = Counter(kind for frame in frames for kind in frame.records.types)
-    doubt = doubt_of_yaws([frame.records.boxes[:, 6] for frame in frames])
+    doubt = check_yaws([frame.records.boxes[:, 6] for frame in frames])
     return ImportCounts(len(train), len(val), dict(boxes.most_common()), doubt)
 
 

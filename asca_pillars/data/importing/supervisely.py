@@ -31,7 +31,7 @@ from asca_pillars.data.importing.tool_labels import (
     track_numbers,
     xyz,
 )
-from asca_pillars.data.yaw_units import why_no_yaw
+from asca_pillars.data.yaw_units import yaw_error
 from asca_pillars.scans.find_scans import files_below
 from asca_pillars.scans.scan_settings import ScanSettings
 
@@ -81,7 +81,7 @@ def _read(source: Path, scans: Path, settings: ScanSettings, *, along_y: bool) -
                 continue  # points and masks are no boxes
             key, geometry = entry(figure, "objectKey"), entry(figure, "geometry")
             pitch, roll, yaw = xyz(geometry, "rotation").tolist()
-            if (reason := why_no_yaw(yaw)) is not None:  # before a quarter is added
+            if (reason := yaw_error(yaw)) is not None:  # before a quarter is added
                 raise ValueError(f"a yaw {reason}")
             size = xyz(geometry, "dimensions")
             if along_y:

@@ -20,7 +20,7 @@ from asca_pillars.data.importing.box_files import dataset_settings
 from asca_pillars.data.importing.foreign_values import LeftOut, entry, numbers, text_of
 from asca_pillars.data.importing.formats import FORMATS, TOOLS
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.data.yaw_units import why_no_yaw
+from asca_pillars.data.yaw_units import yaw_error
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, natural_order
 from asca_pillars.scans.scan_settings import ScanSettings
@@ -201,7 +201,7 @@ def _records(boxes: Iterable[ToolBox], path: Path, left_out: LeftOut) -> BoxReco
             numbers([box.yaw, box.tilt], 2, "the rotation")
         except ValueError as reason:
             raise ValueError(f"box {number}: {reason}; correct it in the tool") from None
-        if (why := why_no_yaw(box.yaw)) is not None:
+        if (why := yaw_error(box.yaw)) is not None:
             raise ValueError(f"box {number}: the yaw {why}")
         if box.tilt > _UPRIGHT_RAD:
             left_out.add("tilts", f"{path}, box {number}", f"rolled or pitched by {box.tilt:.2g} rad, read upright")

@@ -1,17 +1,16 @@
-"""Finding a place for an object in a frame, and what it hides there (section 3.5, steps 5 and 6)."""
+"""Placement of an object in a frame, and occlusion by it (section 3.5, steps 5 and 6)."""
 
 import itertools
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace
 from asca_pillars.data.insertion.gt_database import StoredObject
 from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.geometry.arrays import Floating, Floats, Mask, Singles
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import paired_bev_touch
 from asca_pillars.geometry.ranges import Ranges
@@ -19,26 +18,24 @@ from asca_pillars.geometry.rotations import transform_columns, transform_points
 
 PLACE_TRIES = 32  # places that are tried for one object
 CHECKED_PLACES = 4  # of those on free ground, looked at closely
-MARGIN_M = 0.2  # around the footprint that must be free, too
+MARGIN_M = 0.2  # around the footprint, which must be free too
 MIN_SEEN_SHARE = 0.5  # of an object's points
-
-_Floats = NDArray[np.floating[Any]]
 
 
 class Scene:
-    """A frame while objects are put into it.
+    """A frame while objects are inserted into it.
 
     Attributes:
-        frame: as it was.
+        frame: the frame before insertion.
         obstacles: (K, 7) boxes that another one must not touch, metres and radians, LiDAR frame.
-        inserted: objects so far, with all their points.
+        inserted: inserted objects, with all their points.
     """
 
-    def __init__(self, frame: LabeledFrame, obstacles: NDArray[np.float32]) -> None:
+    def __init__(self, frame: LabeledFrame, obstacles: Singles) -> None:
         self.frame = frame
         self.obstacles = obstacles
         self.inserted: list[StoredObject] = []
-        self._seen_points: list[NDArray[np.float32]] = []
+        self._seen_points: list[Singles] = []
         inside = points_in_boxes(frame.points, frame.boxes)
         self._owned = np.flatnonzero(inside.any(axis=1))
         self._owners = np.ascontiguousarray(inside[self._owned].T)
@@ -48,14 +45,14 @@ class Scene:
         self._hidden = np.zeros(len(self._owned), bool)
 
     def add(self, item: StoredObject) -> None:
-        """Put an object where it says."""
+        """Insert an object at its box."""
         self._hidden |= self._owned_rays.entering(item.box[None])
         self._seen_points = [*self._seen_with(item), self._seen_of(item)]
         self.inserted.append(item)
         self.obstacles = np.concatenate([self.obstacles, item.box[None]])
 
     def shows_all_with(self, item: StoredObject) -> bool:
-        """Whether most of every object, `item` included, would be seen if `item` were added."""
+        """Whether most points of every object, `item` included, stay visible if `item` is added."""
         seen = ~(self._hidden | self._owned_rays.entering(item.box[None]))
         if (np.count_nonzero(self._wanted & seen, axis=1) < self._enough).any():
             return False
@@ -65,7 +62,7 @@ class Scene:
         return all(len(points) >= MIN_SEEN_SHARE * len(other.points) for points, other in after)
 
     def frame_with_inserted(self, min_points: int) -> LabeledFrame:
-        """The frame with the objects, without what they hide; what keeps fewer than `min_points` becomes IGNORED."""
+        """The frame with the objects, without the points they hide; below `min_points` an object becomes IGNORED."""
         if not self.inserted:
             return self.frame
         boxes = np.array([item.box for item in self.inserted])
@@ -81,12 +78,12 @@ class Scene:
             labels=np.concatenate([labels, added.astype(np.int64)]),
         )
 
-    def _seen_of(self, item: StoredObject) -> NDArray[np.float32]:
+    def _seen_of(self, item: StoredObject) -> Singles:
         """Points of `item` that no inserted object hides."""
         hiding = [other.box for other in self.inserted if _share_azimuths(other.box, item.box)]
         return item.points[~rays_entering(item.points, np.array(hiding))] if hiding else item.points
 
-    def _seen_with(self, item: StoredObject) -> list[NDArray[np.float32]]:
+    def _seen_with(self, item: StoredObject) -> list[Singles]:
         """Points of each inserted object that neither another one nor `item` hides."""
         return [
             points[~rays_entering(points, item.box[None])] if _share_azimuths(other.box, item.box) else points
@@ -95,35 +92,35 @@ class Scene:
 
 
 class Rays:
-    """The straight ways from the sensor to points (N, >=3), LiDAR frame, for many tests while places are tried."""
+    """Rays from the sensor to points (N, >=3), LiDAR frame, for many intersection tests."""
 
-    def __init__(self, points: _Floats) -> None:
+    def __init__(self, points: Floating) -> None:
         self._ends = np.ascontiguousarray(points[:, :3].T, dtype=np.float64)
         self._reach = np.hypot(self._ends[0], self._ends[1]) * (1 + 1e-5) + 1e-3
 
-    def entering(self, boxes: _Floats) -> NDArray[np.bool_]:
-        """Mask (N,) of those that touch one of boxes (M, 7), LiDAR frame, their ends included."""
+    def entering(self, boxes: Floating) -> Mask:
+        """Mask (N,) of the rays that touch one of boxes (M, 7), LiDAR frame, their ends included."""
         px, py, _ = self._ends
         hits = np.zeros(len(px), bool)
         for x, y, z, length, width, height, yaw in boxes.tolist():
-            # Most ways pass the box's circumscribed circle by; both sides are scaled by the distance to the point.
-            near = (np.abs(px * y - py * x) <= math.hypot(length, width) / 2 * self._reach).nonzero()[0]
-            if not len(near):
+            # Most rays miss the box's circumscribed circle; both sides are scaled by the distance to the point.
+            candidates = (np.abs(px * y - py * x) <= math.hypot(length, width) / 2 * self._reach).nonzero()[0]
+            if not len(candidates):
                 continue
             cos, sin = math.cos(yaw), math.sin(yaw)
             into_box = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-            ray = transform_columns(self._ends[:, near], into_box)
+            ray = transform_columns(self._ends[:, candidates], into_box)
             center = transform_columns(np.array([[x], [y], [z]]), into_box)
             ray[np.abs(ray) < 1e-9] = 1e-9
             half = np.array([[length], [width], [height]]) / 2
             one, other = (center - half) / ray, (center + half) / ray
             enters = np.minimum(one, other).max(axis=0)
             leaves = np.maximum(one, other).min(axis=0)
-            hits[near] |= (enters <= leaves) & (leaves >= 0) & (enters <= 1)
+            hits[candidates] |= (enters <= leaves) & (leaves >= 0) & (enters <= 1)
         return hits
 
 
-def rays_entering(points: _Floats, boxes: _Floats) -> NDArray[np.bool_]:
+def rays_entering(points: Floating, boxes: Floating) -> Mask:
     """Mask (N,) of the straight lines from the sensor to points (N, >=3) that touch one of boxes (M, 7), ends included.
 
     All in the LiDAR frame.
@@ -131,19 +128,21 @@ def rays_entering(points: _Floats, boxes: _Floats) -> NDArray[np.bool_]:
     return Rays(points).entering(boxes)
 
 
-def is_clear(box: _Floats, obstacles: _Floats, ranges: Ranges) -> bool:
+def is_clear(box: Floating, obstacles: Floating, ranges: Ranges) -> bool:
     """Whether a box (7,) stands within the ranges and touches none of the others (K, 7), all in the LiDAR frame."""
     reach = (np.hypot(obstacles[:, 3], obstacles[:, 4]) + math.hypot(box[3], box[4])) / 2
-    near = obstacles[np.hypot(obstacles[:, 0] - box[0], obstacles[:, 1] - box[1]) <= reach]
+    candidates = obstacles[np.hypot(obstacles[:, 0] - box[0], obstacles[:, 1] - box[1]) <= reach]
     if not ranges.hold_centers(box[None])[0]:
         return False
-    return not paired_bev_touch(np.broadcast_to(box, near.shape).astype(np.float64), near.astype(np.float64)).any()
+    return not paired_bev_touch(
+        np.broadcast_to(box, candidates.shape).astype(np.float64), candidates.astype(np.float64)
+    ).any()
 
 
 def to_free_place(
     item: StoredObject, space: FreeSpace, scene: Scene, ranges: Ranges, rng: np.random.Generator
 ) -> StoredObject | None:
-    """The object turned about the sensor's vertical axis to a free place, or None where none was found."""
+    """The object turned about the sensor's vertical axis to a free place, or None if there is none."""
     distance_m, azimuth_rad = math.hypot(*item.box[:2]), math.atan2(item.box[1], item.box[0])
     cells, distances_m = space.cells
     ring = np.flatnonzero(np.abs(distances_m - distance_m) < CELL_M / 2)
@@ -169,7 +168,7 @@ def to_free_place(
     return None
 
 
-def _turned(item: StoredObject, box: NDArray[np.float32], turn_rad: float) -> StoredObject:
+def _turned(item: StoredObject, box: Singles, turn_rad: float) -> StoredObject:
     """The object at its new box (7,), to which it was turned about the sensor's vertical axis."""
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     points = item.points.copy()
@@ -178,7 +177,7 @@ def _turned(item: StoredObject, box: NDArray[np.float32], turn_rad: float) -> St
     return StoredObject(box, item.label, points)
 
 
-def _footprint_grid(box: _Floats) -> NDArray[np.float64]:
+def _footprint_grid(box: Floating) -> Floats:
     """Offsets (P, 2) along and across a box (7,), all over its footprint and margin, the four corners first."""
     length, width = (float(size) + 2 * MARGIN_M for size in box[3:5])
     rows, columns = (math.ceil(size / CELL_M) + 1 for size in (length, width))
@@ -189,14 +188,14 @@ def _footprint_grid(box: _Floats) -> NDArray[np.float64]:
     return np.stack([u[order], v[order]], axis=1)
 
 
-def _placed(offsets: NDArray[np.float64], boxes: _Floats) -> NDArray[np.float64]:
+def _placed(offsets: Floats, boxes: Floating) -> Floats:
     """Offsets (P, 2) along and across boxes (N, 7) as x, y: (N, P, 2)."""
     cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
     u, v = offsets.T
     return np.stack([boxes[:, 0, None] + cos * u - sin * v, boxes[:, 1, None] + sin * u + cos * v], axis=-1)
 
 
-def _share_azimuths(a: _Floats, b: _Floats) -> bool:
+def _share_azimuths(a: Floating, b: Floating) -> bool:
     """Whether boxes (7,) may stand, seen from the sensor, one before the other: by their circumscribed circles."""
     widths_rad = sum(
         math.asin(min(math.hypot(box[3], box[4]) / 2 / max(math.hypot(box[0], box[1]), 1e-6), 1.0)) for box in (a, b)

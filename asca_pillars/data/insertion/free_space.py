@@ -1,4 +1,4 @@
-"""Where an object may be put into a scan: seen ground minus what stands on it (section 3.5, steps 2 to 4).
+"""Free space for objects in a scan: seen ground minus the obstacles on it (section 3.5, steps 2 to 4).
 
 Ground that is seen: along one azimuth the beams of a spinning LiDAR land ring after ring. Between two neighboring
 landings the beam to the farther one passed low over the ground, so nothing tall stands there, although a gap of metres
@@ -10,12 +10,10 @@ import math
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from asca_pillars.base.processes import in_processes
 from asca_pillars.data.insertion.ground_fit import (
@@ -29,19 +27,18 @@ from asca_pillars.data.insertion.ground_fit import (
 )
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
 from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.common_plane import plane_heights
 
 CELL_M = 0.25
-OBSTACLE_M = (0.25, 2.5)  # above the ground: what stands in the way of a person or a car
+OBSTACLE_M = (0.25, 2.5)  # heights above the ground of obstacles to a person or a car
 CLEARANCE_M = 0.3  # height above the ground at which a beam may pass and still prove it free
 MAX_SLOPE = 0.06
 _AZIMUTH_RAD = np.radians(0.4)
 _AZIMUTHS = 900
 _RINGS = math.ceil(math.sqrt(2) * REACH_M / CELL_M) + 1
 CELLS_PER_NODE = round(LATTICE_M / CELL_M)
-
-_Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +52,18 @@ class FreeSpace:
     """
 
     ground: Ground | None
-    free: NDArray[np.bool_]
-    clusters: NDArray[np.float32]
+    free: Mask
+    clusters: Singles
 
     @cached_property
-    def cells(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def cells(self) -> tuple[Floats, Floats]:
         """Centers (2, F) of the free cells, x and y, and their distances (F,) from the sensor, metres, LiDAR frame."""
         if self.ground is None:
             return np.zeros((2, 0)), np.zeros(0)
         xy = self.ground.origin_m[:, None] + (np.array(np.nonzero(self.free)) + 0.5) * CELL_M
         return xy, np.hypot(xy[0], xy[1])
 
-    def is_free(self, xy_m: _Floats) -> NDArray[np.bool_]:
+    def is_free(self, xy_m: Floating) -> Mask:
         """Whether the cells at (..., 2) are free: (...) bool."""
         if self.ground is None:
             return np.zeros(xy_m.shape[:-1], bool)
@@ -77,7 +74,7 @@ class FreeSpace:
         return np.asarray(inside & self.free.ravel().take(row * columns + column, mode="clip"))
 
 
-def find_free_space(points: _Floats) -> FreeSpace:
+def find_free_space(points: Floating) -> FreeSpace:
     """Steps 2 to 4 on the points (N, >=3) of one scan, metres, LiDAR frame."""
     nothing = FreeSpace(None, np.zeros((0, 0), bool), np.zeros((0, 7), np.float32))
     ground = fit_ground(points)
@@ -103,9 +100,7 @@ def find_free_space(points: _Floats) -> FreeSpace:
     return FreeSpace(ground, free & (blocked == 0), clusters)
 
 
-def _seen_ground(
-    xy_m: NDArray[np.float64], on_ground: NDArray[np.bool_], obstacle: NDArray[np.bool_], ground: Ground
-) -> NDArray[np.bool_]:
+def _seen_ground(xy_m: Floats, on_ground: Mask, obstacle: Mask, ground: Ground) -> Mask:
     """Cells (X, Y) of ground that beams landed on or passed low over, by points (2, N); see the top of the module."""
     used = on_ground | obstacle
     (x, y), on_ground = np.compress(used, xy_m, axis=1), on_ground[used]
@@ -132,14 +127,14 @@ def _seen_ground(
 
 
 @cache
-def _polar_index() -> NDArray[np.int64]:
+def _polar_index() -> Ints:
     """Azimuth and ring, as one index, of each cell (X, Y) of the square that reaches REACH_M around the sensor."""
     middles = np.arange(-REACH_M, REACH_M, CELL_M) + 0.5 * CELL_M
     x, y = np.meshgrid(middles, middles, indexing="ij")
     return _azimuth_bin(x, y) * _RINGS + (np.hypot(x, y) / CELL_M).astype(np.int64)
 
 
-def _is_flat(ground: Ground) -> NDArray[np.bool_]:
+def _is_flat(ground: Ground) -> Mask:
     """Cells (X, Y) where the ground's slope is one that a street may have."""
     nodes = _nodes(ground)
     heights = plane_heights(ground.plane, nodes) + ground.rise_m.astype(np.float64)
@@ -148,17 +143,17 @@ def _is_flat(ground: Ground) -> NDArray[np.bool_]:
     return np.repeat(np.repeat(flat, CELLS_PER_NODE, axis=0), CELLS_PER_NODE, axis=1)
 
 
-def _azimuth_bin(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.int64]:
+def _azimuth_bin(x_m: Floats, y_m: Floats) -> Ints:
     return np.floor(np.arctan2(y_m, x_m) / _AZIMUTH_RAD).astype(np.int64) % _AZIMUTHS
 
 
-def _nodes(ground: Ground) -> NDArray[np.float64]:
+def _nodes(ground: Ground) -> Floats:
     """(X, Y, 2) middles of the ground's lattice."""
     rows, columns = np.indices(ground.rise_m.shape)
     return ground.origin_m + (np.stack([rows, columns], axis=-1) + 0.5) * LATTICE_M
 
 
-VERSION = 2  # of what is computed; files of another version are computed again
+VERSION = 2  # of the computation; files of another version are computed again
 _AT_ONCE = 16
 
 
@@ -193,12 +188,12 @@ def load_free_space(split: LabeledSplit, frame_id: str, prepared: Path, *, camer
     return space
 
 
-def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
-    """What tells that the files which the map was made from are still the same."""
+def _stamp(split: LabeledSplit, frame_id: str) -> Ints:
+    """Numbers that change when a file that the map was made from changes."""
     return np.array([VERSION, *split.points_state(frame_id)])
 
 
-def _read(path: Path, stamp: NDArray[np.int64]) -> FreeSpace | None:
+def _read(path: Path, stamp: Ints) -> FreeSpace | None:
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             if not np.array_equal(file["stamp"], stamp):
@@ -213,7 +208,7 @@ def _read(path: Path, stamp: NDArray[np.int64]) -> FreeSpace | None:
         return None
 
 
-def _write(path: Path, stamp: NDArray[np.int64], space: FreeSpace) -> None:
+def _write(path: Path, stamp: Ints, space: FreeSpace) -> None:
     ground = space.ground or Ground(np.zeros(3), np.zeros(2), np.zeros((0, 0), np.float16))
     with writing(path) as temporary:
         np.savez(

@@ -1,4 +1,4 @@
-"""The ground under a scan: a plane fitted by RANSAC, and how far the real surface rises above it (section 3.5, step 2).
+"""Ground of a scan: a plane fitted by RANSAC, and the height of the surface above it (section 3.5, step 2).
 
 The paper fits one plane and calls everything near it ground. A street has camber and kerbs, and over 70 m it follows
 its hills: one plane misses it by decimetres near and by metres far away, where an inserted object would hover or sink.
@@ -13,20 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.geometry.arrays import Floating, Floats, Ints, Singles
 from asca_pillars.geometry.common_plane import most_common_plane, plane_heights
 
-REACH_M = 80.0  # beyond this, nothing is looked at
+REACH_M = 80.0  # farther points are ignored
 LATTICE_M = 1.0
 GROUND_BAND_M = 0.15  # ground returns lie within this of the surface
 _COARSE_M = 2.0
-_OPENING_CELLS = 5  # what is narrower than so many coarse cells and stands out is no ground
+_OPENING_CELLS = 5  # anything that stands out and is narrower than so many coarse cells is no ground
 _PLANE_REACH_M = 40.0
 _PLANE_BAND_M = 0.15
 _MIN_CELLS = 30
 _MAX_SLOPE = 0.3
 _UNKNOWN = 1e3
-
-_Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,31 +38,31 @@ class Ground:
         rise_m: (X, Y) float16 height of the surface above the plane at the middles of the lattice's cells.
     """
 
-    plane: NDArray[np.float64]
-    origin_m: NDArray[np.float64]
+    plane: Floats
+    origin_m: Floats
     rise_m: NDArray[np.float16]
 
-    def heights(self, xy_m: _Floats) -> NDArray[np.float64]:
+    def heights(self, xy_m: Floating) -> Floats:
         """z (N,) of the ground at (N, 2), interpolated; beside the lattice as at its border."""
         return plane_heights(self.plane, xy_m) + _interpolate(self.rise_m, self.origin_m, LATTICE_M, xy_m)
 
 
-def fit_plane(points: _Floats) -> NDArray[np.float64] | None:
+def fit_plane(points: Floating) -> Floats | None:
     """RANSAC plane (3,) through the ground of points (N, >=3), or None where there is none to be seen.
 
     Fed one low point per square metre within 40 m: walls and cars, most of the points, become few, and the rings near
     the sensor no longer outvote the rest. The draws are seeded: the same points give the same plane.
     """
     x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
-    near = np.flatnonzero(np.hypot(x, y) < _PLANE_REACH_M)
-    cells = np.floor(x[near] / LATTICE_M) * 10_000 + np.floor(y[near] / LATTICE_M)
-    low = near[_low_per_cell(cells, z[near])]
+    within = np.flatnonzero(np.hypot(x, y) < _PLANE_REACH_M)
+    cells = np.floor(x[within] / LATTICE_M) * 10_000 + np.floor(y[within] / LATTICE_M)
+    low = within[_low_per_cell(cells, z[within])]
     if len(low) < _MIN_CELLS:
         return None
     return most_common_plane(np.stack([x[low], y[low], z[low]], axis=1), _PLANE_BAND_M, _MAX_SLOPE)
 
 
-def fit_ground(points: _Floats) -> Ground | None:
+def fit_ground(points: Floating) -> Ground | None:
     """The surface under points (N, >=3), metres, LiDAR frame, or None where no ground is to be seen."""
     # By columns: to choose among many short rows takes ten times as long.
     xyz = np.ascontiguousarray(points[:, :3].T, np.float64)
@@ -77,18 +76,18 @@ def fit_ground(points: _Floats) -> Ground | None:
     xy, above = np.compress(wedge, xyz[:2], axis=1).T, above[wedge]
     origin = np.floor(xy.min(axis=0) / _COARSE_M) * _COARSE_M
     coarse = _coarse_surface(xy, above, origin)
-    near = np.abs(above - _interpolate(coarse, origin, _COARSE_M, xy)) < 0.25
+    ground = np.abs(above - _interpolate(coarse, origin, _COARSE_M, xy)) < 0.25
     shape = np.array(coarse.shape) * round(_COARSE_M / LATTICE_M)
-    cells = _flat_cells(np.compress(near, xy.T, axis=1).T, origin, LATTICE_M, shape)
+    cells = _flat_cells(np.compress(ground, xy.T, axis=1).T, origin, LATTICE_M, shape)
     counts = np.bincount(cells, minlength=shape.prod())
-    sums = np.bincount(cells, above[near], minlength=shape.prod())
+    sums = np.bincount(cells, above[ground], minlength=shape.prod())
     means = sums / np.maximum(counts, 1)
     weights = np.minimum(counts, 5.0)
     rise = _smooth(means.reshape(shape), weights.reshape(shape), sigmas=(0.7, 1.5, 4, 12))
     return Ground(plane, origin, rise.astype(np.float16))
 
 
-def _coarse_surface(xy_m: _Floats, above_m: _Floats, origin_m: _Floats) -> NDArray[np.float32]:
+def _coarse_surface(xy_m: Floating, above_m: Floating, origin_m: Floating) -> Singles:
     """Heights above the plane on the coarse lattice, without what stands on the ground.
 
     The low points of the cells follow the ground except under cars and behind walls. A morphological opening tells
@@ -106,41 +105,41 @@ def _coarse_surface(xy_m: _Floats, above_m: _Floats, origin_m: _Floats) -> NDArr
     return _smooth(np.where(ground > 0, lowest, 0), ground, sigmas=(0.7, 2, 6, 20))
 
 
-def _flat_cells(xy_m: _Floats, origin_m: _Floats, step_m: float, shape: NDArray[np.int64]) -> NDArray[np.int64]:
+def _flat_cells(xy_m: Floating, origin_m: Floating, step_m: float, shape: Ints) -> Ints:
     """Index (N,), in a raster (X, Y) laid out row by row, of the cell that each of (N, 2) lies in."""
     index = ((xy_m - origin_m) / step_m).astype(np.int64)
     return np.asarray(index[:, 0] * shape[1] + index[:, 1])
 
 
-def order_by_cell(cells: NDArray[Any], values_m: _Floats) -> NDArray[np.int64]:
+def order_by_cell(cells: NDArray[Any], values_m: Floating) -> Ints:
     """Order (N,) of points by the number of their cell and, within a cell, by a value, metres."""
     # Both as one number: sorted in a sixth of the time that two take.
     return np.argsort(cells * (4 * _UNKNOWN) + np.clip(values_m, -_UNKNOWN, _UNKNOWN))
 
 
-def _low_per_cell(cells: NDArray[Any], heights_m: _Floats) -> NDArray[np.int64]:
-    """For each cell in use the index of the point below which a tenth of its points lie."""
+def _low_per_cell(cells: NDArray[Any], heights_m: Floating) -> Ints:
+    """Index of the point at the tenth percentile of height in each occupied cell."""
     order = order_by_cell(cells, heights_m)
     first = np.flatnonzero(np.diff(cells[order], prepend=np.nan))
     count = np.diff(first, append=len(cells))
     return np.asarray(order[first + count // 10])
 
 
-def _smooth(values: _Floats, weights: _Floats, sigmas: tuple[float, ...]) -> NDArray[np.float32]:
+def _smooth(values: Floating, weights: Floating, sigmas: tuple[float, ...]) -> Singles:
     """Weighted Gaussian mean; where the narrow one finds nothing, the next wider."""
     values, weights = values.astype(np.float32), weights.astype(np.float32)
     result = np.zeros_like(values)
     missing = np.ones(values.shape, bool)
     for sigma in sigmas:
         total = cv2.GaussianBlur(weights, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-        found = missing & (total > 0.02)
+        filled = missing & (total > 0.02)
         mean = cv2.GaussianBlur(values * weights, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-        result[found] = mean[found] / total[found]
-        missing &= ~found
+        result[filled] = mean[filled] / total[filled]
+        missing &= ~filled
     return result
 
 
-def _interpolate(lattice: NDArray[Any], origin_m: _Floats, step_m: float, xy_m: _Floats) -> NDArray[np.float64]:
+def _interpolate(lattice: NDArray[Any], origin_m: Floating, step_m: float, xy_m: Floating) -> Floats:
     """Bilinear values (N,) at (N, 2) of a lattice of cell middles."""
     rows, columns = lattice.shape
     xy = np.ascontiguousarray(xy_m.T)
@@ -160,7 +159,7 @@ _TILE_M = 5.0
 _TILES = 1000  # more than lie side by side
 
 
-def cluster_boxes(obstacles: NDArray[np.float64], ground: Ground) -> NDArray[np.float32]:
+def cluster_boxes(obstacles: Floats, ground: Ground) -> Singles:
     """Steps 3 and 4: DBSCAN of obstacle points (N, 3), and the minimum-area rectangle of each cluster as a box (K, 7).
 
     Points and boxes are in metres and radians, LiDAR frame.
@@ -181,7 +180,7 @@ def cluster_boxes(obstacles: NDArray[np.float64], ground: Ground) -> NDArray[np.
     return boxes.astype(np.float32)
 
 
-def cluster_labels(xy_m: NDArray[np.float64]) -> NDArray[np.int64]:
+def cluster_labels(xy_m: Floats) -> Ints:
     """DBSCAN of points (N, 2), metres: the number (N,) of each point's cluster from 1 on, 0 for a point in none.
 
     Clustered are the cells in which points lie, weighted by their number; neighbors are those up to _REACH_CELLS away
@@ -195,17 +194,17 @@ def cluster_labels(xy_m: NDArray[np.float64]) -> NDArray[np.int64]:
     cells = index[:, 0] * shape[1] + index[:, 1]
     count = np.bincount(cells, minlength=shape.prod()).reshape(shape).astype(np.float32)
     around = (2 * _REACH_CELLS + 1, 2 * _REACH_CELLS + 1)
-    near = cv2.boxFilter(count, -1, around, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    core = (count > 0) & (near >= CLUSTER_MIN_POINTS)
+    neighbors = cv2.boxFilter(count, -1, around, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    core = (count > 0) & (neighbors >= CLUSTER_MIN_POINTS)
     # Widened by one less than the reach, towards lower indices, neighbors touch and others do not.
     touching = cv2.dilate(core.astype(np.uint8), np.ones((_REACH_CELLS, _REACH_CELLS), np.uint8))
     _, labels = cv2.connectedComponents(touching, connectivity=8)
-    # What has a core point near belongs to its cluster.
+    # Points near a core point belong to its cluster.
     labels = cv2.dilate(np.where(core, labels, 0).astype(np.float32), np.ones(around, np.uint8))
     return labels.ravel()[cells].astype(np.int64)
 
 
-def _tiled(points: NDArray[np.float64], labels: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+def _tiled(points: Floats, labels: Ints) -> list[Floats]:
     """The points of each cluster, cut into squares of _TILE_M if it is longer than two of them."""
     if not len(points):
         return []

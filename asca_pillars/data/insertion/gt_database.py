@@ -100,7 +100,7 @@ def prepare_database(
 
     Args:
         split: the training list.
-        class_names: types that enter, as labels 0, 1, ...
+        class_names: types of the objects, labels 0, 1, ...
         prepared: folder for what is computed once per dataset.
         camera_view: only points that the camera sees.
         workers: processes that read the frames; any number of them gives the same bytes.
@@ -146,10 +146,10 @@ class _FrameObjects(NamedTuple):
 
 def _read_objects(split: LabeledSplit, class_names: Sequence[str], camera_view: bool, frame_id: str) -> _FrameObjects:
     frame = read_frame(split, frame_id, class_names, camera_view=camera_view, min_points=0)
-    wanted = frame.labels >= 0
-    inside = points_in_boxes(frame.points, frame.boxes[wanted]).T
+    labelled = frame.labels >= 0
+    inside = points_in_boxes(frame.points, frame.boxes[labelled]).T
     points = frame.points[np.nonzero(inside)[1]]
-    return _FrameObjects(frame.boxes[wanted], frame.labels[wanted], inside.sum(axis=1), points)
+    return _FrameObjects(frame.boxes[labelled], frame.labels[labelled], inside.sum(axis=1), points)
 
 
 def _build(path: Path, frames: Iterable[_FrameObjects], built_from: dict[str, Any]) -> None:

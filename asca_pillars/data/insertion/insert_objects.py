@@ -32,21 +32,21 @@ from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 
-OBJECT_TRIES = 10  # objects of a class that are tried before one is given up
+OBJECT_TRIES = 10  # objects of a class that are tried for each insertion
 
 
 @dataclass(frozen=True)
 class Inserter:
-    """Everything that inserting into the frames of one list needs.
+    """Inserts objects into the frames of one list.
 
     Attributes:
         split: the list.
-        settings: how many, and by which method.
+        settings: number of objects and method.
         ranges: objects are put where the detector looks.
         camera_view: whether frames are cut to what the camera sees.
-        min_points: what loses so many points that fewer are left becomes IGNORED.
+        min_points: objects left with fewer points become IGNORED.
         prepared: folder of the free-space maps.
-        database: where objects come from.
+        database: stored objects.
         shares: probability of each class.
     """
 
@@ -66,12 +66,12 @@ class Inserter:
         return tuple(np.flatnonzero(enough & (self.database.labels == label)) for label in range(len(self.shares)))
 
     def free_space(self, frame_id: str) -> FreeSpace:
-        """Where there is room in a frame."""
+        """Free space of a frame."""
         return load_free_space(self.split, frame_id, self.prepared, camera_view=self.camera_view)
 
 
 def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, insert: InsertConfig) -> Inserter:
-    """Build or find the object database, and work out how often each class is to be drawn.
+    """Build or find the object database, and compute the probability of each class.
 
     It is built by as many processes as load batches later (`data.workers`).
 

@@ -1,4 +1,4 @@
-"""The folder of what is computed once per dataset: the object database and the maps of free ground."""
+"""Folder of per-dataset caches: the object database and the maps of free ground."""
 
 import contextlib
 import os
@@ -13,12 +13,12 @@ from asca_pillars.scans.find_scans import PREPARED_FILE, PREPARED_NOTE
 
 
 def prepared_folder(root: str | Path, data: DataConfig) -> Path:
-    """Where it is for the dataset at `root`: <root>/prepared unless `data.prepared` names another folder."""
+    """Folder for the dataset at `root`: <root>/prepared unless `data.prepared` names another."""
     return Path(data.prepared) if data.prepared else Path(root) / "prepared"
 
 
 def require_writable(folder: Path) -> None:
-    """Say before minutes of work that the folder cannot take the result.
+    """Check before minutes of work that the folder can be written.
 
     Raises:
         DatasetError: it cannot be written.

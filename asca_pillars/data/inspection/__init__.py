@@ -1,1 +1,1 @@
-"""What a dataset contains and how it suits a configuration."""
+"""Inspection of a dataset: its contents, and its fit to a configuration."""

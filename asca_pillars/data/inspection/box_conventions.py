@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.boxes import points_in_boxes
 
 _MORE = 1.1  # times as many points
-_SEEN_POINTS = 5  # of a box, by any convention, that may tell them apart
+_SEEN_POINTS = 5  # in a box by any convention, for the box to count
 _WINS_PER_LOSS = 4
 _DEVIATIONS = 3.0
-"""By which boxes with more points have to outnumber those with fewer, in standard deviations of a fair coin."""
+"""Least excess of boxes with more points over those with fewer, in standard deviations of a fair coin."""
 
 
 class Convention(NamedTuple):
-    """How boxes are changed: yaw is multiplied and added to, z raised by a share of the height."""
+    """Change of boxes: yaw is multiplied and added to, z raised by a share of the height."""
 
     name: str
     remedy: str
@@ -54,7 +54,7 @@ CONVENTIONS = (
 
 
 class ConventionFit(NamedTuple):
-    """How well a convention fits M boxes.
+    """Fit of a convention to M boxes.
 
     `points` in all boxes together; boxes with 10 % `more` points than as labelled, and those with as many `fewer`.
     """
@@ -66,12 +66,12 @@ class ConventionFit(NamedTuple):
 
 
 def count_points(points: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDArray[np.int64]:
-    """How many points (N, >=3), metres, each box (M, 7) holds by each of the `CONVENTIONS`: (C, M)."""
+    """Count the points (N, >=3), metres, in each box (M, 7) by each of the `CONVENTIONS`: (C, M)."""
     counts = np.zeros((len(CONVENTIONS), len(boxes)), np.int64)
     for column, box in enumerate(boxes):
         reach = np.hypot(box[3], box[4]) / 2 + 0.01
-        near = points[(np.abs(points[:, 0] - box[0]) < reach) & (np.abs(points[:, 1] - box[1]) < reach)]
-        counts[:, column] = points_in_boxes(near, _changed(box)).sum(axis=0)
+        candidates = points[(np.abs(points[:, 0] - box[0]) < reach) & (np.abs(points[:, 1] - box[1]) < reach)]
+        counts[:, column] = points_in_boxes(candidates, _changed(box)).sum(axis=0)
     return counts
 
 
@@ -84,7 +84,7 @@ def convention_fits(counts: NDArray[np.int64]) -> tuple[ConventionFit, ...]:
 
 
 def better_convention(fits: Sequence[ConventionFit]) -> tuple[Convention, ConventionFit] | None:
-    """The convention that fits better than the labels' own beyond chance, the best one; None if none does."""
+    """The best convention that fits significantly better than that of the labels; None if none does."""
     better = [
         (convention, fit)
         for convention, fit in zip(CONVENTIONS, fits, strict=True)

@@ -1,4 +1,4 @@
-"""What is wrong with a dataset before anything is trained on it, each with its remedy."""
+"""Problems of a dataset, found before training, each with its remedy."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection,
 from asca_pillars.data.inspection.measurements import InspectedSpec, input_cells
 from asca_pillars.scans.input_check import TOLERANCE_M
 
-# From these shares on something is a mistake or costs recall; KITTI and the simulator stay well below all of them.
+# Beyond these shares something is a mistake or costs recall; KITTI and the simulator stay well below all of them.
 BOXES_OUTSIDE = 0.05
 BOXES_CUT_IN_Z = 0.1
 BOXES_WITHOUT_POINTS = 0.2
@@ -39,33 +39,33 @@ def findings(inspection: Inspection, spec: InspectedSpec, min_points: int) -> li
     """Errors first: frames that cannot be read, classes without positives; then whatever else looks wrong.
 
     Args:
-        inspection: of the dataset.
-        spec: what the dataset was measured against.
+        inspection: measurements of the dataset.
+        spec: the detector that the dataset was measured against.
         min_points: data.min_points of the same configuration.
     """
-    found: list[Finding] = []
+    problems: list[Finding] = []
     if inspection.damaged:
         text = f"frames that cannot be read: {len(inspection.damaged)}, the first: {inspection.damaged[0]}"
-        found.append(Finding("error", "frames", text))
+        problems.append(Finding("error", "frames", text))
     for facts in inspection.classes:
         if facts.positives == 0:
             frames = f"{inspection.frames} of {inspection.frames_in_split} frames of '{inspection.split}'"
             text = (
                 f"no anchor is positive for {facts.name} in {frames}: {_why_none(facts, inspection, spec, min_points)}"
             )
-            found.append(Finding("error", facts.name, text))
+            problems.append(Finding("error", facts.name, text))
     for facts in inspection.classes:
         if facts.positives:
-            found += [
+            problems += [
                 Finding("warning", facts.name, f"{facts.name}: {text}") for text in _of_class(facts, spec, min_points)
             ]
     scans = inspection.scans
-    found += [Finding("warning", "axes", text) for text in _of_axes(inspection)]
-    found += [Finding("warning", "boxes", text) for text in _of_conventions(inspection)]
-    found += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
-    found += [Finding("warning", "height", text) for text in _of_height(inspection)]
-    found += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, spec)]
-    return found
+    problems += [Finding("warning", "axes", text) for text in _of_axes(inspection)]
+    problems += [Finding("warning", "boxes", text) for text in _of_conventions(inspection)]
+    problems += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
+    problems += [Finding("warning", "height", text) for text in _of_height(inspection)]
+    problems += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, spec)]
+    return problems
 
 
 def _why_none(facts: ClassFacts, inspection: Inspection, spec: InspectedSpec, min_points: int) -> str:
@@ -165,16 +165,16 @@ def _of_reflectance(scans: ScanFacts, frames: int) -> Iterator[str]:
 
 
 def _of_axes(inspection: Inspection) -> Iterator[str]:
-    if len(inspection.doubts) <= ODD_SCANS * inspection.frames:
+    if len(inspection.axes_warnings) <= ODD_SCANS * inspection.frames:
         return
-    (_, axes), _ = Counter((doubt.about, doubt.axes) for doubt in inspection.doubts).most_common(1)[0]
-    first = next(doubt for doubt in inspection.doubts if doubt.axes == axes)
+    (_, axes), _ = Counter((warning.about, warning.axes) for warning in inspection.axes_warnings).most_common(1)[0]
+    first = next(warning for warning in inspection.axes_warnings if warning.axes == axes)
     key, what = ("pose: FILE", "how the sensor is tilted") if axes is None else (f"axes: {axes}", "the axes")
     if inspection.states_mounting:
         remedy = f"if so, state {what}, `{key}` in dataset.yaml"
     else:
         remedy = "if so, turn the points of all scans to x forward, y left, z up, and calib with them"
-    yield f"{len(inspection.doubts)} of {inspection.frames} scans are odd, the first: {first.text}: {remedy}"
+    yield f"{len(inspection.axes_warnings)} of {inspection.frames} scans are odd, the first: {first.text}: {remedy}"
 
 
 def _of_conventions(inspection: Inspection) -> Iterator[str]:
@@ -237,7 +237,7 @@ def _of_points(scans: ScanFacts, frames: int, spec: InspectedSpec) -> Iterator[s
 
 
 def _widen(facts: ClassFacts, spec: InspectedSpec) -> str:
-    """Where the boxes are, beside the range of x, of y or both that does not hold them."""
+    """Extent of the boxes along x, y or both, beside the range that does not hold them."""
     assert facts.reach_m is not None, "there are boxes"
     ranges = (spec.grid.x_range_m, spec.grid.y_range_m)
     wrong = [

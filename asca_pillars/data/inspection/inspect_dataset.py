@@ -1,6 +1,6 @@
-"""What a detector is going to be trained on: a dataset measured against a configuration.
+"""Measures a dataset against a configuration before training.
 
-`measurements` measures a frame, this module a dataset, and `findings` says what is wrong with it.
+`measurements` measures a frame, this module a dataset, and `findings` lists its problems.
 """
 
 from collections import Counter
@@ -25,15 +25,15 @@ from asca_pillars.data.inspection.measurements import (
 )
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.data.yaw_units import doubt_of_yaws
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.detection.targets import Assigner
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.scans.input_check import FrameDoubt
+from asca_pillars.scans.input_check import AxesWarning
 
 
 class Spread(NamedTuple):
-    """How a quantity is spread: 10 % of the values lie below `p10`, 10 % above `p90`."""
+    """Percentiles of a quantity: 10 % of the values lie below `p10`, 10 % above `p90`."""
 
     p10: float
     median: float
@@ -46,7 +46,7 @@ class ClassFacts:
     """The labelled objects of one class.
 
     Attributes:
-        boxes: how many there are. With none, what is measured on them is None.
+        boxes: number of boxes. Without any, their measurements are None.
         points: points inside one box; `no_points` boxes have none, `few_points` fewer than data.min_points.
         size_m: mean length, width and height; `size_std_m` their standard deviations.
         misfits: boxes that no anchor can overlap by positive_iou, wherever it stands: the size is too different.
@@ -121,10 +121,10 @@ class ScanFacts:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found in `frames` of a split's frames.
+    """Measurements of `frames` of a split's frames.
 
     `types` counts the labels by type, those of no class included; `damaged` holds a line for each frame that was
-    wanted and cannot be read, `doubts` what is odd about the axes of a scan, for each scan where something is. A
+    selected and cannot be read, `axes_warnings` a warning for each scan whose axes look wrong. A
     dataset of KITTI's layout cannot state how its sensor stands (`states_mounting`). `conventions` says how well the
     points fit the boxes of the classes as they are labelled, turned, mirrored, raised and lowered; `yaws_doubt` is a
     sentence where the yaws do not look like radians.
@@ -139,7 +139,7 @@ class Inspection:
     classes: tuple[ClassFacts, ...]
     scans: ScanFacts
     damaged: tuple[str, ...]
-    doubts: tuple[FrameDoubt, ...]
+    axes_warnings: tuple[AxesWarning, ...]
     states_mounting: bool
     conventions: tuple[ConventionFit, ...]
     yaws_doubt: str | None
@@ -163,10 +163,10 @@ def inspect_dataset(
 
     Args:
         split: a list of a dataset.
-        spec: grid, limits and classes that are to be trained on it.
-        data: how its frames are to be read.
-        assigner: what matches anchors with boxes.
-        frames: how many are looked at.
+        spec: grid, limits and classes of the detector.
+        data: settings for reading the frames.
+        assigner: assigner of anchors to boxes.
+        frames: number of frames to measure.
         progress: show a bar.
 
     Raises:
@@ -175,12 +175,12 @@ def inspect_dataset(
     """
     split.require_files()
     in_split = len(split.frame_ids)
-    wanted = min(frames, in_split)
+    selected = min(frames, in_split)
     measured: list[FrameMeasure] = []
     damaged: list[DatasetError | ScanError] = []
-    for number in track(range(wanted), "Inspecting", disable=not progress, transient=True):
+    for number in track(range(selected), "Inspecting", disable=not progress, transient=True):
         try:
-            frame_id = split.frame_ids[number * in_split // wanted]
+            frame_id = split.frame_ids[number * in_split // selected]
             measured.append(measure_frame(split, frame_id, spec, data, assigner))
         except (DatasetError, ScanError) as error:
             damaged.append(error)
@@ -197,19 +197,19 @@ def inspect_dataset(
         classes=tuple(_class_facts(measured, index, spec, data.min_points) for index in range(len(spec.classes))),
         scans=_scan_facts([frame.scan for frame in measured], spec),
         damaged=tuple(map(str, damaged)),
-        doubts=tuple(frame.doubt for frame in measured if frame.doubt is not None),
+        axes_warnings=tuple(frame.axes for frame in measured if frame.axes is not None),
         states_mounting=not isinstance(split, KittiSplit),
         conventions=convention_fits(np.concatenate([frame.convention_points for frame in measured], axis=1)),
-        yaws_doubt=doubt_of_yaws([frame.label_yaws for frame in measured]),
+        yaws_doubt=check_yaws([frame.label_yaws for frame in measured]),
     )
 
 
 def _class_facts(frames: Sequence[FrameMeasure], index: int, detector: InspectedSpec, min_points: int) -> ClassFacts:
     spec = detector.classes[index]
-    own = np.concatenate([frame.labels for frame in frames]) == index
-    boxes = np.concatenate([frame.boxes for frame in frames])[own].astype(np.float64)
-    points = np.concatenate([frame.points for frame in frames])[own]
-    outcomes = np.concatenate([frame.outcomes for frame in frames])[own]
+    of_class = np.concatenate([frame.labels for frame in frames]) == index
+    boxes = np.concatenate([frame.boxes for frame in frames])[of_class].astype(np.float64)
+    points = np.concatenate([frame.points for frame in frames])[of_class]
+    outcomes = np.concatenate([frame.outcomes for frame in frames])[of_class]
     low, high = np.array(detector.ranges).T
     outside = (boxes[:, :3] < low) | (boxes[:, :3] >= high)
     cut = (boxes[:, 2] - boxes[:, 5] / 2 < low[2]) | (boxes[:, 2] + boxes[:, 5] / 2 > high[2])
@@ -236,7 +236,7 @@ def _class_facts(frames: Sequence[FrameMeasure], index: int, detector: Inspected
 
 
 def _misfits(boxes: NDArray[np.float64], spec: ClassSpec) -> int:
-    """How many boxes stay below positive_iou even with an anchor of their own place and yaw."""
+    """Count the boxes below positive_iou even with an anchor of their own place and yaw."""
     in_place = boxes.copy()
     in_place[:, [0, 1, 6]] = 0
     anchor = np.array([[0, 0, 0, spec.length_m, spec.width_m, spec.height_m, 0]])

@@ -19,11 +19,11 @@ from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
-from asca_pillars.scans.input_check import FrameDoubt, doubt_frame, ground_z_m
+from asca_pillars.scans.input_check import AxesWarning, check_axes, ground_z_m
 from asca_pillars.scans.scan_reader import decide_scale
 
 InspectedSpec: TypeAlias = PillarSpec | VoxelSpec
-"""Of the families that are inspected."""
+"""Specs of the families that can be inspected."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class InputCells:
     """Pillars or voxels.
 
     Attributes:
-        name: of one cell.
+        name: name of one cell.
         of_points: finite points (N, >=3), metres, LiDAR frame -> flat index of each one's cell (N,), -1 outside.
         max_points: points of a cell that the network sees.
-        max_points_key: where the configuration says so.
-        max_cells: of a scan; None without a limit.
-        closer_anchors: how anchors come closer to each other, as advice.
+        max_points_key: key of `max_points` in the configuration.
+        max_cells: limit of cells in a scan; None without one.
+        closer_anchors: advice for a denser grid of anchors.
     """
 
     name: str
@@ -48,7 +48,7 @@ class InputCells:
 
 
 def input_cells(spec: InspectedSpec) -> InputCells:
-    """Of this detector."""
+    """Cells of this detector's input."""
     if isinstance(spec, PillarSpec):
         return InputCells(
             name="pillar",
@@ -70,20 +70,20 @@ def input_cells(spec: InspectedSpec) -> InputCells:
 
 
 DOUBT_POINTS = 8_192
-"""Of a scan that its axes are judged by."""
+"""Points of a scan that its axes are checked by."""
 
 
 class MatchOutcome(IntEnum):
-    """What training makes of a labelled object."""
+    """Assignment of anchors to a labelled object."""
 
     LEFT_OUT = 0
-    """Too few points, or its center beside the grid."""
+    """It has too few points, or its center lies outside the grid."""
     OVERLAPPED = 1
-    """An anchor that is to find it overlaps it by positive_iou; with the assigner `atss`, at all."""
+    """A positive anchor overlaps it by positive_iou; with the assigner `atss`, at all."""
     FORCED = 2
-    """None does; the nearest ones are matched to it nevertheless, and fit it badly."""
+    """No anchor does; the nearest ones are matched to it nevertheless, and fit it badly."""
     MISSED = 3
-    """No anchor is to find it."""
+    """It has no positive anchor."""
 
 
 class ScanMeasure(NamedTuple):
@@ -113,7 +113,7 @@ class FrameMeasure(NamedTuple):
     """A frame: its labels by type, the M objects of the C classes, and its scan.
 
     `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `outcomes` (M,), `positives` (C,) positive
-    anchors of each class, `doubt` what is odd about the scan's axes, `convention_points` (C, M) inside each box by each
+    anchors of each class, `axes` a warning about the scan's axes, `convention_points` (C, M) inside each box by each
     of the `box_conventions`, `label_yaws` as the labels state them.
     """
 
@@ -124,7 +124,7 @@ class FrameMeasure(NamedTuple):
     outcomes: NDArray[np.int64]
     positives: NDArray[np.int64]
     scan: ScanMeasure
-    doubt: FrameDoubt | None
+    axes: AxesWarning | None
     convention_points: NDArray[np.int64]
     label_yaws: NDArray[np.float64]
 
@@ -142,21 +142,21 @@ def measure_frame(
     points = points_in_boxes(frame.points, frame.boxes).sum(axis=0)
     to_find = replace(frame, labels=np.where(points < data.min_points, IGNORED, frame.labels))
     outcomes, positives = match(to_find, spec, assigner)
-    own = frame.labels != IGNORED
+    counted = frame.labels != IGNORED
     stored = split.stored_points(frame_id)
     scale = 1.0 if split.one_reflectance_scale else decide_scale(stored[:, 3])[0]
     scan = measure_scan(stored, frame.points, spec, scale)
     sample = frame.points[:: max(1, len(frame.points) // DOUBT_POINTS)]
     return FrameMeasure(
         types=Counter(split.label_types(frame_id)),
-        boxes=frame.boxes[own],
-        labels=frame.labels[own],
-        points=points[own],
-        outcomes=outcomes[own],
+        boxes=frame.boxes[counted],
+        labels=frame.labels[counted],
+        points=points[counted],
+        outcomes=outcomes[counted],
         positives=positives,
         scan=scan,
-        doubt=doubt_frame(sample, None if np.isnan(scan.ground_z_m) else scan.ground_z_m) if len(sample) else None,
-        convention_points=count_points(frame.points, frame.boxes[own]),
+        axes=check_axes(sample, None if np.isnan(scan.ground_z_m) else scan.ground_z_m) if len(sample) else None,
+        convention_points=count_points(frame.points, frame.boxes[counted]),
         label_yaws=split.label_yaws(frame_id),
     )
 
@@ -172,11 +172,11 @@ def match(
     outcomes = np.full(len(frame.boxes), MatchOutcome.LEFT_OUT, dtype=np.int64)
     for row in np.flatnonzero(labels != IGNORED):
         overlap = aligned_bev_iou(targets.anchors[targets.matched == row], boxes[row : row + 1]).max(initial=0)
-        wanted = spec.classes[labels[row]].positive_iou if assigner == "overlap" else 0.0
+        threshold = spec.classes[labels[row]].positive_iou if assigner == "overlap" else 0.0
         if overlap == 0:
             outcomes[kept[row]] = MatchOutcome.MISSED
         else:
-            outcomes[kept[row]] = MatchOutcome.OVERLAPPED if overlap >= wanted else MatchOutcome.FORCED
+            outcomes[kept[row]] = MatchOutcome.OVERLAPPED if overlap >= threshold else MatchOutcome.FORCED
     return outcomes, np.bincount(labels[targets.matched], minlength=len(spec.classes))
 
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError, OutputError
@@ -19,6 +18,7 @@ from asca_pillars.data.inspection.findings import FEWEST_BOXES
 from asca_pillars.data.inspection.measurements import InspectedSpec
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
+from asca_pillars.geometry.arrays import Floats, Singles
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.grid import NECK_STRIDE
@@ -34,11 +34,9 @@ FINDABLE_POINTS = 5  # ranges are those of the boxes with so many: far ones with
 SPARE_PILLARS = 1.1  # room above the fullest scan
 _TENTH_M = 0.1
 
-_Floats = NDArray[np.float64]
-
 
 class Proposal(NamedTuple):
-    """The configuration, and how many boxes each class was measured on; `rare` types have too few for a class."""
+    """The configuration, and the number of boxes per class; `rare` types have too few for a class."""
 
     config: Config
     boxes: dict[str, int]
@@ -52,8 +50,8 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
 
     Args:
         split: the labels.
-        config: everything else is taken from it.
-        frames: how many frames are looked at, evenly spaced.
+        config: the other settings.
+        frames: number of frames to measure, evenly spaced.
         progress: show a bar.
 
     Raises:
@@ -62,25 +60,25 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
     ids = split.frame_ids
     chosen = [ids[number * len(ids) // min(frames, len(ids))] for number in range(min(frames, len(ids)))]
     clouds = []
-    found: dict[str, list[NDArray[np.float32]]] = {}
-    findable: dict[str, list[NDArray[np.float32]]] = {}
+    boxes_of: dict[str, list[Singles]] = {}
+    findable: dict[str, list[Singles]] = {}
     for frame_id in track(chosen, "Measuring", disable=not progress, transient=True):
         points = split.points(frame_id, camera_view=config.data.camera_view)
         boxes, types = split.labeled_boxes(frame_id)
         inside = points_in_boxes(points, boxes).sum(axis=0)
         for box, kind, held in zip(boxes, types, inside.tolist(), strict=True):
-            found.setdefault(kind, []).extend([box] if held >= max(config.data.min_points, 1) else [])
+            boxes_of.setdefault(kind, []).extend([box] if held >= max(config.data.min_points, 1) else [])
             findable.setdefault(kind, []).extend([box] if held >= FINDABLE_POINTS else [])
         clouds.append(points)
-    counts = {kind: len(own) for kind, own in sorted(found.items(), key=lambda item: -len(item[1]))}
+    counts = {kind: len(boxes) for kind, boxes in sorted(boxes_of.items(), key=lambda item: -len(item[1]))}
     names = [kind for kind, count in counts.items() if count >= FEWEST_BOXES]
     if not names:
         there = ", ".join(f"{kind} {count}" for kind, count in counts.items()) or "none"
         raise DatasetError(
             f"{split.root}: no type has {FEWEST_BOXES} boxes with points (there are: {there}); add frames"
         )
-    measured = {kind: np.array(found[kind], np.float64) for kind in names}
-    of_classes = [np.array(findable[kind] or found[kind], np.float64) for kind in names]
+    measured = {kind: np.array(boxes_of[kind], np.float64) for kind in names}
+    of_classes = [np.array(findable[kind] or boxes_of[kind], np.float64) for kind in names]
     spec = _holding(config.model.spec, np.concatenate(of_classes))
     spec = replace(spec, classes=tuple(_class(kind, boxes, spec) for kind, boxes in measured.items()))
     if isinstance(spec, PillarSpec):
@@ -102,7 +100,7 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
 
 
 def differences(config: Config) -> dict[str, Any]:
-    """What of a configuration is not the default, as plain values for a YAML."""
+    """Settings of a configuration that differ from the defaults, as plain values for a YAML."""
     plain = _differences(config, to_dict(config))
     if config.model.kind != Config().model.kind:
         plain["model"] = {"kind": config.model.kind} | plain["model"]
@@ -110,16 +108,16 @@ def differences(config: Config) -> dict[str, Any]:
 
 
 def _differences(settings: Any, plain: dict[str, Any]) -> dict[str, Any]:
-    """What of a dataclass is not its default; a section that is not starts from the defaults of its own type."""
+    """Fields of a dataclass that differ from the defaults; a changed section is compared with those of its own type."""
     default, changed = type(settings)(), {}
     for key, value in plain.items():
-        own = getattr(settings, key)
-        if own != getattr(default, key):
-            changed[key] = _differences(own, value) if is_dataclass(own) else value
+        changed_value = getattr(settings, key)
+        if changed_value != getattr(default, key):
+            changed[key] = _differences(changed_value, value) if is_dataclass(changed_value) else value
     return changed
 
 
-def _holding(spec: InspectedSpec, boxes: _Floats) -> InspectedSpec:
+def _holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
     """The same with a grid of the same cells whose ranges hold the boxes (N, 7)."""
     grid, outside, changes = spec.grid, (1 - HELD) / 2, dict[str, Any]()
     looks_back = np.quantile(boxes[:, 0], outside) < min(BEHIND_M, grid.x_range_m[0])
@@ -140,13 +138,13 @@ def _holding(spec: InspectedSpec, boxes: _Floats) -> InspectedSpec:
     if not (grid.z_range_m[0] <= low and high <= grid.z_range_m[1]):
         margin_m = 0.5  # the ground below, and what is a little higher
         changes["z_range_m"] = tuple(height_m * round(end / height_m) for end in (low - margin_m, high + margin_m))
-    # Without float dust: they are to be read in a YAML.
+    # Rounded, for people who read them in a YAML.
     ranges = {key: tuple(round(float(end), 6) for end in changes[key]) for key in changes if key.endswith("range_m")}
     return replace(spec, grid=replace(grid, **(changes | ranges)))  # type: ignore[arg-type]  # its own grid
 
 
-def _around(span_m: tuple[float, float], centers: _Floats, outside: float, step_m: float) -> tuple[float, float]:
-    """As `_widened`, the same ahead and behind."""
+def _around(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
+    """Like `_widened`, the same ahead and behind."""
     if span_m[0] == -span_m[1] and _widened(span_m, centers, outside, step_m) == span_m:
         half = math.ceil(round(2 * span_m[1] / step_m, 6)) * step_m / 2  # whole steps, which may have changed
         return -half, half
@@ -155,7 +153,7 @@ def _around(span_m: tuple[float, float], centers: _Floats, outside: float, step_
     return -half, half
 
 
-def _widened(span_m: tuple[float, float], centers: _Floats, outside: float, step_m: float) -> tuple[float, float]:
+def _widened(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
     low, high = np.quantile(centers, outside), np.quantile(centers, 1 - outside)
     if span_m[0] <= low and high < span_m[1]:
         return span_m
@@ -166,7 +164,7 @@ def _widened(span_m: tuple[float, float], centers: _Floats, outside: float, step
     return start, start + math.ceil((max(high, span_m[1]) - start) / step_m) * step_m
 
 
-def _class(name: str, boxes: _Floats, spec: InspectedSpec) -> ClassSpec:
+def _class(name: str, boxes: Floats, spec: InspectedSpec) -> ClassSpec:
     length, width, height = (round(float(value), 2) for value in np.median(boxes[:, 3:6], axis=0))
     z_m = round(float(np.median(boxes[:, 2])), 2)
     best = _best_overlaps(boxes, (length, width, height), spec)
@@ -175,13 +173,13 @@ def _class(name: str, boxes: _Floats, spec: InspectedSpec) -> ClassSpec:
     return ClassSpec(name, length, width, height, z_m, positive, round(positive - NEGATIVE_BELOW, 2))
 
 
-def _best_overlaps(boxes: _Floats, size_m: Sequence[float], spec: InspectedSpec) -> _Floats:
+def _best_overlaps(boxes: Floats, size_m: Sequence[float], spec: InspectedSpec) -> Floats:
     """(N,) overlap of each box with the better one of the anchors of the cell that is nearest to it."""
     x_m, y_m = spec.anchor_centers_m()
     best = np.zeros(len(boxes))
     for row, box in enumerate(boxes):
-        near = x_m[np.abs(x_m - box[0]).argmin()], y_m[np.abs(y_m - box[1]).argmin()], 0.0
-        anchors = np.array([[*near, *size_m, yaw] for yaw in ANCHOR_YAWS_RAD])
+        nearest = x_m[np.abs(x_m - box[0]).argmin()], y_m[np.abs(y_m - box[1]).argmin()], 0.0
+        anchors = np.array([[*nearest, *size_m, yaw] for yaw in ANCHOR_YAWS_RAD])
         best[row] = aligned_bev_iou(anchors, box[None]).max()
     return best
 

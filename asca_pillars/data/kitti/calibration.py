@@ -19,7 +19,7 @@ from asca_pillars.geometry.rotations import transform_columns
 
 DEFAULT_IMAGE_SIZE_WH = (1242, 375)
 NEAR_PLANE_M = 0.1
-"""What is nearer to the image plane than this counts as behind the camera: its pixel would be meaningless."""
+"""Points nearer to the image plane than this count as behind the camera: their pixels would be meaningless."""
 
 BOX_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 """The twelve edges of a box as pairs of rows of `geometry.boxes.corners`."""
@@ -80,7 +80,7 @@ def in_image(
     calib: Calibration,
     image_size_wh: Sequence[int] = DEFAULT_IMAGE_SIZE_WH,
 ) -> NDArray[np.bool_]:
-    """Which LiDAR points (..., >=3) lie before the camera and project into the image: (...) bool.
+    """Mask (...) of the LiDAR points (..., >=3) before the camera that project into the image.
 
     KITTI labels only what the camera sees, so training points are cropped to this view.
     """

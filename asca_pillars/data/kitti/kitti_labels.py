@@ -17,7 +17,7 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import read_text
 from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, image_boxes
-from asca_pillars.data.yaw_units import why_no_yaw
+from asca_pillars.data.yaw_units import yaw_error
 from asca_pillars.geometry.boxes import wrap_angle
 
 _TOO_LARGE = 1e9  # of any field; far above, float32 boxes are no longer finite
@@ -156,7 +156,7 @@ def parse_object(words: Sequence[str], place: str) -> KittiObject:
     """The object of a line's words, 15 or 16; `place` is named in errors.
 
     Raises:
-        DatasetError: it is not one of KITTI's.
+        DatasetError: the line is not one of KITTI's.
     """
     if len(words) not in (15, 16):
         raise DatasetError(
@@ -181,13 +181,13 @@ def parse_object(words: Sequence[str], place: str) -> KittiObject:
         rotation_y=rotation_y,
         score=score[0] if score else None,
     )
-    if item.has_box_3d and (reason := why_no_yaw(rotation_y)) is not None:
+    if item.has_box_3d and (reason := yaw_error(rotation_y)) is not None:
         raise DatasetError(f"{place}: rotation_y {reason}")
     return item
 
 
 def is_detection_text(text: str) -> bool:
-    """Return whether it is a text of detections as `labels_text` writes it, with scores, which labels do not have."""
+    """Whether a text holds detections as `labels_text` writes them, with scores, which labels do not have."""
     try:
         objects = [parse_object(line.split(), "") for line in text.splitlines()]
     except DatasetError:
@@ -209,7 +209,7 @@ def _number(word: str, place: str) -> float:
 
 def _format_object(item: KittiObject) -> str:
     box = (item.height_m, item.width_m, item.length_m, item.x_m, item.y_m, item.z_m, item.rotation_y)
-    # KITTI prints what is unknown (-1, -10, -1000) without decimals; "z" keeps -0.00 out of the files.
+    # KITTI prints unknown values (-1, -10, -1000) without decimals; "z" keeps -0.00 out of the files.
     unknown = item.type == "DontCare"
     fields = [
         item.type,

@@ -31,7 +31,7 @@ from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.scans.stored_scans import stored_points
 
 SIMULATION_FILE = "simulation.json"
-"""What `asca simulate` notes of its frames, in the dataset's folder."""
+"""File in the dataset's folder that records the settings of `asca simulate`."""
 _PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # the signature, then length and name of the first chunk
 
 
@@ -51,7 +51,7 @@ class KittiSplit:
 
     @cached_property
     def has_camera(self) -> bool:
-        """Whether labels stand only where a camera sees: everywhere but in what `asca simulate --view around` wrote.
+        """Whether only the camera's view is labelled: always but in frames of `asca simulate --view around`.
 
         Raises:
             DatasetError: the note of the simulation is damaged.
@@ -90,13 +90,13 @@ class KittiSplit:
             )
         if self.name in ("training", "testing"):
             return tuple(sorted(scans))
-        wanted = read_image_set(Path(self.root), self.name)
-        if missing := sorted(wanted - scans):
+        listed = read_image_set(Path(self.root), self.name)
+        if missing := sorted(listed - scans):
             raise DatasetError(
                 f"{self.scan_path(missing[0])}: listed in ImageSets/{self.name}.txt but not there "
-                f"({len(missing)} of {len(wanted)} scans are missing); complete the folder or the list"
+                f"({len(missing)} of {len(listed)} scans are missing); complete the folder or the list"
             )
-        return tuple(sorted(wanted))
+        return tuple(sorted(listed))
 
     def scan_path(self, frame_id: str) -> Path:
         """velodyne/<id>.bin."""
@@ -158,7 +158,7 @@ class KittiSplit:
 
     @property
     def to_sensor(self) -> FrameChange:
-        """Nothing: scans are in the sensor's frame."""
+        """The identity: scans are in the sensor's frame."""
         return FrameChange.turn(0.0)
 
     def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
@@ -272,11 +272,11 @@ def write_train_val_lists(root: Path) -> list[Path]:
     """
     lists = train_val_frames()
     scans = {path.stem for path in visible_files(root / "training" / "velodyne", "*.bin")}
-    wanted = {frame_id for frame_ids in lists.values() for frame_id in frame_ids}
-    if scans != wanted:
+    listed = {frame_id for frame_ids in lists.values() for frame_id in frame_ids}
+    if scans != listed:
         raise DatasetError(
-            f"{root / 'training' / 'velodyne'}: {len(wanted & scans)} of KITTI's {FRAMES} scans are there and "
-            f"{len(scans - wanted)} others; KITTI's lists are for all of its scans and no others: leave --kitti-split "
+            f"{root / 'training' / 'velodyne'}: {len(listed & scans)} of KITTI's {FRAMES} scans are there and "
+            f"{len(scans - listed)} others; KITTI's lists are for all of its scans and no others: leave --kitti-split "
             "out, and write lists of your own"
         )
     missing = []

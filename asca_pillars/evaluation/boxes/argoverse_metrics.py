@@ -22,8 +22,9 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.evaluation.boxes.box_pairs import UNMATCHED, BoxPairs, Doubles, EvaluatedFrame, pair_class
+from asca_pillars.evaluation.boxes.box_pairs import UNMATCHED, BoxPairs, EvaluatedFrame, pair_class
 from asca_pillars.evaluation.boxes.nuscenes_metrics import DISTANCES_M, ERROR_DISTANCE_M, RECALLS
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.geometry.boxes import wrap_angle
 
 MAX_DETECTIONS = 100
@@ -34,7 +35,7 @@ _TINY = 1e-10  # what the API adds to the number of detections
 
 @dataclass(frozen=True)
 class ArgoverseScore:
-    """Of one class: AP and CDS in percent, and errors; None where there is no object."""
+    """Scores of one class: AP and CDS in percent, and errors; None without objects."""
 
     class_name: str
     objects: int
@@ -51,7 +52,7 @@ def argoverse_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str
     return [_score(pair_class(within, name, _closeness), name) for name in class_names]
 
 
-def aligned_size_error(found: Doubles, objects: Doubles) -> Doubles:
+def aligned_size_error(boxes: Floats, objects: Floats) -> Floats:
     """Scale error of boxes (K, 7), metres and radians, laid over each other, center on center and heading on heading.
 
     The API's `iou_3d_axis_aligned` divides the common volume by the product of the larger extents, which is the volume
@@ -60,12 +61,12 @@ def aligned_size_error(found: Doubles, objects: Doubles) -> Doubles:
     Returns:
         (K,) in [0, 1).
     """
-    shared = np.minimum(found[:, 3:6], objects[:, 3:6]).prod(axis=1)
-    return 1 - shared / np.maximum(found[:, 3:6], objects[:, 3:6]).prod(axis=1)
+    shared = np.minimum(boxes[:, 3:6], objects[:, 3:6]).prod(axis=1)
+    return 1 - shared / np.maximum(boxes[:, 3:6], objects[:, 3:6]).prod(axis=1)
 
 
-def _closeness(found: Doubles, objects: Doubles) -> Doubles:
-    return -np.linalg.norm(found[:, None, :3] - objects[None, :, :3], axis=2)
+def _closeness(boxes: Floats, objects: Floats) -> Floats:
+    return -np.linalg.norm(boxes[:, None, :3] - objects[None, :, :3], axis=2)
 
 
 def _in_range(frame: EvaluatedFrame) -> EvaluatedFrame:
@@ -93,8 +94,8 @@ def _score(pairs: BoxPairs, name: str) -> ArgoverseScore:
     return ArgoverseScore(name, objects, 100 * ap, ate_m, ase, aoe_rad, 100 * cds)
 
 
-def _first_of_each(pairs: BoxPairs) -> tuple[NDArray[np.bool_], NDArray[np.int64], Doubles]:
-    """Which detections (N,) count; the object that each is the first one of, and its distance, inf if of none."""
+def _first_of_each(pairs: BoxPairs) -> tuple[NDArray[np.bool_], NDArray[np.int64], Floats]:
+    """Mask (N,) of the detections that count; index and distance of the object each is the first match of, else inf."""
     count = len(pairs.scores)
     kept, owner, distance_m = np.ones(count, dtype=bool), np.full(count, UNMATCHED), np.full(count, np.inf)
     taken, in_frame = np.zeros(len(pairs.objects), dtype=bool), dict.fromkeys(pairs.frames.tolist(), 0)

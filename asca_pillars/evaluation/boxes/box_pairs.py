@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.frames import NEIGHBOR_TYPES
+from asca_pillars.geometry.arrays import Floats, Ints, Mask
 
 UNMATCHED = -1
 
-Doubles = NDArray[np.float64]
-Closeness = Callable[[Doubles, Doubles], Doubles]
+Closeness = Callable[[Floats, Floats], Floats]
 """(N, 7), (M, 7) -> (N, M), larger is closer."""
 
 
@@ -33,7 +33,7 @@ class EvaluatedFrame:
     frame_id: str
     objects: NDArray[np.floating]
     object_types: Sequence[str]
-    visible: NDArray[np.bool_]
+    visible: Mask
     found: NDArray[np.floating]
     found_types: Sequence[str]
     scores: NDArray[np.floating]
@@ -53,15 +53,15 @@ class BoxPairs:
         excuse: (N,) closeness of the closest object that does not count; -inf without one.
     """
 
-    scores: Doubles
-    found: Doubles
-    frames: NDArray[np.int64]
-    objects: Doubles
-    first: NDArray[np.int64]
-    closeness: tuple[Doubles, ...]
-    excuse: Doubles
+    scores: Floats
+    found: Floats
+    frames: Ints
+    objects: Floats
+    first: Ints
+    closeness: tuple[Floats, ...]
+    excuse: Floats
 
-    def match(self, close_enough: Callable[[float], bool]) -> NDArray[np.int64]:
+    def match(self, close_enough: Callable[[float], bool]) -> Ints:
         """(N,) index of the object that each detection takes, or UNMATCHED."""
         matched = np.full(len(self.scores), UNMATCHED)
         taken = np.zeros(len(self.objects), dtype=bool)
@@ -112,12 +112,12 @@ def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Clo
     )
 
 
-Band = Callable[[NDArray[np.floating]], NDArray[np.bool_]]
+Band = Callable[[NDArray[np.floating]], Mask]
 """(N, 7) boxes -> (N,) which centers it holds."""
 
 
 def _distance(low_m: float, high_m: float) -> Band:
-    def inside(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def inside(boxes: NDArray[np.floating]) -> Mask:
         away = np.hypot(boxes[:, 0], boxes[:, 1])
         return (away >= low_m) & (away < high_m)
 
@@ -125,7 +125,7 @@ def _distance(low_m: float, high_m: float) -> Band:
 
 
 def _direction(low_rad: float, high_rad: float) -> Band:
-    def inside(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def inside(boxes: NDArray[np.floating]) -> Mask:
         turned = np.abs(np.arctan2(boxes[:, 1], boxes[:, 0]))
         return (turned >= low_rad) & (turned < high_rad)
 
@@ -145,8 +145,8 @@ BANDS: dict[str, Band] = {
 behind, and what is between."""
 
 
-def in_band(pairs: BoxPairs, matched: NDArray[np.int64], band: str) -> tuple[NDArray[np.bool_], NDArray[np.bool_], int]:
-    """Which detections (N,) a band counts and which of them are hits (N,), and how many objects it holds.
+def in_band(pairs: BoxPairs, matched: Ints, band: str) -> tuple[Mask, Mask, int]:
+    """Masks (N,) of the detections that a band counts and of the hits among them, and its number of objects.
 
     An object takes its detection along: only what matches nothing is judged by where it stands itself.
     """

@@ -55,7 +55,7 @@ def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedReco
 
 
 def stated_scope(path: Path, lines: Iterable[NamedRecords]) -> DetectorScope | None:
-    """What the detector could have found, as all of the lines state it; None where that is not known.
+    """Scope of the detector, if all lines state the same; None if it is unknown.
 
     Lines of earlier versions state nothing; then a `recording.json` beside `path`, the file of the lines, does.
 
@@ -190,7 +190,7 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, reporter: Reporter 
 def _can_be_judged(
     split: LabeledSplit, frame_id: str, objects: NDArray[np.float32], found: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Of the boxes (N, 7): which stand where objects are labelled, or so near one of `objects` that it may be meant."""
+    """Mask of the boxes (N, 7) in the labelled view, or so near one of `objects` that they may match it."""
     apart = np.linalg.norm(found[:, None, :2] - objects[None, :, :2], axis=2)
     return np.asarray(split.in_labeled_view(frame_id, found[:, :3]) | (apart < NEAR_LABEL_M).any(axis=1))
 

@@ -23,7 +23,7 @@ _ALL = "all"
 
 @dataclass(frozen=True)
 class BoxReport:
-    """What was evaluated, by which protocol, and every number about it."""
+    """Result of an evaluation by one of the box protocols, with all its numbers."""
 
     subject: str
     """The model or file and the data, in words."""
@@ -73,7 +73,7 @@ def box_tables(report: BoxReport) -> list[TextTable]:
 
 
 def box_notes(report: BoxReport) -> list[str]:
-    """What one must know to read the tables: classes left out, objects that do not count, scores to choose."""
+    """Notes for the reader of the tables: classes left out, objects that do not count, scores to choose."""
     types = Counter(kind for frame in report.frames.frames for kind in frame.object_types)
     others = [f"{name} ({count})" for name, count in types.items() if name not in report.class_names]
     hidden = sum(int((~frame.visible).sum()) for frame in report.frames.frames)

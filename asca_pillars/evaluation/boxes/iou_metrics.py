@@ -65,7 +65,7 @@ MATCH_M = 2.0
 
 @dataclass(frozen=True)
 class FixedScore:
-    """Of one class in one band, by centers less than MATCH_M apart on the ground."""
+    """Scores of one class in one band, by centers less than MATCH_M apart on the ground."""
 
     class_name: str
     score: float

@@ -22,7 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.evaluation.boxes.box_pairs import BANDS, BoxPairs, Doubles, EvaluatedFrame, in_band, pair_class
+from asca_pillars.evaluation.boxes.box_pairs import BANDS, BoxPairs, EvaluatedFrame, in_band, pair_class
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.geometry.boxes import wrap_angle
 
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
@@ -34,7 +35,7 @@ _FLOOR = 0.1  # of precision
 
 @dataclass(frozen=True)
 class NuScenesScore:
-    """Of one class: AP in percent, its mean and by distance of match, and errors; None where there is no object."""
+    """Scores of one class: AP in percent, mean and by match distance, and errors; None without objects."""
 
     class_name: str
     band: str
@@ -50,13 +51,13 @@ def nuscenes_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]
     """A score for every class and band, in that order."""
     scores = []
     for name in class_names:
-        pairs = pair_class(frames, name, lambda found, objects: -ground_distance(found, objects))
+        pairs = pair_class(frames, name, lambda boxes, objects: -ground_distance(boxes, objects))
         matches = {limit_m: match_by_distance(pairs, limit_m) for limit_m in DISTANCES_M}
         scores += [_score(pairs, matches, name, band) for band in BANDS]
     return scores
 
 
-def ground_distance(a: Doubles, b: Doubles) -> Doubles:
+def ground_distance(a: Floats, b: Floats) -> Floats:
     """Distance of centers on the ground in m: (N, 7), (M, 7) -> (N, M)."""
     return np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
 
@@ -66,17 +67,17 @@ def match_by_distance(pairs: BoxPairs, limit_m: float) -> NDArray[np.int64]:
     return pairs.match(lambda closeness: -closeness < limit_m)
 
 
-def match_errors(found: Doubles, objects: Doubles) -> Doubles:
+def match_errors(boxes: Floats, objects: Floats) -> Floats:
     """(K, 3) distance on the ground in m, 1 - IoU of the sizes, difference of yaw in rad, of K matches (K, 7)."""
-    moved = np.hypot(found[:, 0] - objects[:, 0], found[:, 1] - objects[:, 1])
-    turned = np.abs(wrap_angle(found[:, 6] - objects[:, 6]))
-    return np.stack([moved, size_error(found, objects), turned], axis=1)
+    moved = np.hypot(boxes[:, 0] - objects[:, 0], boxes[:, 1] - objects[:, 1])
+    turned = np.abs(wrap_angle(boxes[:, 6] - objects[:, 6]))
+    return np.stack([moved, size_error(boxes, objects), turned], axis=1)
 
 
-def size_error(found: Doubles, objects: Doubles) -> Doubles:
+def size_error(boxes: Floats, objects: Floats) -> Floats:
     """(K,) 1 - IoU of boxes (K, 7) that are laid over each other, center on center and heading on heading."""
-    shared = np.minimum(found[:, 3:6], objects[:, 3:6]).prod(axis=1)
-    return 1 - shared / (found[:, 3:6].prod(axis=1) + objects[:, 3:6].prod(axis=1) - shared)
+    shared = np.minimum(boxes[:, 3:6], objects[:, 3:6]).prod(axis=1)
+    return 1 - shared / (boxes[:, 3:6].prod(axis=1) + objects[:, 3:6].prod(axis=1) - shared)
 
 
 def _score(pairs: BoxPairs, matches: dict[float, NDArray[np.int64]], name: str, band: str) -> NuScenesScore:
@@ -95,14 +96,14 @@ def _score(pairs: BoxPairs, matches: dict[float, NDArray[np.int64]], name: str, 
     return NuScenesScore(name, band, objects, float(np.mean(by_distance)), tuple(by_distance), *errors)
 
 
-def _at_recalls(hits: NDArray[np.bool_], values: Doubles, objects: int) -> Doubles:
+def _at_recalls(hits: NDArray[np.bool_], values: Floats, objects: int) -> Floats:
     """(101,) what `values` of the detections (N,) are at each recall; 0 beyond the highest."""
     if not hits.any():
         return np.zeros(len(RECALLS))
     return np.interp(RECALLS, np.cumsum(hits) / objects, values, right=0)
 
 
-def _mean_errors(errors: Doubles, scores: Doubles, score_at_recall: Doubles) -> tuple[float, float, float]:
+def _mean_errors(errors: Floats, scores: Floats, score_at_recall: Floats) -> tuple[float, float, float]:
     achieved = np.flatnonzero(score_at_recall)
     if not len(achieved) or achieved[-1] < _FIRST:
         return 1.0, 1.0, 1.0

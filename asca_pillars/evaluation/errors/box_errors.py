@@ -26,6 +26,7 @@ from asca_pillars.detection.targets import match_by_overlap
 from asca_pillars.evaluation.errors.error_frames import ErrorFrame
 from asca_pillars.evaluation.errors.label_fit import view_angle_deg
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
+from asca_pillars.geometry.arrays import Floats, Ints, Mask
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.overlap import bev_iou
 
@@ -49,7 +50,6 @@ RESIDUALS = {
 }
 """Names of the columns of `box_residuals`."""
 
-_Doubles = NDArray[np.float64]
 _NONE = -1
 _MIN_SIZE_M = 0.1
 _FACES = tuple(list(RESIDUALS).index(name) for name in ("near_end", "far_end", "near_side", "far_side"))
@@ -84,7 +84,7 @@ class ObjectMatch:
 
     frame: int
     class_name: str
-    box: _Doubles
+    box: Floats
     points: int
     occluded: int
     truncated: float
@@ -93,7 +93,7 @@ class ObjectMatch:
     counted: bool
     found: bool
     below_score: bool
-    detection: _Doubles | None
+    detection: Floats | None
     score: float
 
 
@@ -113,7 +113,7 @@ class DetectionMatch:
 
     frame: int
     class_name: str
-    box: _Doubles
+    box: Floats
     score: float
     reported: bool
     kind: str
@@ -137,33 +137,33 @@ def match_frame(
 
     Args:
         frame: the frame.
-        index: its number, which the matches carry.
+        index: number of the frame, stored in the matches.
         class_name: type of the objects and detections.
-        score: from which on detections are reported.
+        score: least score of reported detections.
     """
     types = np.array(frame.types, dtype=object)
-    own = types == class_name
-    related = own | (types == NEIGHBOR_TYPES.get(class_name, ""))
-    mine = np.flatnonzero(np.array(frame.found_types, dtype=object) == class_name)
-    mine = mine[np.argsort(-frame.scores[mine], kind="stable")]
-    boxes, scores, excused = frame.found[mine], frame.scores[mine], frame.excused[mine]
+    of_class = types == class_name
+    related = of_class | (types == NEIGHBOR_TYPES.get(class_name, ""))
+    order = np.flatnonzero(np.array(frame.found_types, dtype=object) == class_name)
+    order = order[np.argsort(-frame.scores[order], kind="stable")]
+    boxes, scores, ignored = frame.found[order], frame.scores[order], frame.ignored[order]
     reported = scores >= score
     overlap = bev_iou(boxes, frame.objects)
 
-    # The best score comes first, so that detections below the score take nothing from those above it.
-    holder = _match(overlap, np.ones(len(mine), bool), related, least_iou(class_name))
-    found = (holder >= 0) & np.append(reported, False)[holder]
+    # The best score comes first, so that detections below the score take no object from those above it.
+    match = _match(overlap, np.ones(len(order), bool), related, least_iou(class_name))
+    found = (match >= 0) & np.append(reported, False)[match]
     unmatched = reported.copy()
-    unmatched[holder[holder >= 0]] = False
+    unmatched[match[match >= 0]] = False
     badly_placed = _match(overlap, unmatched, related & ~found, LOCALIZATION_IOU)
 
-    object_of = np.full(len(mine), _NONE)
-    object_of[holder[holder >= 0]] = np.flatnonzero(holder >= 0)
+    object_of = np.full(len(order), _NONE)
+    object_of[match[match >= 0]] = np.flatnonzero(match >= 0)
     detections = []
     for row, item in enumerate(object_of):
         if item >= 0:
-            kind, label = ("found" if own[item] and frame.counted[item] else "ignored"), ""
-        elif excused[row]:
+            kind, label = ("found" if of_class[item] and frame.counted[item] else "ignored"), ""
+        elif ignored[row]:
             kind, label = "ignored", ""
         else:
             kind, label = _false_kind(overlap[row], types, related, least_iou(class_name))
@@ -171,10 +171,10 @@ def match_frame(
             DetectionMatch(index, class_name, boxes[row], float(scores[row]), bool(reported[row]), kind, label)
         )
 
-    view, neighbors = view_angle_deg(frame.objects), _nearest_m(frame.objects, own)
+    view, neighbors = view_angle_deg(frame.objects), _nearest_m(frame.objects, of_class)
     objects = []
-    for row in np.flatnonzero(own & (frame.object_points > 0)).tolist():
-        detection = int(holder[row] if found[row] else badly_placed[row])
+    for row in np.flatnonzero(of_class & (frame.object_points > 0)).tolist():
+        detection = int(match[row] if found[row] else badly_placed[row])
         objects.append(
             ObjectMatch(
                 frame=index,
@@ -187,7 +187,7 @@ def match_frame(
                 neighbor_m=float(neighbors[row]),
                 counted=bool(frame.counted[row]),
                 found=bool(found[row]),
-                below_score=bool(holder[row] >= 0 and not found[row]),
+                below_score=bool(match[row] >= 0 and not found[row]),
                 detection=None if detection == _NONE else boxes[detection],
                 score=float("nan") if detection == _NONE else float(scores[detection]),
             )
@@ -195,7 +195,7 @@ def match_frame(
     return objects, detections
 
 
-def box_residuals(found: _Doubles, labels: _Doubles) -> _Doubles:
+def box_residuals(found: Floats, labels: Floats) -> Floats:
     """Errors of boxes found[k] against labels[k], sensor at the origin: (K, 7), (K, 7) -> (K, len(RESIDUALS)).
 
     A box that is turned by more than 45 degrees against its label's axis is taken by its other axis: what it covers
@@ -231,7 +231,7 @@ def box_residuals(found: _Doubles, labels: _Doubles) -> _Doubles:
     return np.stack([columns[name] for name in RESIDUALS], axis=1)
 
 
-def boxes_from_residuals(labels: _Doubles, residuals: _Doubles) -> _Doubles:
+def boxes_from_residuals(labels: Floats, residuals: Floats) -> Floats:
     """Inverse of `box_residuals`: (K, 7), (K, len(RESIDUALS)) -> (K, 7), from ends, sides, bottom, top and heading.
 
     Boxes that are turned by more than 45 degrees come back with the same footprint, length and width exchanged.
@@ -254,14 +254,14 @@ def boxes_from_residuals(labels: _Doubles, residuals: _Doubles) -> _Doubles:
     return boxes
 
 
-def corrected(labels: _Doubles, residuals: _Doubles, part: str) -> _Doubles:
+def corrected(labels: Floats, residuals: Floats, part: str) -> Floats:
     """The boxes (K, 7) of these residuals with one part, a key of CORRECTIONS, taken from the labels (K, 7)."""
     kept = residuals.copy()
     kept[:, list(CORRECTIONS[part])] = 0.0
     return boxes_from_residuals(labels, kept)
 
 
-def _ray_facing_axes(labels: _Doubles) -> tuple[_Doubles, _Doubles]:
+def _ray_facing_axes(labels: Floats) -> tuple[Floats, Floats]:
     """Unit vectors (K, 2) of the labels' ray-facing axes, and on which side of them the sensor is: (K,), 1 is left."""
     heading = np.stack([np.cos(labels[:, 6]), np.sin(labels[:, 6])], axis=1)
     axis = np.where((heading * labels[:, :2]).sum(axis=1, keepdims=True) < 0, -heading, heading)
@@ -269,20 +269,16 @@ def _ray_facing_axes(labels: _Doubles) -> tuple[_Doubles, _Doubles]:
     return axis, np.where(sensor_left < 0, -1.0, 1.0)
 
 
-def _match(
-    overlap: _Doubles, detections: NDArray[np.bool_], objects: NDArray[np.bool_], least: float
-) -> NDArray[np.int64]:
+def _match(overlap: Floats, detections: Mask, objects: Mask, least: float) -> Ints:
     """Match some detections with some objects by (D, M) overlaps: (M,) detection that each object gets, or _NONE."""
     rows, columns = np.flatnonzero(detections), np.flatnonzero(objects)
     matched, items = match_by_overlap(overlap[np.ix_(rows, columns)], least)
-    holder = np.full(overlap.shape[1], _NONE)
-    holder[columns[items]] = rows[matched]
-    return holder
+    match = np.full(overlap.shape[1], _NONE)
+    match[columns[items]] = rows[matched]
+    return match
 
 
-def _false_kind(
-    overlap: _Doubles, types: NDArray[np.object_], related: NDArray[np.bool_], least: float
-) -> tuple[str, str]:
+def _false_kind(overlap: Floats, types: NDArray[np.object_], related: Mask, least: float) -> tuple[str, str]:
     """Kind of a false detection and the type of the label it stands on, from its overlaps (M,) with the objects."""
     for chosen, low, kind in (
         (related, least, "duplicate"),
@@ -295,8 +291,8 @@ def _false_kind(
     return "background", ""
 
 
-def _nearest_m(boxes: _Doubles, own: NDArray[np.bool_]) -> _Doubles:
+def _nearest_m(boxes: Floats, mask: Mask) -> Floats:
     """Distance (M,) from each box (M, 7) to the nearest other one that a mask (M,) chooses; infinite without one."""
     apart = np.linalg.norm(boxes[:, None, :2] - boxes[None, :, :2], axis=2)
     np.fill_diagonal(apart, np.inf)
-    return np.where(own, apart, np.inf).min(axis=1, initial=np.inf)
+    return np.where(mask, apart, np.inf).min(axis=1, initial=np.inf)

@@ -1,4 +1,4 @@
-"""Frames as the error analysis takes them: points, labels and detections of one frame, the sensor at the origin."""
+"""Frames for the error analysis: points, labels and detections of one frame, the sensor at the origin."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,16 +31,15 @@ class ErrorFrame:
         frame_id: name of the frame in its dataset.
         points: (N, 4) x, y, z, reflectance; with a camera those in the image.
         objects: (M, 7) labelled boxes of every type.
-        types: of the objects.
+        types: types of the objects.
         occluded: (M,) KITTI's 0 to 3, or UNKNOWN_OCCLUSION.
         truncated: (M,) 0..1, 0 where unknown.
         object_points: (M,) points in each box.
-        counted: (M,) objects that are to be found: within the protocol's limits and with a point inside.
+        counted: (M,) objects that count: within the protocol's limits and with a point inside.
         found: (D, 7) detected boxes.
-        found_types: of the detections.
+        found_types: types of the detections.
         scores: (D,).
-        excused: (D,) detections that are no error wherever they stand: in a DontCare area, or smaller in the image than
-            KITTI labels.
+        ignored: (D,) detections that are never false: in a DontCare area, or smaller in the image than KITTI labels.
     """
 
     frame_id: str
@@ -54,7 +53,7 @@ class ErrorFrame:
     found: NDArray[np.float64]
     found_types: tuple[str, ...]
     scores: NDArray[np.float64]
-    excused: NDArray[np.bool_]
+    ignored: NDArray[np.bool_]
 
 
 class ErrorFrames(Protocol):
@@ -62,7 +61,7 @@ class ErrorFrames(Protocol):
 
     @property
     def frame_ids(self) -> Sequence[str]:
-        """Sorted."""
+        """Sorted frame ids."""
 
     def read(self, frame_id: str) -> ErrorFrame:
         """One frame; DatasetError or ScanError if a file of it is missing or damaged."""
@@ -76,7 +75,7 @@ class KittiErrorFrames:
         split: scans and calibrations.
         labels, predictions: folders of the text.
         class_names: classes that are evaluated.
-        frame_ids: those with predictions, sorted.
+        frame_ids: ids of the frames with predictions, sorted.
     """
 
     split: KittiSplit
@@ -108,7 +107,7 @@ class KittiErrorFrames:
             found=boxes_from_objects(found, calibration).astype(np.float64),
             found_types=tuple(self._spelling.get(item.type.casefold(), item.type) for item in found),
             scores=flat_found.scores,
-            excused=_excused(flat_found, flat_areas),
+            ignored=_ignored(flat_found, flat_areas),
         )
 
     @cached_property
@@ -130,7 +129,7 @@ class BoxErrorFrames:
 
     @cached_property
     def frame_ids(self) -> tuple[str, ...]:
-        """Those with predictions, sorted."""
+        """Ids of the frames with predictions, sorted."""
         return tuple(sorted(self._by_id))
 
     def read(self, frame_id: str) -> ErrorFrame:
@@ -151,7 +150,7 @@ class BoxErrorFrames:
             found=change.boxes(np.asarray(frame.found)).astype(np.float64),
             found_types=tuple(frame.found_types),
             scores=np.asarray(frame.scores, np.float64),
-            excused=np.zeros(len(frame.found), bool),
+            ignored=np.zeros(len(frame.found), bool),
         )
 
     @cached_property
@@ -166,6 +165,6 @@ def _counted(truth: FrameObjects, class_names: Sequence[str]) -> NDArray[np.bool
     return counted
 
 
-def _excused(found: FrameObjects, areas: FrameObjects) -> NDArray[np.bool_]:
-    low = detection_states(found, "", DIFFICULTY) == KittiState.IGNORED  # too low for any class
-    return np.asarray(low | (dont_care_shares(Frames.join([areas], [found])) > DONT_CARE_SHARE))
+def _ignored(detections: FrameObjects, areas: FrameObjects) -> NDArray[np.bool_]:
+    low = detection_states(detections, "", DIFFICULTY) == KittiState.IGNORED  # too low for any class
+    return np.asarray(low | (dont_care_shares(Frames.join([areas], [detections])) > DONT_CARE_SHARE))

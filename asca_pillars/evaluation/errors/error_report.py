@@ -180,13 +180,13 @@ PRODUCTS: dict[str, Recognizer] = {
     MARKDOWN: ending_with(_END),
     PAGE: ending_with(_END),
 }
-"""What is written, and how it is recognized as ours."""
+"""Output files, and how a run recognizes its own."""
 BY_LIST = "list"
 
 
 @dataclass(frozen=True)
 class ErrorReport(Strict):
-    """What errors.json holds.
+    """Contents of errors.json.
 
     Attributes:
         subject: the model or folder and the data, in words.

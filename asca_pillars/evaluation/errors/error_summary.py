@@ -41,7 +41,7 @@ _Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Resamples:
-    """How often each frame is drawn.
+    """Bootstrap samples, as counts of each frame.
 
     Attributes:
         weights: (DRAWS, F) whole numbers.
@@ -121,7 +121,7 @@ _Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Spread(Strict):
-    """How a quantity is distributed: how many values, median (of a share: the mean), 10th and 90th percentile.
+    """Distribution of a quantity: number of values, median (of a share: the mean), 10th and 90th percentile.
 
     `interval` is the median's (mean's) 95 % interval by `block_bootstrap`.
     """

@@ -23,7 +23,7 @@ from asca_pillars.evaluation.errors.label_fit import END_ON_DEG, MAX_RANGE_M, ST
 from asca_pillars.evaluation.report_page import TextTable
 
 PRINTED_NOTES = 4
-"""How many of the notes are needed to read the first tables; the others say what traits and statistics are."""
+"""Number of notes needed to read the first tables; the others explain traits and statistics."""
 _NONE = "-"
 _BOX_COLUMNS = (
     "near_end",

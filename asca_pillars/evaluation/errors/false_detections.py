@@ -1,4 +1,4 @@
-"""What stands where a detection is false: height, brightness, points, and what is beside it.
+"""Surroundings of false detections: height, brightness, number of points, and points beside the box.
 
 Everything is measured on the points of the scan that lie above the ground, whatever they belong to. A detection may
 have several traits or none. The traits are the same for every class, and mean different things: where a person is
@@ -38,7 +38,7 @@ TRAITS = {
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the points at a detection look like. Metres; NaN without points above the ground.
+    """Statistics of the points at a detection. Metres; NaN without points above the ground.
 
     Attributes:
         distance_m: horizontal, of the box's center.

@@ -1,4 +1,4 @@
-"""How labelled boxes lie around the points of their objects; no detector takes part.
+"""Fit of labelled boxes to the points of their objects; no detector takes part.
 
 Two datasets whose labels fit their points differently teach a network different boxes. Compare, for example, a
 simulated dataset with a real one, or the drives of a real one with each other.
@@ -76,12 +76,12 @@ def label_fit(points: NDArray[np.floating], boxes: NDArray[np.floating]) -> NDAr
         distance = float(np.hypot(box[0], box[1]))
         if not 0 < distance <= MAX_RANGE_M:
             continue
-        near = _points_near(points, box)
+        crop = _points_near(points, box)
         values: dict[str, float] = {}
         if box[3] < VEHICLE_LENGTH_M:
-            values = _range_statistics(near, box)
+            values = _range_statistics(crop, box)
         elif view_angle_deg(box[None])[0] < END_ON_DEG:
-            values = _end_on_statistics(near, box, distance)
+            values = _end_on_statistics(crop, box, distance)
         row[:] = [values.get(name, np.nan) for name in STATISTICS]
     return result
 
@@ -97,7 +97,7 @@ def view_angle_deg(boxes: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _points_near(points: NDArray[np.floating], box: NDArray[np.float64]) -> _BoxPoints:
-    """The points whose distance from the box's center leaves them a chance to belong to it."""
+    """Crop the points to the surroundings of a box."""
     center, line = box[:2], box[:2] / np.hypot(box[0], box[1])
     axis = np.array([np.cos(box[6]), np.sin(box[6])])
     axis = -axis if axis @ center < 0 else axis
@@ -108,39 +108,39 @@ def _points_near(points: NDArray[np.floating], box: NDArray[np.float64]) -> _Box
     return _BoxPoints(offset @ axis, offset @ np.array([-axis[1], axis[0]]), up, offset @ line)
 
 
-def _range_statistics(near: _BoxPoints, box: NDArray[np.float64]) -> dict[str, float]:
+def _range_statistics(points: _BoxPoints, box: NDArray[np.float64]) -> dict[str, float]:
     length, width, height = box[3:6]
-    own = (np.abs(near.along) < length / 2 + 0.15) & (np.abs(near.across) < width / 2 + 0.15)
-    own &= (near.up > 0.1) & (near.up < height + 0.1)
-    depth = near.depth[own]
+    inside = (np.abs(points.along) < length / 2 + 0.15) & (np.abs(points.across) < width / 2 + 0.15)
+    inside &= (points.up > 0.1) & (points.up < height + 0.1)
+    depth = points.depth[inside]
     if len(depth) < MIN_POINTS:
         return {}
     values = {f"range_{share}": float(np.percentile(depth, share)) for share in (5, 50, 95)}
     return values | {"range_spread": float(np.ptp(depth))}
 
 
-def _end_on_statistics(near: _BoxPoints, box: NDArray[np.float64], distance_m: float) -> dict[str, float]:
+def _end_on_statistics(points: _BoxPoints, box: NDArray[np.float64], distance_m: float) -> dict[str, float]:
     length, width, height = box[3:6]
-    own = (np.abs(near.along) < length / 2 + 0.5) & (np.abs(near.across) < width / 2 + 0.35)
-    near = near.where(own & (near.up > 0.25) & (near.up < height + 0.2))
-    low_beyond = (near.up < 0.6 * height) & (near.along > 0)
-    beside = np.abs(near.across) >= width / 2 - 0.25
+    inside = (np.abs(points.along) < length / 2 + 0.5) & (np.abs(points.across) < width / 2 + 0.35)
+    points = points.where(inside & (points.up > 0.25) & (points.up < height + 0.2))
+    low_beyond = (points.up < 0.6 * height) & (points.along > 0)
+    flank = np.abs(points.across) >= width / 2 - 0.25
     values = {
-        "flank_end": _percentile(near.along[low_beyond & beside], 97) - length / 2,
-        "low_inside": float((low_beyond & ~beside).sum() >= 5),
+        "flank_end": _percentile(points.along[low_beyond & flank], 97) - length / 2,
+        "low_inside": float((low_beyond & ~flank).sum() >= 5),
     }
-    if len(near.along) >= MIN_POINTS:
-        values["nearest_point"] = float(near.along.min() + length / 2)
-        roof = near.up > 0.8 * height
+    if len(points.along) >= MIN_POINTS:
+        values["nearest_point"] = float(points.along.min() + length / 2)
+        roof = points.up > 0.8 * height
         if _heads_away(box):
-            upper = near.along[near.up > 0.6 * height]
+            upper = points.along[points.up > 0.6 * height]
             values["upper_end"] = (_last(upper) + length / 2) / length
-            values["roof_end"] = _last(near.along[roof & (near.up < 0.9 * height)]) + length / 2
-        values["roof_length"] = _percentile(near.along[roof], 95) - _percentile(near.along[roof], 5)
-    if len(near.along) > MIN_DENSE_POINTS:
-        values["top_97"] = float(np.percentile(near.up, 97) - height)
-        values["top"] = float(near.up.max() - height)
-        bumper = near.across[(near.up > 0.35) & (near.up < 0.8) & (near.along < 0.8 - length / 2)]
+            values["roof_end"] = _last(points.along[roof & (points.up < 0.9 * height)]) + length / 2
+        values["roof_length"] = _percentile(points.along[roof], 95) - _percentile(points.along[roof], 5)
+    if len(points.along) > MIN_DENSE_POINTS:
+        values["top_97"] = float(np.percentile(points.up, 97) - height)
+        values["top"] = float(points.up.max() - height)
+        bumper = points.across[(points.up > 0.35) & (points.up < 0.8) & (points.along < 0.8 - length / 2)]
         if len(bumper) > 20 and distance_m < MAX_REAR_RANGE_M:
             values["rear_width"] = float(np.ptp(np.percentile(bumper, [1, 99])) - width)
     return values

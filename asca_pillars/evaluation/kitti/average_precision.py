@@ -93,7 +93,7 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class KittiResults:
-    """What the protocol says of a set of frames.
+    """Results of the protocol for a set of frames.
 
     Attributes:
         curves: by class name, metric and difficulty; absent where the official tool does not evaluate.

@@ -32,7 +32,7 @@ _NONE = "-"
 
 @dataclass(frozen=True)
 class KittiReport:
-    """What was evaluated by KITTI's protocol, and every number about it."""
+    """Result of an evaluation by KITTI's protocol, with all its numbers."""
 
     subject: str
     """The model or folder and the data, in words."""
@@ -40,7 +40,7 @@ class KittiReport:
     ap: KittiEvaluation
     points: Sequence[OperatingPoint]
     best_scores: dict[str, float]
-    """Of each class that was found at all: the score that weighs misses against false detections best."""
+    """The score of each detected class that weighs misses against false detections best."""
     about: dict[str, Any]
     """Model, command, machine and versions, for the JSON."""
 
@@ -67,7 +67,7 @@ def kitti_tables(report: KittiReport) -> list[TextTable]:
 
 
 def kitti_notes(report: KittiReport) -> list[str]:
-    """What one must know to read the tables.
+    """Notes for the reader of the tables.
 
     Types left out, classes not evaluated, sets too small for their AP, detections ignored, scores to choose.
     """

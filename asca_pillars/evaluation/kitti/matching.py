@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 
 from asca_pillars.evaluation.kitti.pairs import Pairs
 from asca_pillars.evaluation.kitti.states import KittiState
-
-_Doubles = NDArray[np.float64]
-_Indices = NDArray[np.int64]
-_Mask = NDArray[np.bool_]
+from asca_pillars.geometry.arrays import Floats, Ints, Mask
 
 
 class ClassStates(NamedTuple):
-    """What one class, difficulty and distance band makes of the objects of all frames.
+    """States of the objects of all frames at one class, difficulty and distance band.
 
     Attributes:
         truth_states: (N,) `KittiState` of the ground truth.
@@ -34,8 +31,8 @@ class ClassStates(NamedTuple):
 
     truth_states: NDArray[np.int8]
     detection_states: NDArray[np.int8]
-    scores: _Doubles
-    in_dont_care: _Mask
+    scores: Floats
+    in_dont_care: Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +49,14 @@ class Counts:
 
     counted: int
     matched: int
-    thresholds: _Doubles
-    tp: _Indices
-    fp: _Indices
-    fn: _Indices
-    similarity: _Doubles
+    thresholds: Floats
+    tp: Ints
+    fp: Ints
+    fn: Ints
+    similarity: Floats
 
 
-def count(pairs: Pairs, metric: str, states: ClassStates, similarity: _Doubles, recall_steps: int) -> Counts:
+def count(pairs: Pairs, metric: str, states: ClassStates, similarity: Floats, recall_steps: int) -> Counts:
     """Both passes of the protocol: score thresholds at even steps of recall, then the counts at each of them.
 
     Args:
@@ -100,7 +97,7 @@ def count(pairs: Pairs, metric: str, states: ClassStates, similarity: _Doubles, 
     )
 
 
-def assign(pairs: Pairs, best: _Indices, candidates: _Mask) -> _Mask:
+def assign(pairs: Pairs, best: Ints, candidates: Mask) -> Mask:
     """Let each ground truth in turn take the first candidate in its order of preference that is still free.
 
     Args:
@@ -124,7 +121,7 @@ def assign(pairs: Pairs, best: _Indices, candidates: _Mask) -> _Mask:
     return found
 
 
-def score_thresholds(scores: _Doubles, counted: int, recall_steps: int) -> _Doubles:
+def score_thresholds(scores: Floats, counted: int, recall_steps: int) -> Floats:
     """Those scores at which recall comes nearest to 0, 1 / recall_steps, 2 / recall_steps ...; descending.
 
     Args:
@@ -143,7 +140,7 @@ def score_thresholds(scores: _Doubles, counted: int, recall_steps: int) -> _Doub
     return np.array(chosen, dtype=np.float64)
 
 
-def _rounds(truth: _Indices, frame: _Indices) -> Iterator[tuple[_Indices, _Indices]]:
+def _rounds(truth: Ints, frame: Ints) -> Iterator[tuple[Ints, Ints]]:
     """The rows of each round, and where in them the rows of each ground truth begin.
 
     Round k holds the k-th ground truth of every frame. `truth` and `frame` ascend: (P,), (P,).
@@ -160,17 +157,17 @@ def _rounds(truth: _Indices, frame: _Indices) -> Iterator[tuple[_Indices, _Indic
         yield rows[low:high], np.cumsum(sizes) - sizes
 
 
-def _first_true(mask: _Mask, starts: _Indices) -> _Mask:
+def _first_true(mask: Mask, starts: Ints) -> Mask:
     """The first true row of each run of rows, in every column: (R, T), starts of the G runs (G,) -> (R, T)."""
     row = np.arange(len(mask), dtype=np.int32)[:, None]
     place = np.where(mask, row, np.int32(len(mask)))
     first = np.minimum.reduceat(place, starts, axis=0)
-    matched: _Mask = row == np.repeat(first, np.diff(starts, append=len(mask)), axis=0)
+    matched: Mask = row == np.repeat(first, np.diff(starts, append=len(mask)), axis=0)
     return matched
 
 
-def _sums(mask: _Mask, values: _Doubles) -> _Doubles:
+def _sums(mask: Mask, values: Floats) -> Floats:
     """Sum of the values (P,) that each column of the mask (P, T) chooses: (T,)."""
     rows, columns = np.nonzero(mask)
-    sums: _Doubles = np.bincount(columns, weights=values[rows], minlength=mask.shape[1]).astype(np.float64)
+    sums: Floats = np.bincount(columns, weights=values[rows], minlength=mask.shape[1]).astype(np.float64)
     return sums

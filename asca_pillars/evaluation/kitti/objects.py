@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti.kitti_labels import KittiObject
-
-_Doubles = NDArray[np.float64]
+from asca_pillars.geometry.arrays import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +37,14 @@ class FrameObjects:
 
     frame_id: str
     types: tuple[str, ...]
-    bbox: _Doubles
-    alpha: _Doubles
-    dimensions_hwl: _Doubles
-    locations: _Doubles
-    rotation_y: _Doubles
-    truncated: _Doubles
-    occluded: _Doubles
-    scores: _Doubles
+    bbox: Floats
+    alpha: Floats
+    dimensions_hwl: Floats
+    locations: Floats
+    rotation_y: Floats
+    truncated: Floats
+    occluded: Floats
+    scores: Floats
 
     def __post_init__(self) -> None:
         count = len(self.types)
@@ -66,7 +65,7 @@ class FrameObjects:
         return np.array([name.casefold() for name in self.types], dtype=np.str_)
 
     @property
-    def distances_m(self) -> _Doubles:
+    def distances_m(self) -> Floats:
         """(N,) horizontal distance from the camera, sqrt(x^2 + z^2), in metres."""
         return np.hypot(self.locations[:, 0], self.locations[:, 2])
 

@@ -1,4 +1,4 @@
-"""Which ground truth and which detections of a frame overlap, for all frames at once.
+"""Pairs of ground truth and detections that overlap, for all frames at once.
 
 Overlaps cost most of the time of an evaluation and depend on no class, difficulty or distance band: they are computed
 once, and only the few pairs are kept that overlap enough to match.
@@ -163,7 +163,7 @@ def _ground_iou(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles]:
 
 
 def _circles_meet(a: _Doubles, b: _Doubles) -> NDArray[np.bool_]:
-    """Which pairs have footprints, and circles around them that meet; objects without a 3D box have sizes of -1."""
+    """Mask of the pairs that have footprints whose circumscribed circles meet; without a 3D box sizes are -1."""
     squared = np.square(a[:, 0] - b[:, 0]) + np.square(a[:, 1] - b[:, 1])
     reach = np.hypot(a[:, 3], a[:, 4]) + np.hypot(b[:, 3], b[:, 4])
     exist = np.min([a[:, 3], a[:, 4], b[:, 3], b[:, 4]], axis=0) > 0

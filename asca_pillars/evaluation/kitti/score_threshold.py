@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asca_pillars.detection.targets import greedy_matches
 from asca_pillars.evaluation.kitti.average_precision import min_overlap as kitti_min_overlap
@@ -31,15 +30,14 @@ from asca_pillars.evaluation.kitti.states import (
     is_type,
     truth_states,
 )
+from asca_pillars.geometry.arrays import Mask
 
 DONT_CARE_SHARE = 0.5  # of a detection's 2D box: in one DontCare area, more makes it ignored
-
-_Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class ScoreMatches:
-    """How N objects and D detections match at a score threshold.
+    """Matches of N objects and D detections at a score threshold.
 
     Attributes:
         frame_id: of the frame; "" for all frames together.
@@ -51,24 +49,24 @@ class ScoreMatches:
     """
 
     frame_id: str
-    counted: _Mask
-    found: _Mask
-    reported: _Mask
-    true_positive: _Mask
-    false_positive: _Mask
+    counted: Mask
+    found: Mask
+    reported: Mask
+    true_positive: Mask
+    false_positive: Mask
 
     @property
-    def missed(self) -> _Mask:
+    def missed(self) -> Mask:
         """(N,) mask of the counted objects that were not found: the false negatives."""
         return self.counted & ~self.found
 
     @property
-    def not_counted(self) -> _Mask:
+    def not_counted(self) -> Mask:
         """(N,) mask of the objects that need not be found."""
         return ~self.counted
 
     @property
-    def ignored(self) -> _Mask:
+    def ignored(self) -> Mask:
         """(D,) mask of the reported detections that are neither true nor false positives."""
         return self.reported & ~self.true_positive & ~self.false_positive
 
@@ -117,7 +115,7 @@ class MatchInput:
 
     frames: Frames
     pairs: Pairs
-    in_dont_care: _Mask
+    in_dont_care: Mask
     scores: Mapping[str, float]
     min_overlap: Mapping[str, float]
 

@@ -1,4 +1,4 @@
-"""Which objects KITTI counts, which it ignores and which it does not see, per class and difficulty.
+"""Objects that KITTI counts, ignores, or treats as absent, per class and difficulty.
 
 An ignored object need not be found, but it takes a detection; an ignored detection is never false, but it takes an
 object. An absent one does neither.
@@ -16,7 +16,7 @@ from asca_pillars.evaluation.kitti.objects import FrameObjects
 
 
 class KittiState(IntEnum):
-    """What the protocol makes of an object at one class, difficulty and distance band."""
+    """State of an object at one class, difficulty and distance band."""
 
     ABSENT = -1
     COUNTED = 0
@@ -30,7 +30,7 @@ _Band = tuple[float, float]
 
 
 class Limits(NamedTuple):
-    """What counts at one difficulty; the limits themselves still count."""
+    """Limits of one difficulty, inclusive."""
 
     min_height_px: float
     max_occluded: int

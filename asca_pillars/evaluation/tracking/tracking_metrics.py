@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asca_pillars.detection.targets import UNMATCHED, best_assignments
+from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
 from asca_pillars.geometry.overlap import iou_3d
-
-_Integers = NDArray[np.int64]
-_Doubles = NDArray[np.float64]
 
 IGNORED_IOU = 0.25
 """A box that takes a label which is not counted, by so much overlap, is not counted either."""
@@ -19,24 +16,24 @@ IGNORED_IOU = 0.25
 class TrackedFrame(NamedTuple):
     """One class in one frame: M labelled and N found identities, none twice."""
 
-    objects: _Integers
+    objects: Ints
     """(M,)."""
-    found: _Integers
+    found: Ints
     """(N,)."""
-    similarity: _Doubles
+    similarity: Floats
     """(M, N) in 0..1: 3D IoU."""
 
 
 class Boxes(NamedTuple):
     """K boxes of one class in one frame, with their identities."""
 
-    boxes: NDArray[np.float32]
+    boxes: Singles
     """(K, 7), LiDAR frame."""
-    ids: _Integers
+    ids: Ints
     """(K,)."""
 
 
-def tracked_frame(labels: Boxes, counted: NDArray[np.bool_], found: Boxes) -> TrackedFrame:
+def tracked_frame(labels: Boxes, counted: Mask, found: Boxes) -> TrackedFrame:
     """Compare the boxes of a frame, without labels that are not counted and without the boxes that found those.
 
     Args:
@@ -95,7 +92,7 @@ def _at(
     """HOTA, DetA, AssA and LocA at one threshold."""
     could_match = _pairs(frames, [frame.similarity >= alpha - _ROUNDING for frame in frames])
     association = {pair: _association(pair, count, objects, found) for pair, count in could_match.items()}
-    matched: list[NDArray[np.bool_]] = []
+    matched: list[Mask] = []
     similarities = 0.0
     for frame in frames:
         allowed = frame.similarity >= alpha - _ROUNDING
@@ -125,8 +122,8 @@ def _association(pair: Pair, both: int, objects: dict[int, int], found: dict[int
     return both / (objects[pair[0]] + found[pair[1]] - both)
 
 
-def _pairs(frames: Sequence[TrackedFrame], masks: Sequence[NDArray[np.bool_]]) -> dict[Pair, int]:
-    """How often each pair of identities is in the masks (M, N) of the frames."""
+def _pairs(frames: Sequence[TrackedFrame], masks: Sequence[Mask]) -> dict[Pair, int]:
+    """Count each pair of identities in the masks (M, N) of the frames."""
     counts: dict[Pair, int] = {}
     for frame, mask in zip(frames, masks, strict=True):
         rows, columns = np.nonzero(mask)

@@ -52,9 +52,9 @@ class TrackingReport:
     frames: int
     frames_found: int
     not_scored: dict[str, int]
-    """How many labels there are of each class that is not scored, because the detector does not know it."""
+    """Number of labels of each class that is not scored, because the detector does not know it."""
     scope: DetectorScope | None
-    """What the detector could have found; None where the predictions do not state it."""
+    """Scope of the detector; None where the predictions do not state it."""
     outside: int
     """Labels of the scored classes that are not counted because they lie outside its ranges."""
     hidden: int
@@ -63,7 +63,7 @@ class TrackingReport:
 
     @property
     def counted(self) -> int:
-        """How many labels are counted."""
+        """Number of labels that count."""
         return sum(one.clear.labels for one in self.scores)
 
 
@@ -138,7 +138,7 @@ def tracking_tables(report: TrackingReport) -> list[TextTable]:
 
 
 def tracking_notes(report: TrackingReport) -> list[str]:
-    """What is to be known beside the numbers."""
+    """Notes for the reader of the numbers."""
     notes = [
         "HOTA and its parts by 3D IoU, means over 0.05 to 0.95 (Luiten et al., 2021); MOTA, switches and fragments at "
         f"3D IoU {CLEAR_IOU:g}.",

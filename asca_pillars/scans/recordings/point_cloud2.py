@@ -9,7 +9,7 @@ from asca_pillars.scans.recordings.messages import decoded, time_of
 from asca_pillars.scans.recordings.other_clouds import foxglove_cloud, livox_cloud, point_cloud, posed
 from asca_pillars.scans.recordings.recording import Message, reason
 from asca_pillars.scans.recordings.scan_types import ScanKind
-from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, wanted_fields
+from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, select_fields
 
 # sensor_msgs/PointField: datatype 1 to 8.
 _DATATYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -87,7 +87,7 @@ def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
             Field(str(field.name), np.dtype(order + _DATATYPES[field.datatype - 1]), max(int(field.count), 1))
         )
         offsets.append(int(field.offset))
-    wanted = wanted_fields(source, fields)
+    wanted = select_fields(source, fields)
     for index in wanted:
         if offsets[index] + fields[index].size_bytes > step:
             raise ScanError(

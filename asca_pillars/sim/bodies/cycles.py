@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.bodies.primitives import (
-    Floats,
     Limb,
     Primitives,
     Surface,
@@ -37,14 +37,14 @@ def _circle() -> Floats:
 
 
 _CIRCLE = _circle()
-# Of a wheel's tread, its tire's side and its spokes: how far each corner lies from the hub, and aside of the wheel.
+# Distances of the corners of tread, tire side and spokes from the hub, as shares of the radius, and sideways.
 _SHARE_OF_RADIUS = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, _RIM, _RIM], [_RIM, _RIM, 0.0, 0.0]])[:, None, :, None]
 _ASIDE = np.zeros((3, 1, 4, 3))
 _ASIDE[0, 0, :, 1] = 0.035, 0.035, -0.035, -0.035
 
 
 class _Frame(NamedTuple):
-    """Where a bicycle's parts meet, metres."""
+    """Joints of a bicycle's frame, metres."""
 
     wheel_radius: float
     hub_x: float  # of the front wheel; the rear one mirrors it

@@ -5,9 +5,9 @@ They are built of ellipsoids with jointed limbs; x ahead, feet on z = 0.
 
 import numpy as np
 
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.bodies.cycles import bicycle
 from asca_pillars.sim.bodies.primitives import (
-    Floats,
     Limb,
     Primitives,
     Surface,
@@ -34,7 +34,7 @@ _WALKER_M = 1.5  # children push nothing
 
 
 def draw_burden(rng: np.random.Generator, height: float, lean_m: float, shoulder_m: float) -> Primitives:
-    """What a person of that height carries, pulls or pushes; often nothing."""
+    """Object that a person of that height carries, pulls or pushes; often nothing."""
     names = (*SHARES, "nothing")
     what = names[int(np.searchsorted(np.cumsum(list(SHARES.values())), rng.random()))]
     side = float(rng.choice([-1.0, 1.0]))

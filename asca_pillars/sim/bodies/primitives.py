@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
-Floats = npt.NDArray[np.float64]
+from asca_pillars.geometry.arrays import Floats
+
 BACKGROUND = -1  # owner of everything that is no labelled object
 
 _CUBE_FACES = np.array(
@@ -19,7 +20,7 @@ _CUBE = _CUBE_FACES[:, _QUAD].ravel()
 
 @dataclass(frozen=True)
 class Surface:
-    """How a material answers a laser.
+    """Reflection of a laser by a material.
 
     Attributes:
         reflectance: 0..1 at normal incidence.
@@ -86,7 +87,7 @@ def _only_triangles(triangles: Floats, surface: Floats) -> Primitives:
     return Primitives(triangles, surface, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
-def quads(corners: npt.ArrayLike, surface: Surface | Floats) -> Primitives:
+def quads(corners: ArrayLike, surface: Surface | Floats) -> Primitives:
     """Flat quadrilaterals: corners (...,4,3) in order around each, metres.
 
     One surface for all, or a table (...,3) of each one's reflectance, gloss, transparency.
@@ -97,7 +98,7 @@ def quads(corners: npt.ArrayLike, surface: Surface | Floats) -> Primitives:
     return _only_triangles(corners.take(_QUAD, axis=1).reshape(-1, 3, 3), np.repeat(table, 2, axis=0))
 
 
-def cuboids(rows: npt.ArrayLike) -> Primitives:
+def cuboids(rows: ArrayLike) -> Primitives:
     """Boxes without a bottom, 10 triangles each.
 
     Rows (N,10) are x, y, bottom z, length, width, height, in metres, yaw in radians, and a surface's reflectance,
@@ -116,7 +117,7 @@ def cuboids(rows: npt.ArrayLike) -> Primitives:
     return _only_triangles(corners.take(_CUBE, axis=1).reshape(-1, 3, 3), np.repeat(rows[:, 7:10], 10, axis=0))
 
 
-def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
+def prisms(rows: ArrayLike, sides: int = 8) -> Primitives:
     """Round posts of 2 * `sides` triangles each, open at both ends (a lid is thinner than a laser's footprint).
 
     Rows (N,9) are x, y, bottom z, height, radius at the foot, radius at the top, in metres, reflectance, and how far
@@ -143,9 +144,7 @@ def prisms(rows: npt.ArrayLike, sides: int = 8) -> Primitives:
     return _only_triangles(corners.take(_QUAD, axis=1).reshape(-1, 3, 3), np.repeat(surface, 2 * sides, axis=0))
 
 
-def ellipsoids(
-    centers: npt.ArrayLike, radii: npt.ArrayLike, surface: Floats, axes: npt.ArrayLike | None = None
-) -> Primitives:
+def ellipsoids(centers: ArrayLike, radii: ArrayLike, surface: Floats, axes: ArrayLike | None = None) -> Primitives:
     """Ellipsoids: centers (E,3), radii (E,3) along the rows of `axes` (E,3,3; default: x, y, z), metres.
 
     Surface (E,3) is reflectance, gloss, density per metre (0 is solid).
@@ -159,7 +158,7 @@ def ellipsoids(
 
 
 def limbs(
-    start: npt.ArrayLike, end: npt.ArrayLike, radii: npt.ArrayLike, surface: Floats, side: tuple[float, float, float]
+    start: ArrayLike, end: ArrayLike, radii: ArrayLike, surface: Floats, side: tuple[float, float, float]
 ) -> Primitives:
     """Long ellipsoids from `start` to `end` (N,3), with radii (N,2): along `side` and across it; all in metres."""
     start, end = np.asarray(start, float), np.asarray(end, float)
@@ -188,7 +187,7 @@ def _lengths(vectors: Floats) -> Floats:
 
 
 # From, to, radius sideways, radius across, surface.
-Limb = tuple[npt.ArrayLike, npt.ArrayLike, float, float, Floats]
+Limb = tuple[ArrayLike, ArrayLike, float, float, Floats]
 
 
 def draw_cloth(rng: np.random.Generator, n: int, dark_share: float = 0.1) -> Floats:

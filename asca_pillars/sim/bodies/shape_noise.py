@@ -3,18 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
+from asca_pillars.geometry.arrays import Floats, Mask
 from asca_pillars.sim.bodies.primitives import Primitives
 
-Floats = npt.NDArray[np.float64]
 _WAVES = 2
 _WAVELENGTH_M = 1.0, 5.0
 _FEET_M = 0.5  # below, displacements fade towards the ground, on which a body stands
 _PATCH_M = 0.15, 0.45
 
 
-def scaled(body: Primitives, factors: npt.ArrayLike) -> Primitives:
+def scaled(body: Primitives, factors: ArrayLike) -> Primitives:
     """The body stretched about its origin by `factors` (3,) along x, y and z."""
     by = np.asarray(factors, float)
     return replace(
@@ -53,7 +53,7 @@ def darkened(rng: np.random.Generator, body: Primitives) -> Primitives:
     dark = np.linalg.norm(middles - around, axis=1) < rng.uniform(*_PATCH_M)
     first = len(body.triangles)
 
-    def without(surface: Floats, which: npt.NDArray[np.bool_]) -> Floats:
+    def without(surface: Floats, which: Mask) -> Floats:
         surface = surface.copy()
         surface[which, 0] = 0.0
         return surface

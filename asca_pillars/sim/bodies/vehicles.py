@@ -6,12 +6,12 @@ x ahead, wheels on z = 0.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, quads
 from asca_pillars.sim.bodies.styles import Paint, Profile, draw_paint
 
-Floats = npt.NDArray[np.float64]
 MIRROR = np.array([1.0, -1.0, 1.0])
 _SPOKES = 10
 
@@ -117,7 +117,7 @@ def _sections(hull: _Hull, x: Floats) -> Floats:
 
 
 def _bow(hull: _Hull, x: Floats, y_m: Floats) -> Floats:
-    """How far a section's points at `y_m` stand ahead of its middle, metres."""
+    """Distance by which a section's points at `y_m` stand ahead of its middle, metres."""
     outward = (y_m / (hull.width / 2)) ** 2
     return outward * (
         hull.tail_bow * np.maximum(1 - (1 - x) / 0.3, 0) - hull.nose_bow * np.maximum(1 - x / 0.45, 0) ** 1.5
@@ -127,7 +127,7 @@ def _bow(hull: _Hull, x: Floats, y_m: Floats) -> Floats:
 def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """The left half of a body: corners (Q,4,3) and surfaces (Q,3)."""
     profile, top = hull.profile, np.array(hull.profile.top)
-    # What a pane does not let through it mirrors away: most windows of KITTI's cars are holes.
+    # A pane mirrors the light that it does not let through: most windows of KITTI's cars are holes.
     pane = Surface(0.05, 15.0, float(rng.uniform(0.1, 0.7)))
     # Side windows are dirty, tinted, or show a frame where the outline has none: half as many returns as from a door.
     window = Surface(0.05, float(np.exp(rng.uniform(np.log(0.3), np.log(12.0)))), float(rng.uniform(0.05, 0.6)))
@@ -181,7 +181,7 @@ def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
     return _panels(np.stack([along, y, z], axis=2))
 
 
-def wheels(x_m: npt.ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
+def wheels(x_m: ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
     """A wheel at each x on both sides: tyre tread, and a dark sidewall around a rim that shines more or less."""
     rubber = Surface(float(np.exp(rng.uniform(np.log(0.01), np.log(0.06)))), 0.3)
     rim = Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.5)))), 0.6)
@@ -292,7 +292,7 @@ def bus_body(rng: np.random.Generator, length: float, width: float, height: floa
 
 
 def trailer_body(rng: np.random.Generator, length: float, width: float, height: float) -> Primitives:
-    """What KITTI calls Misc: a trailer, a caravan or a container."""
+    """An object of KITTI's type Misc: a trailer, a caravan or a container."""
     paint = draw_paint(rng, 0.2).upright
     foot = min(0.4, 0.3 * height)
     rows = [

@@ -1,1 +1,1 @@
-"""What every firing of the sensor hits."""
+"""Ray casting: the surface that every firing of the sensor hits."""

@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from asca_pillars.base.compiling import cached
+from asca_pillars.geometry.arrays import Floats, Ints
 from asca_pillars.sim.casting.rays import (
     PLAIN,
     TURN,
@@ -20,8 +20,6 @@ from asca_pillars.sim.casting.rays import (
     window_of,
 )
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 TUFT_M = 0.2
 LONE_LEAVES = 0.35  # share of the rays through a cloud that meet it by a chance of their own
 _NEAR_AXIS_M = 0.3
@@ -30,7 +28,7 @@ _FACING_SALT, _TUFT_SALT = 100_000_000, 200_000_000
 
 
 class Extent(NamedTuple):
-    """How far an ellipsoid reaches from its center, metres."""
+    """Half extents of an ellipsoid, metres."""
 
     up: float
     flat: float  # along the ground, at most
@@ -102,7 +100,7 @@ def leaves_of(density_per_m: float, distance: float, slope: Floats, columns_per_
 
 @cached(inline="always", **PLAIN)
 def leaf_chance(leaves: Leaves, k: int, j: int, salt: int, key: int) -> float:
-    """What decides how far a ray gets into a cloud: its own chance, or that of its tuft."""
+    """Random number that decides how far a ray gets into a cloud: its own, or that of its tuft."""
     chance = ray_chance(key, k, j, salt)
     if chance < LONE_LEAVES:
         return chance / LONE_LEAVES
@@ -154,7 +152,7 @@ def cast_ellipsoids(
             if first >= last:
                 continue
             cos, sin, dz, up = cos_phase[k], sin_phase[k], slopes[k], origins[k] - center[2]
-            # Where the rays of the ring start in the unit frame of the ellipsoid.
+            # Origins of the rays of the ring in the unit frame of the ellipsoid.
             p0 = m[0, 2] * up - m[0, 0] * center[0] - m[0, 1] * center[1]
             p1 = m[1, 2] * up - m[1, 0] * center[0] - m[1, 1] * center[1]
             p2 = m[2, 2] * up - m[2, 0] * center[0] - m[2, 1] * center[1]

@@ -3,12 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import cached
+from asca_pillars.geometry.arrays import Floats, Mask
 from asca_pillars.sim.casting.rays import PLAIN, NearestHits, Rays, ray_chance
-
-Floats = npt.NDArray[np.float64]
 
 GROUND = -2  # owner of what the ground returns
 BANK_RUN_M = 6.0  # a bank rises over this way and is level beyond
@@ -21,9 +20,9 @@ ASPHALT, PAVEMENT, VERGE, MARKING, RAIL, BALLAST = range(6)
 
 
 class Street(NamedTuple):
-    """What the ground of a street looks like: metres, slopes and radians, in road coordinates (`world.ground`).
+    """Shape of the ground of a street: metres, slopes and radians, in road coordinates (`world.ground`).
 
-    What is 0 is absent.
+    Parts with size 0 are absent.
     """
 
     yaw_rad: float
@@ -87,7 +86,7 @@ def road_distances(x: float, y: float, street: Street) -> tuple[float, float, fl
 
 @cached(**PLAIN)
 def outside_roads(points: Floats, street: Street) -> Floats:
-    """How far each of (N,2) points lies outside all roads (negative inside), metres."""
+    """Distance of each of (N,2) points to the outside of all roads (negative inside), metres."""
     result = np.empty(len(points))
     for i in range(len(points)):
         _, _, _, _, result[i] = road_distances(points[i, 0], points[i, 1], street)
@@ -182,8 +181,6 @@ def highest_within(relief: Floats, along_m: float) -> Floats:
     return highest
 
 
-Bools = npt.NDArray[np.bool_]
-
 GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
 CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
 LOW_M = 0.45  # less high it looks where its neighbor met the ground
@@ -223,7 +220,7 @@ def gap_at(ray: GroundRay, reach: float, street: Street, relief: Floats, z_m: fl
 
 @cached(**PLAIN)
 def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: float) -> float:
-    """How many metres a ray of this height and slope stays above everything, in whatever direction.
+    """Distance in metres over which a ray of this height and slope stays above everything, in whatever direction.
 
     `highest` (rings,) is the highest relief in each ring of cells around the car.
     """
@@ -313,7 +310,7 @@ def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relie
 
 
 @cached(**PLAIN)
-def are_needed(outside: Bools, owner: npt.NDArray[np.int32], k: int, first: int, last: int) -> bool:
+def are_needed(outside: Mask, owner: NDArray[np.int32], k: int, first: int, last: int) -> bool:
     """Whether it matters what ground columns [first, last) of ring k meet.
 
     It does for an object, which the ground may hide, and beside a ray that is asked for, which may lean over an edge;
@@ -349,7 +346,7 @@ def cast_ground(
     for k in range(len(slopes)):
         up, slope, cos, sin = origins[k], slopes[k], cos_phase[k], sin_phase[k]
         start = first_distance(up, slope, highest, street.rise_m, z_m)
-        # What a neighbor met holds for this ray, too. Neighbors come in small groups, so that a ray does not depend on
+        # A neighbor's hit holds for this ray, too. Neighbors come in small groups, so that a ray does not depend on
         # whether those far from it are cast.
         clear, expected = start, 0.0
         last, needed = 0, False

@@ -9,8 +9,9 @@ the others return.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
+from asca_pillars.geometry.arrays import Floats, Ints, Singles
 from asca_pillars.sim.bodies.primitives import Primitives
 from asca_pillars.sim.casting.ellipsoidcast import cast_ellipsoids
 from asca_pillars.sim.casting.groundcast import cast_ground
@@ -19,26 +20,22 @@ from asca_pillars.sim.casting.trianglecast import cast_triangles
 from asca_pillars.sim.sensor.lidar import Firings
 from asca_pillars.sim.world.ground import Ground
 
-Floats = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int64]
-
 __all__ = ["NOTHING", "Bodies", "Hits", "cast"]
 
 
 class Hits(NamedTuple):
-    """What each firing (K rings, C columns) met first."""
+    """First hit of each firing (K rings, C columns)."""
 
     rho_m: Floats  # (K,C) horizontal distance from the sensor's axis; inf for nothing
     cosine: Singles  # (K,C) of the angle of incidence
     reflectance: Singles  # (K,C) of the material at this incidence
-    owner: npt.NDArray[np.int32]  # (K,C) object index, BACKGROUND, GROUND or NOTHING
+    owner: NDArray[np.int32]  # (K,C) object index, BACKGROUND, GROUND or NOTHING
     alone: Ints  # (objects,) counted firings that would hit the object if it stood alone
     visible: Ints  # (objects,) those that do hit it
 
 
 class Bodies(NamedTuple):
-    """What is cast at: primitives, each with its owner and a salt.
+    """Geometry to cast at: primitives, each with its owner and a salt.
 
     The owner is an object's index or BACKGROUND; objects are in one run each. The salt is the number that tells a
     primitive's chance (glass, foliage) from that of the others.

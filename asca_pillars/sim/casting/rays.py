@@ -1,4 +1,4 @@
-"""What the compiled casters share: the rays of a scan, which of them can meet a body, and the nearest hit of each.
+"""Parts that the compiled casters share: the rays of a scan, those that can meet a body, and the nearest hit of each.
 
 numba reads named tuples by name. Compiled code is cached per file, and numba does not notice a change of another file:
 delete the __pycache__ folders after a change here.
@@ -7,19 +7,18 @@ delete the __pycache__ folders after a change here.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import cached
+from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
 from asca_pillars.sim.sensor.lidar import Firings
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 NOTHING = -3  # owner of a firing that met nothing
 _BEYOND_RAD = 0.02  # columns are cast a little beyond the wedge: ring phases turn them by up to one firing
 
 
 class RayLimits(NamedTuple):
-    """What tells which rays can meet a body. It is small: numba copies whole tuples from function to function."""
+    """Bounds that tell which rays can meet a body. Small: numba copies whole tuples from function to function."""
 
     slope: Floats  # (K,) tan(elevation), falling
     lowest_origin_m: float
@@ -39,23 +38,23 @@ class Rays(NamedTuple):
     sin_phase: Floats  # (K,)
     cos_azimuth: Floats  # (C,)
     sin_azimuth: Floats  # (C,)
-    first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
-    number: npt.NDArray[np.int64]  # (C,) of each column within the whole revolution
+    first_column: Ints  # (counts + 1,) first column at or after an encoder count
+    number: Ints  # (C,) of each column within the whole revolution
     columns_per_turn: int
-    outside: Bools  # (K,C) rays of which it is asked only whether they meet an object
-    counted: Bools  # (C,) columns that count for `NearestHits.alone`
+    outside: Mask  # (K,C) rays of which it is asked only whether they meet an object
+    counted: Mask  # (C,) columns that count for `NearestHits.alone`
     limits: RayLimits
 
 
 class NearestHits(NamedTuple):
-    """What each ray met first so far, (K,C), written by the casters."""
+    """Nearest hit of each ray so far, (K,C), written by the casters."""
 
     rho_m: Floats  # horizontal distance; inf for nothing
-    cosine: npt.NDArray[np.float32]  # of the angle of incidence
-    reflectance: npt.NDArray[np.float32]
-    owner: npt.NDArray[np.int32]
-    stamp: npt.NDArray[np.int32]  # the object for which the ray was last counted in `alone`
-    alone: npt.NDArray[np.int64]  # (objects,) counted rays that an object would stop if it stood alone
+    cosine: Singles  # of the angle of incidence
+    reflectance: Singles
+    owner: NDArray[np.int32]
+    stamp: NDArray[np.int32]  # the object for which the ray was last counted in `alone`
+    alone: Ints  # (objects,) counted rays that an object would stop if it stood alone
 
 
 def rays_of(firings: Firings) -> Rays:
@@ -100,7 +99,6 @@ def no_hits(firings: Firings, objects: int) -> NearestHits:
     )
 
 
-Ints = npt.NDArray[np.int64]
 PLAIN = {"error_model": "numpy"}  # NumPy's division, which does not look out for zeros
 TURN = 2 * np.pi - 1e-9
 

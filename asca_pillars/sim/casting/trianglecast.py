@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from asca_pillars.base.compiling import cached
+from asca_pillars.geometry.arrays import Floats, Ints
 from asca_pillars.sim.casting.rays import (
     PLAIN,
     TURN,
@@ -19,9 +19,6 @@ from asca_pillars.sim.casting.rays import (
     rings_of,
     window_of,
 )
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class Edge(NamedTuple):

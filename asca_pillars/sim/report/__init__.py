@@ -1,1 +1,1 @@
-"""How like real scans a data set is: measured from any KITTI-layout folder and compared with KITTI's own statistics."""
+"""Realism report: statistics of any KITTI-layout folder, compared with those of KITTI."""

@@ -177,18 +177,18 @@ class Row:
 
     @property
     def away(self) -> float:
-        """How far the value is from that of two equal sets."""
+        """Distance of the value from that of two equal sets."""
         return abs(self.value - 1) if self.measure == "ratio" else abs(self.value)
 
     @property
-    def excused(self) -> bool:
-        """Whether a bar is missed by no more than chance would: better cannot be told from as little real data."""
+    def within_noise(self) -> bool:
+        """Whether a bar is missed by no more than the noise of so little real data."""
         return self.within is False and self.noise is not None and self.away <= self.noise
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The rows, and in words which could not be made and why."""
+    """The rows, and sentences about rows that could not be made."""
 
     real: Statistics
     simulated: Statistics
@@ -274,14 +274,14 @@ def _fit_rows(real: Statistics, ours: Statistics) -> Iterator[Row]:
     for name, drives in real.label_fit.items():
         if name not in ours.label_fit:
             continue
-        (own,) = ours.label_fit[name]
+        (fit,) = ours.label_fit[name]
         middle = float(np.median([drive.middle for drive in drives]))
         spread = max(abs(drive.middle - middle) for drive in drives)
         # A normal distribution holds four fifths of itself within 1.28 deviations; medians scatter by 1.25 / sqrt(n).
-        noise = 1.25 * (own.high - own.low) / 2.56 / np.sqrt(own.objects)
+        noise = 1.25 * (fit.high - fit.low) / 2.56 / np.sqrt(fit.objects)
         bar = max(spread, MIN_FIT_BAR) if len(drives) >= MIN_DRIVES else None
         group = "where points lie in their labels (m, shares)"
-        yield Row(group, name, middle, own.middle, "difference", own.middle - middle, bar, float(noise))
+        yield Row(group, name, middle, fit.middle, "difference", fit.middle - middle, bar, float(noise))
 
 
 def _label_rows(name: str, real: Statistics, ours: Statistics) -> Iterator[Row]:

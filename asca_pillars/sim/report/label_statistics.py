@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.evaluation.errors.label_fit import STATISTICS, label_fit, view_angle_deg
+from asca_pillars.geometry.arrays import Floats, Ints, Singles
 from asca_pillars.sim.report.reference import (
     BAND_M,
     BANDS,
@@ -36,7 +37,7 @@ def label_statistics(split: KittiSplit, frame_ids: Sequence[str]) -> tuple[dict[
     """
     per_frame = {name: np.zeros(len(frame_ids), np.int64) for name in CLASSES}
     objects: dict[str, list[KittiObject]] = {name: [] for name in CLASSES}
-    boxes: dict[str, list[NDArray[np.float32]]] = {name: [] for name in CLASSES}
+    boxes: dict[str, list[Singles]] = {name: [] for name in CLASSES}
     dont_care = 0
     for index, frame_id in enumerate(frame_ids):
         everything = split.objects(frame_id)
@@ -55,9 +56,7 @@ def label_statistics(split: KittiSplit, frame_ids: Sequence[str]) -> tuple[dict[
     return of_class, dont_care / len(frame_ids)
 
 
-def _of_class(
-    objects: Sequence[KittiObject], boxes: NDArray[np.float64], per_frame: NDArray[np.int64]
-) -> LabelStatistics:
+def _of_class(objects: Sequence[KittiObject], boxes: Floats, per_frame: Ints) -> LabelStatistics:
     x, y, z, length, width, height, yaw = boxes.T
     range_m = np.hypot(x, y)
     truncated = np.array([item.truncated for item in objects])
@@ -84,12 +83,12 @@ def _counts(values: NDArray[np.number], bins: int) -> tuple[int, ...]:
     return tuple(np.bincount(values.astype(np.int64), minlength=bins).tolist())
 
 
-def _spread(values: NDArray[np.float64]) -> Spread:
+def _spread(values: Floats) -> Spread:
     percentiles = tuple(np.percentile(values, PERCENTILES).tolist())
     return Spread(float(values.mean()), float(values.std()), percentiles)
 
 
-def _band(values: NDArray[np.float64]) -> Band | None:
+def _band(values: Floats) -> Band | None:
     return Band(float(values.mean()), float(values.std())) if len(values) else None
 
 
@@ -122,8 +121,6 @@ _BESIDE_FRONT_SEATS = -0.25, 0.05  # shares of the length ahead of the center
 _FLANK_M = 0.3
 _MIN_DOOR_POINTS = 9
 
-Floats = NDArray[np.float64]
-
 
 def object_fits(
     points: NDArray[np.floating], objects: Sequence[KittiObject], boxes: NDArray[np.floating]
@@ -137,12 +134,12 @@ def object_fits(
     """
     whole = np.array([item.occluded == 0 and item.truncated <= _MAX_TRUNCATION for item in objects], bool)
     names = np.array([item.type for item in objects])
-    found = {}
+    samples = {}
     for name in CLASSES:
-        mine = boxes[whole & (names == name)] if len(objects) else boxes[:0]
-        windows = [window_returns(points, box.astype(np.float64)) if name == "Car" else np.nan for box in mine]
-        found[name] = np.column_stack([label_fit(points, mine), windows]).reshape(-1, len(COLUMNS))
-    return found
+        of_class = boxes[whole & (names == name)] if len(objects) else boxes[:0]
+        windows = [window_returns(points, box.astype(np.float64)) if name == "Car" else np.nan for box in of_class]
+        samples[name] = np.column_stack([label_fit(points, of_class), windows]).reshape(-1, len(COLUMNS))
+    return samples
 
 
 def window_returns(points: NDArray[np.floating], box: Floats) -> float:
@@ -154,8 +151,8 @@ def window_returns(points: NDArray[np.floating], box: Floats) -> float:
     along, across = offset @ (np.cos(yaw), np.sin(yaw)) / length, np.abs(offset @ (-np.sin(yaw), np.cos(yaw)))
     up = (points[:, 2] - z) / height + 0.5
     first, last = _BESIDE_FRONT_SEATS
-    beside = (along > first) & (along < last) & (across > width / 2 - _FLANK_M) & (across < width / 2 + _FLANK_M)
-    windows, doors = (int((beside & (up > low) & (up < high)).sum()) for low, high in (_WINDOWS, _DOORS))
+    flank = (along > first) & (along < last) & (across > width / 2 - _FLANK_M) & (across < width / 2 + _FLANK_M)
+    windows, doors = (int((flank & (up > low) & (up < high)).sum()) for low, high in (_WINDOWS, _DOORS))
     if doors < _MIN_DOOR_POINTS:
         return float("nan")
     return windows / doors * (_DOORS[1] - _DOORS[0]) / (_WINDOWS[1] - _WINDOWS[0])

@@ -58,7 +58,7 @@ class ObjectRecord(NamedTuple):
 
 
 def record_objects(
-    points: _Points, objects: Sequence[KittiObject], boxes: NDArray[np.float32], found: Detections | None
+    points: _Points, objects: Sequence[KittiObject], boxes: NDArray[np.float32], detections: Detections | None
 ) -> list[ObjectRecord]:
     """Records of the objects of CLASSES that have returns.
 
@@ -66,11 +66,11 @@ def record_objects(
         points: (N, 4) of the scan, LiDAR frame.
         objects: M labels with a 3D box.
         boxes: (M, 7) of these, LiDAR frame.
-        found: what a detector finds in the scan, if one was asked.
+        detections: detections in the scan; None without a detector.
     """
     inside = points_in_boxes(points, boxes)
     return [
-        _record(item.type, item.occluded, box, points[mask], found)
+        _record(item.type, item.occluded, box, points[mask], detections)
         for item, box, mask in zip(objects, boxes.astype(np.float64), inside.T, strict=True)
         if item.type in CLASSES and mask.any()
     ]
@@ -82,7 +82,7 @@ def seen_objects(objects: Sequence[KittiObject]) -> list[KittiObject]:
 
 
 def _record(
-    name: str, occluded: int, box: NDArray[np.float64], points: _Points, found: Detections | None
+    name: str, occluded: int, box: NDArray[np.float64], points: _Points, detections: Detections | None
 ) -> ObjectRecord:
     x, y, z, _, _, height, yaw = box
     aside = abs(float(wrap_angle(yaw - np.arctan2(y, x))))
@@ -102,12 +102,12 @@ def _record(
         length_m=float(np.ptp(along)),
         bright=float(np.mean(points[:, 3] >= BRIGHT)),
         pillars=float(len(cells)),
-        score=float("nan") if found is None else _score(name, box, found),
+        score=float("nan") if detections is None else _score(name, box, detections),
     )
 
 
-def _score(name: str, box: NDArray[np.float64], found: Detections) -> float:
-    of_class = found[np.array([other == name for other in found.names], bool)]
+def _score(name: str, box: NDArray[np.float64], detections: Detections) -> float:
+    of_class = detections[np.array([other == name for other in detections.names], bool)]
     if not len(of_class):
         return 0.0
     overlap = bev_iou(box[None].astype(np.float32), of_class.boxes)[0]
@@ -195,7 +195,7 @@ def percentiles(value: NDArray[np.float64], among: NDArray[np.float64]) -> NDArr
 
 
 def _place(records: Sequence[ObjectRecord], like_points: bool) -> NDArray[np.float64]:
-    """Where objects lie among others (N, 3 or 4), in the spans that count alike."""
+    """Positions of objects in the space of matching (N, 3 or 4), each axis in units of its span."""
     columns = [
         [np.log(record.distance_m) / DISTANCE_SPAN for record in records],
         [record.view_deg / VIEW_SPAN_DEG for record in records],
@@ -279,7 +279,7 @@ class FiringRow:
 
 
 def find_clusters(
-    points: NDArray[np.float32], ignored: NDArray[np.bool_], labelled: NDArray[np.float32], found: Detections
+    points: NDArray[np.float32], ignored: NDArray[np.bool_], labelled: NDArray[np.float32], detections: Detections
 ) -> list[Cluster]:
     """Clusters of at least _MIN_POINTS returns above the ground that touch no labelled box, widened a little.
 
@@ -287,7 +287,7 @@ def find_clusters(
         points: (N, 4), LiDAR frame.
         ignored: (N,) mask of points in DontCare areas, whose objects are not labelled.
         labelled: (M, 7) boxes of everything that has a label, LiDAR frame.
-        found: what the detector finds.
+        detections: detections in the scan.
     """
     ground = fit_ground(points)
     if ground is None:
@@ -301,8 +301,8 @@ def find_clusters(
     label = connected(body[:, :2])
     order = np.argsort(label, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
-    persons = np.array([name in ("Pedestrian", "Cyclist") for name in found.names], bool)
-    firing = found.boxes[persons & (found.scores >= FIRING_SCORE), :2]
+    persons = np.array([name in ("Pedestrian", "Cyclist") for name in detections.names], bool)
+    firing = detections.boxes[persons & (detections.scores >= FIRING_SCORE), :2]
     return [_cluster(body[part], height[part], firing) for part in parts if len(part) >= _MIN_POINTS]
 
 
@@ -331,8 +331,8 @@ def firing_rows(clusters: Sequence[Cluster], frames: int) -> list[FiringRow]:
 
 def _cluster(points: NDArray[np.float32], height: NDArray[np.float64], firing: NDArray[np.float32]) -> Cluster:
     (x, y), sides, _ = cv2.minAreaRect(np.ascontiguousarray(points[:, :2]))
-    near = np.hypot(firing[:, 0] - x, firing[:, 1] - y) < _NEAR_M
-    return Cluster(x, y, float(height.max()), max(sides), float(points[:, 3].mean()), bool(near.any()))
+    fires = np.hypot(firing[:, 0] - x, firing[:, 1] - y) < _NEAR_M
+    return Cluster(x, y, float(height.max()), max(sides), float(points[:, 3].mean()), bool(fires.any()))
 
 
 Detect = Callable[[NDArray[np.float32]], Detections]
@@ -343,7 +343,7 @@ MIN_SCORE = 0.02
 
 @dataclass(frozen=True)
 class Side:
-    """What was measured in the frames of one folder."""
+    """Measurements of the frames of one folder."""
 
     source: str
     frames: int
@@ -394,11 +394,11 @@ def measure_side(root: str | Path, detect: Detect | None, title: str) -> Side:
         everything = split.objects(ids[index])
         objects = seen_objects(everything)
         boxes = boxes_from_objects(objects, calibration)
-        found = None if detect is None else detect(points)
-        records += record_objects(points, objects, boxes, found)
-        if found is not None:
+        detections = None if detect is None else detect(points)
+        records += record_objects(points, objects, boxes, detections)
+        if detections is not None:
             ignored = _in_areas(points, [o.bbox for o in everything if o.type == "DontCare"], calibration)
-            clusters += find_clusters(points, ignored, boxes, found)
+            clusters += find_clusters(points, ignored, boxes, detections)
     return Side(str(root), len(chosen), records, None if detect is None else clusters)
 
 
@@ -433,7 +433,7 @@ def compare_like_for_like(
 def _in_areas(
     points: NDArray[np.float32], areas: Sequence[tuple[float, float, float, float]], calibration: Calibration
 ) -> NDArray[np.bool_]:
-    """Which points (N, 4), all of them in the image, lie in one of the areas x1, y1, x2, y2 of it."""
+    """Mask of the points (N, 4), all of them in the image, in one of its areas x1, y1, x2, y2."""
     u, v = calibration.project(points)[0].T
     inside = np.zeros(len(points), bool)
     for x1, y1, x2, y2 in areas:

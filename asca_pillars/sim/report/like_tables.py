@@ -49,7 +49,7 @@ def print_like(result: LikeForLike, console: Console) -> None:
 
 
 def title(result: LikeForLike) -> str:
-    """What is compared."""
+    """Title of the report: the two sets that are compared."""
     return (
         f"{result.simulated.source} ({result.simulated.frames} frames) beside objects of {result.real.source} "
         f"({result.real.frames} frames), like with like"
@@ -57,7 +57,7 @@ def title(result: LikeForLike) -> str:
 
 
 def notes(result: LikeForLike) -> list[str]:
-    """How to read the tables."""
+    """Notes for the reader of the tables."""
     lines = [
         f"Each real object is compared with the {NEIGHBORS} simulated ones of its class that are nearest to it in "
         "distance, angle of view and occlusion (for scores, in points, too); of points and pillars geometric means.",

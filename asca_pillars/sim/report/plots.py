@@ -97,8 +97,8 @@ def _cars(comparison: Comparison, measured: Measured) -> "Figure":
             label = f"{style['label']}, fitted to {fit.cars} cars up to {end_m:.0f} m"
             plot.plot(ranges_m, points, line, color=style["color"], label=label)
             plot.fill_between(ranges_m, points / factor, points * factor, color=style["color"], alpha=0.12)
-    if (near := comparison.real.scan.near_car_fit) is not None:
-        at = np.array([near.points_at(range_m) for range_m in BARRED_RANGES_M])
+    if (fit := comparison.real.scan.near_car_fit) is not None:
+        at = np.array([fit.points_at(range_m) for range_m in BARRED_RANGES_M])
         plot.errorbar(
             BARRED_RANGES_M, at, RATIO_BAR * at, fmt="none", color="black", capsize=4, label="bars, near cars"
         )
@@ -111,7 +111,7 @@ def _cars(comparison: Comparison, measured: Measured) -> "Figure":
 
 
 def _scans(comparison: Comparison, sensor: Sensor) -> "Figure":
-    """Where the returns of whole scans are."""
+    """Distribution of the returns of whole scans."""
     real, ours = comparison.real.scan, comparison.simulated.scan
     figure, (rings, sectors, ranges, heights, reflectances, last) = new_figure(2, 3, 5.0, 3.4)
     for side, style in ((real, _REAL), (ours, _OURS)):

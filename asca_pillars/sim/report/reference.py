@@ -23,7 +23,7 @@ REFLECTANCES = 100  # 0.00 to 0.99
 MAX_PER_FRAME = 20
 PERCENTILES = (5, 25, 50, 75, 95)
 CAR_FIT_RANGE_M = (12.0, 70.0)
-"""Where KITTI's cars of the fit stand. A power law holds piecewise only: fits are alike over the same span alone."""
+"""Range of KITTI's cars in the fit. A power law holds piecewise only: fits are alike over the same span alone."""
 NEAR_CARS_M = (12.0, 50.0)
 """Beyond, cars have so few returns that one more or less turns the whole line, and many have no label."""
 TRUNCATION_EDGES = (0.0, 0.15, 0.30, 0.50)  # shares above the last are the fifth group
@@ -31,7 +31,7 @@ TRUNCATION_EDGES = (0.0, 0.15, 0.30, 0.50)  # shares above the last are the fift
 
 @dataclass(frozen=True)
 class Spread(Strict):
-    """How a quantity is distributed; percentiles are those of PERCENTILES."""
+    """Distribution of a quantity; percentiles are those of PERCENTILES."""
 
     mean: float
     std: float
@@ -83,7 +83,7 @@ class CarFit(Strict):
 
 @dataclass(frozen=True)
 class ScanStatistics(Strict):
-    """Of scans; what is not said to be otherwise is a mean over the scans.
+    """Statistics of scans; unless stated otherwise, means over the scans.
 
     Attributes:
         scans: how many were measured.
@@ -115,7 +115,7 @@ class ScanStatistics(Strict):
 
 @dataclass(frozen=True)
 class LabelStatistics(Strict):
-    """Of the labels of one class; boxes in the LiDAR frame.
+    """Statistics of the labels of one class; boxes in the LiDAR frame.
 
     Attributes:
         count: labelled objects.
@@ -166,7 +166,7 @@ class Fit(Strict):
 
 @dataclass(frozen=True)
 class Statistics(Strict):
-    """Of a data set: its scans, the labels of CLASSES (those of which there are any), and DontCare areas per frame.
+    """Statistics of a data set: its scans, the labels of CLASSES that occur, and DontCare areas per frame.
 
     `label_fit` tells by "Car flank_end" and the like how labels lie around points: of KITTI drive by drive, because
     the cars of a drive are few and one annotator's.
@@ -199,7 +199,7 @@ class Reference(Strict):
 
 @cache
 def kitti_reference() -> Reference:
-    """What real scans are like: the statistics of KITTI that the package carries."""
+    """Statistics of real scans: those of KITTI that the package carries."""
     name = "kitti_statistics.json"
     text = resources.files("asca_pillars.sim").joinpath(name).read_text(encoding="utf-8")
     return parse(Reference, json.loads(text), name)

@@ -42,7 +42,7 @@ _Floats = NDArray[np.floating[Any]]
 
 
 def ground_mask(points: _Floats) -> NDArray[np.bool_]:
-    """Which points (N, >=3), LiDAR frame in metres, are ground: (N,) bool, all false where no plane is to be seen."""
+    """Mask (N,) of the ground points among (N, >=3), LiDAR frame in metres; all false where no plane is to be seen."""
     x, y, z = points[:, :3].astype(np.float32).T
     radius = np.hypot(x, y)
     plane = most_common_ground(points[radius < _PLANE_REACH_M])
@@ -82,8 +82,8 @@ def most_common_ground(points: _Floats) -> NDArray[np.float64] | None:
     if len(planes) == 0:
         return None
     lifted = np.column_stack([sample[:, :2], np.ones(len(sample))])
-    near = np.abs(sample[:, 2:] - lifted @ planes.T) < _GROUND_M
-    inliers = near[:, near.sum(axis=0).argmax()]
+    inliers_of = np.abs(sample[:, 2:] - lifted @ planes.T) < _GROUND_M
+    inliers = inliers_of[:, inliers_of.sum(axis=0).argmax()]
     return np.asarray(np.linalg.lstsq(lifted[inliers], sample[inliers, 2], rcond=None)[0])
 
 
@@ -107,7 +107,7 @@ _Counts = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ScanRecord:
-    """What one scan adds to the statistics.
+    """Contribution of one scan to the statistics.
 
     Attributes:
         points, in_camera, ground, ground_in_camera: returns.
@@ -223,7 +223,7 @@ def fit_cars(cars: NDArray[np.float64], span_m: tuple[float, float]) -> CarFit |
 
 
 def ring_counts(points: NDArray[np.floating[Any]], sensor: Sensor) -> _Counts:
-    """How many returns each ring has, counts (rings,) from the top, of a whole revolution (N, >=3).
+    """Number of returns of each ring, counts (rings,) from the top, of a whole revolution (N, >=3).
 
     KITTI's files hold ring after ring, each from azimuth 0 on, counter-clockwise: where the azimuth falls back, the
     next ring begins. In files of another order a return belongs to the ring of `sensor` whose beam passes nearest.

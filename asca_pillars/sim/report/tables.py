@@ -46,20 +46,20 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
 
 
 def title(comparison: Comparison) -> str:
-    """What is compared."""
+    """Title of the report: the sets that are compared."""
     ours, scan = comparison.simulated, comparison.simulated.scan
     return f"{ours.source}: {scan.scans} scans and the labels of {ours.frames} frames, beside KITTI"
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """How many bars are kept, what was left out, and how to read the distances."""
+    """Notes for the reader: bars kept, parts left out, and the meaning of the distances."""
     barred = [row for row in comparison.rows if row.within is not None]
     missed = "; ".join(row.name for row in comparison.missed)
-    excused = "; ".join(row.name for row in comparison.missed if row.excused)
+    noisy = "; ".join(row.name for row in comparison.missed if row.within_noise)
     return [
         f"{len(barred) - len(comparison.missed)} of {len(barred)} bars kept"
         + (f"; missed: {missed}" if missed else ""),
-        *([f"Missed, but no farther off than chance: {excused}"] if excused else []),
+        *([f"Missed, but no farther off than chance: {noisy}"] if noisy else []),
         *(f"Left out: {line}" for line in comparison.skipped),
         "JS: Jensen-Shannon distance (base 2: 0 alike, 1 disjoint); of reflectances over 21 bins, exactly 0 and 20 of "
         "0.05, beside their means.",

@@ -1,1 +1,1 @@
-"""What the sensor measures of each hit."""
+"""Sensor model: the measurement of each hit."""

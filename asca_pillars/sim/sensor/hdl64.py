@@ -11,7 +11,7 @@ ELEVATION_DEG = (
 )
 # Leaving heights of the first and last laser of the upper and of the lower block, metres.
 ORIGIN_Z_M = ((0.2091, 0.1978), (0.1258, 0.1163))
-# What each laser reports of the same road or wall, over a typical laser: the same on every recording day.
+# Reflectance that each laser reports of the same surface, over a typical laser: the same on every recording day.
 RING_GAIN = (
     1.22, 1.05, 0.96, 0.90, 1.15, 0.96, 1.22, 1.02, 1.19, 0.93, 1.05, 1.12, 1.22, 1.12, 1.00, 1.02, 1.06, 1.09,
     1.06, 0.92, 1.06, 0.69, 1.06, 1.12, 0.91, 1.03, 1.10, 1.12, 1.09, 0.82, 1.10, 1.08, 0.93, 0.93, 1.01, 0.64,

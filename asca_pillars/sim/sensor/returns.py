@@ -7,14 +7,13 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import cached
+from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
 from asca_pillars.sim.casting.raycast import Hits
 from asca_pillars.sim.casting.rays import PLAIN, ray_bits
 from asca_pillars.sim.sensor.lidar import Firings
-
-Floats = npt.NDArray[np.float64]
 
 FADING = 0.5  # spread of the power from firing to firing, in logarithm
 PIVOT = 0.4  # the reflectance that the response leaves as it is
@@ -30,13 +29,13 @@ _NOISE_SALT, _FATE_SALT = 1, 2
 
 
 class Met(NamedTuple):
-    """What the firings (K,C) met first, as in `Hits`; rho is infinite for nothing."""
+    """First hits of the firings (K,C), as in `Hits`; rho is infinite for nothing."""
 
     rho_m: Floats
-    cosine: npt.NDArray[np.float32]
-    reflectance: npt.NDArray[np.float32]
-    owner: npt.NDArray[np.int32]
-    hidden: npt.NDArray[np.bool_]  # firings that report nothing: the ego vehicle blocks them, or nobody asks
+    cosine: Singles
+    reflectance: Singles
+    owner: NDArray[np.int32]
+    hidden: Mask  # firings that report nothing: the ego vehicle blocks them, or nobody asks
 
 
 class Lasers(NamedTuple):
@@ -54,11 +53,11 @@ class Lasers(NamedTuple):
     near_fade: Floats
     cos_azimuth: Floats
     sin_azimuth: Floats
-    number: npt.NDArray[np.int64]
+    number: Ints
 
 
 class Receiver(NamedTuple):
-    """What all lasers share: numbers of `Lidar`, and those drawn for the scan in `Firings`."""
+    """Numbers that all lasers share: those of `Lidar`, and those drawn for the scan in `Firings`."""
 
     lost_power: float
     zero_power: float
@@ -78,7 +77,7 @@ class Receiver(NamedTuple):
 
 
 class Echo(NamedTuple):
-    """What a firing gets back, before noise: from the surface that firing (ring, column) met."""
+    """Echo of a firing, before noise, from the surface that firing (ring, column) met."""
 
     slant_m: float
     cosine: float
@@ -95,11 +94,11 @@ def echo_of(
     lean: float,
     fate: float,
     rho: Floats,
-    cosine: npt.NDArray[np.float32],
-    reflectance: npt.NDArray[np.float32],
+    cosine: Singles,
+    reflectance: Singles,
     stretch: Floats,
     slopes: Floats,
-    number: npt.NDArray[np.int64],
+    number: Ints,
     receiver: Receiver,
 ) -> Echo:
     """The echo of firing (k, j), which may lean over an edge to a neighboring firing's surface.
@@ -120,19 +119,19 @@ def echo_of(
         other = np.inf  # where the part of the revolution that is fired ends
     apart = abs(other - slant)
     spacing = 2 * np.pi / turn if across else abs(slopes[row] - slopes[k])
-    own = Echo(slant, cosine[k, j], reflectance[k, j], 1.0, k, j)
-    if aside >= sideways + updown or not apart > EDGE_M + 1.5 * slant * spacing / max(own.cosine, 0.02):
-        return own
+    hit = Echo(slant, cosine[k, j], reflectance[k, j], 1.0, k, j)
+    if aside >= sideways + updown or not apart > EDGE_M + 1.5 * slant * spacing / max(hit.cosine, 0.02):
+        return hit
     if fate < receiver.split_lost_share:
-        return Echo(slant, own.cosine, own.reflectance, 0.0, k, j)
+        return Echo(slant, hit.cosine, hit.reflectance, 0.0, k, j)
     share = 0.5 * (1.0 - (aside / sideways if across else (aside - sideways) / updown))  # of the neighbor's
-    takes_over = reflectance[row, column] * share / other**2 > own.reflectance * (1.0 - share) / slant**2
+    takes_over = reflectance[row, column] * share / other**2 > hit.reflectance * (1.0 - share) / slant**2
     met = share if takes_over else 1.0 - share
     if apart < PULSE_M or (fate > 1.0 - BETWEEN_SHARE and apart < BETWEEN_M):
-        return Echo(slant + share * (other - slant), own.cosine, own.reflectance, met, k, j)
+        return Echo(slant + share * (other - slant), hit.cosine, hit.reflectance, met, k, j)
     if takes_over:
         return Echo(other, cosine[row, column], reflectance[row, column], met, row, column)
-    return Echo(slant, own.cosine, own.reflectance, met, k, j)
+    return Echo(slant, hit.cosine, hit.reflectance, met, k, j)
 
 
 @cached(inline="always", **PLAIN)
@@ -146,9 +145,7 @@ def fade_of(slant: float, near_fade: float, receiver: Receiver) -> float:
 
 
 @cached(**PLAIN)
-def report_firings(
-    met: Met, lasers: Lasers, receiver: Receiver, key: int
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+def report_firings(met: Met, lasers: Lasers, receiver: Receiver, key: int) -> tuple[Singles, NDArray[np.int32], Ints]:
     """Points (N, 4) in the LiDAR frame, the indices of their owners (N,) and of their rings (N,), ring by ring."""
     rho, cosine, reflectance, owners, hidden = met.rho_m, met.cosine, met.reflectance, met.owner, met.hidden
     slopes, stretch, origins, cos_phase, sin_phase, biases, gains, sigmas, faints, near_fades = lasers[:10]
@@ -205,9 +202,9 @@ def _uniform(bits: np.uint64, part: int) -> float:
 class Returns(NamedTuple):
     """Points in the order of KITTI's files: ring by ring from the top, each counter-clockwise from straight ahead."""
 
-    points: npt.NDArray[np.float32]  # (N,4) x, y, z metres, reflectance 0..0.99 in steps of 0.01
-    owner: npt.NDArray[np.int32]  # (N,) object index, BACKGROUND or GROUND
-    ring: npt.NDArray[np.int64]  # (N,)
+    points: Singles  # (N,4) x, y, z metres, reflectance 0..0.99 in steps of 0.01
+    owner: NDArray[np.int32]  # (N,) object index, BACKGROUND or GROUND
+    ring: Ints  # (N,)
 
 
 def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:

@@ -5,15 +5,14 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
+from asca_pillars.geometry.arrays import Floats, Ints
 from asca_pillars.geometry.overlap import paired_bev_touch
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
 from asca_pillars.sim.world.placement import ON_FOOT, Placer, Target
 from asca_pillars.sim.world.scene import KEPT_CLEAR_M, Scene, draw_scene
-
-Floats = npt.NDArray[np.float64]
 
 TRAVEL_M = 60.0  # the car's longest way: the scene's street is 170 m long, and the sensor sees 80 m
 RING_M = 230.0  # traffic that leaves the street at one end comes back, as somebody else, at the other
@@ -24,7 +23,7 @@ CROSSING_MPS, RIDING_MPS, WALKING_MPS = (3.0, 8.0), (2.5, 6.5), (0.8, 1.8)
 STANDING_SHARE = 0.15  # of lanes whose traffic waits, and of walkers and riders
 WALK_M = 25.0  # a walker stops so far from where it was placed
 EGO_M = (4.6, 2.2)  # length and width of the car
-# What is added to a footprint's length and width before two of them may not touch.
+# Margin added to a footprint's length and width within which two of them may not touch.
 APART_M, PEOPLE_APART_M = 0.5, -0.2
 STEP_S = 0.1
 _HELD_M = 12.0
@@ -51,7 +50,7 @@ class Way:
     ring: bool = False
 
     def at(self, times_s: Floats) -> "Places":
-        """Where it is at times (T,), seconds from the middle of the sequence."""
+        """Poses at times (T,), seconds from the middle of the sequence."""
         gone = np.asarray(times_s, float) * self.speed_mps
         way = np.clip(gone, self.from_m, self.to_m)
         x, y = self.x_m + way * np.cos(self.heading_rad), self.y_m + way * np.sin(self.heading_rad)
@@ -72,7 +71,7 @@ class Places(NamedTuple):
     """(T,) along the way, from its middle."""
     speed_mps: Floats
     """(T,) now."""
-    laps: npt.NDArray[np.int64]
+    laps: Ints
     """(T,) how often it has left the street."""
 
 
@@ -106,7 +105,7 @@ def draw_ways(
     taken = [_footprints(ego, times, (*EGO_M, 0.0), APART_M)]
     drawn = [_way(target, ground, kind, flow, rng) for target in targets]
     kept: dict[int, Going] = {}
-    # What cannot move comes first: it has no other choice.
+    # Objects that cannot move come first: they have no other choice.
     for index in sorted(range(len(targets)), key=lambda index: drawn[index].speed_mps > 0):
         target = targets[index]
         x, y, _, *size, yaw = target.box
@@ -114,9 +113,9 @@ def draw_ways(
         drawn_way = drawn[index]
         # Traffic does not stop in its lane: what follows would run into it.
         for way in (drawn_way,) if drawn_way.ring else (drawn_way, Way(x, y, yaw)):
-            own = _footprints(way, times, size, apart)
-            if not any(_touch(own, other) for other in taken):
-                taken.append(own)
+            footprints = _footprints(way, times, size, apart)
+            if not any(_touch(footprints, other) for other in taken):
+                taken.append(footprints)
                 kept[index] = Going(target, way)
                 break
     return ego, [kept[index] for index in sorted(kept)]
@@ -170,7 +169,7 @@ def _lane(y_m: float, ground: Ground) -> int:
     return int(np.floor((y_m - ground.to_lidar(0.0, 0.0)[1]) / LANE_M))
 
 
-def _footprints(way: Way, times_s: Floats, size: npt.ArrayLike, apart_m: float) -> Floats:
+def _footprints(way: Way, times_s: Floats, size: ArrayLike, apart_m: float) -> Floats:
     """(T, 7) boxes, of which only what is seen from above counts."""
     boxes = np.zeros((len(times_s), 7))
     boxes[:, :2] = way.at(times_s).xy_m
@@ -181,8 +180,8 @@ def _footprints(way: Way, times_s: Floats, size: npt.ArrayLike, apart_m: float) 
 
 
 def _touch(a: Floats, b: Floats) -> bool:
-    near = np.hypot(*(a[:, :2] - b[:, :2]).T) < (np.hypot(*a[0, 3:5]) + np.hypot(*b[0, 3:5])) / 2
-    return bool(near.any() and paired_bev_touch(a[near], b[near]).any())
+    close = np.hypot(*(a[:, :2] - b[:, :2]).T) < (np.hypot(*a[0, 3:5]) + np.hypot(*b[0, 3:5])) / 2
+    return bool(close.any() and paired_bev_touch(a[close], b[close]).any())
 
 
 FAR_M = 115.0  # beyond it an object is out of every sensor's reach
@@ -194,7 +193,7 @@ class Moment(NamedTuple):
 
     scene: Scene
     track_ids: tuple[int, ...]
-    """Of each of `scene.targets`; the same object keeps its number."""
+    """Identity of each of `scene.targets`, the same in all frames."""
     velocities_mps: Floats
     """(M, 2) over ground, along the frame's x and y."""
     ego_pose: Floats
@@ -261,8 +260,8 @@ def draw_moving_scene(
 
     def arrange(placer: Placer) -> None:
         nonlocal ego, going
-        near = [target for target in placer.targets if abs(target.box[0]) < config.reach_m]
-        ego, going = draw_ways(near, placer.ground, placer.kind, duration_s, rng_of_ways)
+        targets = [target for target in placer.targets if abs(target.box[0]) < config.reach_m]
+        ego, going = draw_ways(targets, placer.ground, placer.kind, duration_s, rng_of_ways)
         kept = [item.target for item in going]
         placer.targets[:] = kept
         placer.half_hidden[:] = [target for target in placer.half_hidden if any(target is one for one in kept)]

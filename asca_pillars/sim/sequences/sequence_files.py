@@ -28,10 +28,10 @@ from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
 from asca_pillars.sim.parallel import (
     COMMAND,
-    check_wishes,
-    claim_simulation,
+    check_counts,
     for_each,
     held_out,
+    record_settings,
     require_own_simulation,
     write_once,
 )
@@ -57,7 +57,7 @@ class SequencePlan:
 
     @property
     def duration_s(self) -> float:
-        """Of one sequence."""
+        """Duration of one sequence, seconds."""
         return self.length / RATE_HZ
 
     def time_s(self, sequence: int, index: int) -> float:
@@ -133,19 +133,19 @@ def simulate_sequences(
         ConfigError: a number below 1, or a share outside 0..1.
         DatasetError: `out` holds sequences of another seed, length or configuration.
     """
-    check_wishes({"sequences": sequences, "length": length, "workers": workers}, val_share)
+    check_counts({"sequences": sequences, "length": length, "workers": workers}, val_share)
     root = Path(out)
     config = config or SimulationConfig()
     if config.field_of_view == "full":  # as much is cast, and there is no camera to label for
         config = replace(config, field_of_view="around")
     plan = SequencePlan(seed, length, config)
-    claim_simulation(root, {"seed": seed, "length": length, "rate_hz": RATE_HZ, **asdict(config)}, root / "scans")
+    record_settings(root, {"seed": seed, "length": length, "rate_hz": RATE_HZ, **asdict(config)}, root / "scans")
     todo = [(one, index) for one in range(sequences) for index in range(length)]
     todo = [item for item in todo if not _scan_path(root, *item).exists()]
     for_each(partial(_write_frame, root, plan), todo, workers, progress=progress)
     first_val = sequences - held_out(sequences, val_share)
-    for name, own in (("train", range(first_val)), ("val", range(first_val, sequences))):
-        write_image_set(root, name, [f"{one:04d}/{index:06d}" for one in own for index in range(length)])
+    for name, numbers in (("train", range(first_val)), ("val", range(first_val, sequences))):
+        write_image_set(root, name, [f"{one:04d}/{index:06d}" for one in numbers for index in range(length)])
     write_text(root / DATASET_FILE, _DATASET)
     return root
 
@@ -160,7 +160,7 @@ def require_own_sequences(out: Path) -> None:
 
 @lru_cache(maxsize=1)
 def _world(plan: SequencePlan, sequence: int) -> tuple[MovingScene, Firings]:
-    """Of one sequence after the other: a process draws a street once, not for each of its scans."""
+    """World of one sequence after the other: a process draws a street once, not for each of its scans."""
     scene, ways, sensor = (draws_of(plan.seed, sequence, stream) for stream in (_SCENE, _WAYS, _SENSOR))
     firings = draw_firings(plan.config.lidar, sensor, plan.config.field_of_view == "camera", True)
     return draw_moving_scene(plan.config.scene, scene, ways, plan.duration_s), firings

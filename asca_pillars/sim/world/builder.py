@@ -3,15 +3,14 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from asca_pillars.base.compiling import cached
+from asca_pillars.geometry.arrays import Floats, Mask
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, prisms
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
 from asca_pillars.sim.world.placement import Occupied
 
-Floats = npt.NDArray[np.float64]
 Material = tuple[float, float, float]  # reflectance, gloss, transparency
 HEAD_ROOM_M = 2.2  # leaves above may hang over objects
 
@@ -72,12 +71,12 @@ class Builder:
         return self.ground.cross_half_m > 0 and start_m < middle + reach and end_m > middle - reach
 
     def until_junction(self, start_m: float, length_m: float) -> float:
-        """As much of a piece of the main road's side as lies before the crossing road."""
+        """Length of the part of a piece of the main road's side before the crossing road."""
         first = self.ground.cross_u_m - self.ground.cross_half_m - self.ground.pavement_m - 1.0
         return first - start_m if self.ground.cross_half_m > 0 and start_m < first < start_m + length_m else length_m
 
-    def claim(self, along: float, across: float, length: float, width: float, cross: bool = False) -> bool:
-        """Take a place aligned with the road; whether it was free."""
+    def reserve(self, along: float, across: float, length: float, width: float, cross: bool = False) -> bool:
+        """Reserve a rectangle aligned with the road; False if it was occupied."""
         x, y, yaw = self.to_lidar(along, across, cross)
         return self.occupied.take(x, y, length, width, yaw)
 
@@ -179,8 +178,8 @@ class Builder:
 
 
 @cached()
-def _intrudes(blobs: Floats, footprints: Floats) -> npt.NDArray[np.bool_]:
-    """Which clouds would hang into the car (its sensor would see nothing else) or an object."""
+def _intrudes(blobs: Floats, footprints: Floats) -> Mask:
+    """Mask of the clouds that would hang into the car (its sensor would see nothing else) or an object."""
     result = np.zeros(len(blobs), np.bool_)
     for i in range(len(blobs)):
         if blobs[i, 2] - blobs[i, 5] >= HEAD_ROOM_M:

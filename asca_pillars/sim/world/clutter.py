@@ -55,7 +55,7 @@ def thin_cylinder(builder: Builder, along: float, across: float) -> None:
     """A round thing as tall as a person: a stump, a pipe, a rolled carpet, a wrapped tree."""
     rng = builder.rng
     radius = float(rng.uniform(0.08, 0.28))
-    if builder.claim(along, across, 2 * radius, 2 * radius):
+    if builder.reserve(along, across, 2 * radius, 2 * radius):
         taper, lean = float(rng.uniform(0.5, 1.1)), rng.normal(0.0, 0.05, 2)
         builder.post(
             along,
@@ -73,7 +73,7 @@ def post_with_box(builder: Builder, along: float, across: float) -> None:
     """A parking meter, a letter box, a counter, a pump, a bird house: something wide on something thin."""
     rng = builder.rng
     size = (float(rng.uniform(0.15, 0.5)), float(rng.uniform(0.2, 0.6)), float(rng.uniform(0.25, 0.9)))
-    if builder.claim(along, across, 0.5, 0.5):
+    if builder.reserve(along, across, 0.5, 0.5):
         top = float(rng.uniform(0.9, 2.1))
         builder.post(along, across, -0.2, top, float(rng.uniform(0.03, 0.1)), float(rng.uniform(0.1, 0.5)))
         builder.box(along, across, top - size[2], size, material(builder), yaw=float(rng.uniform(0, 3.1)))
@@ -83,7 +83,7 @@ def column(builder: Builder, along: float, across: float) -> None:
     """An upright slab or pillar: a stone, a gate's pillar, an advertising stele, a stack of chairs."""
     rng = builder.rng
     size = (float(rng.uniform(0.2, 0.7)), float(rng.uniform(0.15, 0.7)), float(rng.uniform(1.0, 2.4)))
-    if builder.claim(along, across, 0.8, 0.8):
+    if builder.reserve(along, across, 0.8, 0.8):
         builder.box(
             along, across, -0.2, (size[0], size[1], size[2] + 0.2), material(builder), yaw=float(rng.uniform(0, 3.1))
         )
@@ -94,7 +94,7 @@ def container(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     length, width = float(rng.uniform(1.2, 6.0)), float(rng.uniform(1.0, 2.4))
     height = float(rng.uniform(0.9, 2.7))
-    if not builder.claim(along, across, length, width):
+    if not builder.reserve(along, across, length, width):
         return
     paint = material(builder)
     if rng.random() < 0.5:
@@ -109,7 +109,7 @@ def heap(builder: Builder, along: float, across: float) -> None:
     """Earth, gravel, leaves, boulders, bags: low round mounds."""
     rng = builder.rng
     wide = float(np.exp(rng.uniform(np.log(0.2), np.log(2.4))))
-    if not builder.claim(along, across, 1.6 * wide, 1.2 * wide):
+    if not builder.reserve(along, across, 1.6 * wide, 1.2 * wide):
         return
     reflectance, tall = float(rng.uniform(0.15, 0.5)), float(rng.uniform(0.25, 0.6)) * wide
     for _ in range(int(rng.integers(2, 7))):
@@ -122,7 +122,7 @@ def stack(builder: Builder, along: float, across: float) -> None:
     """Pallets, timber, bricks, boxes: uneven blocks on and beside each other."""
     rng = builder.rng
     length, width, height = float(rng.uniform(0.6, 4.5)), float(rng.uniform(0.5, 1.8)), float(rng.uniform(0.5, 1.9))
-    if not builder.claim(along, across, length, width):
+    if not builder.reserve(along, across, length, width):
         return
     paint: Material = material(builder)
     columns, layers = max(int(length / 1.1), 1), max(int(height / 0.4), 1)
@@ -146,7 +146,7 @@ def parked_bicycles(builder: Builder, along: float, across: float) -> None:
     bodies = [parked_bicycle_body(rng) for _ in range(min(number, 2))]  # racks repeat them: they are dear to draw
     for i in range(number):
         place = along + i * step
-        if builder.claim(place, across, length, width):
+        if builder.reserve(place, across, length, width):
             builder.body(bodies[i % 2], place, across, leaning + float(rng.choice([0.0, np.pi]) + rng.normal(0, 0.12)))
 
 
@@ -156,7 +156,7 @@ def parked_motorbikes(builder: Builder, along: float, across: float) -> None:
     turned = float(rng.choice([0.0, 0.9, np.pi / 2]))
     length, width = (2.0, 0.8) if turned == 0.0 else (0.9, 2.1)
     for place in along + (2.3 if turned == 0.0 else 1.0) * np.arange(int(rng.integers(1, 5))):
-        if builder.claim(place, across, length, width):
+        if builder.reserve(place, across, length, width):
             builder.body(motorbike_body(rng), place, across, turned + float(rng.normal(0, 0.1)))
 
 

@@ -16,7 +16,7 @@ def pole(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     mast = rng.random() < 0.15
     radius = float(rng.uniform(0.12, 0.3) if mast else rng.uniform(0.03, 0.12))
-    if not builder.claim(along, across, 2 * radius, 2 * radius):
+    if not builder.reserve(along, across, 2 * radius, 2 * radius):
         return
     tilt = rng.normal(0.0, 0.015, 2)
     builder.post(
@@ -63,7 +63,7 @@ def pole_group(builder: Builder, along: float, across: float) -> None:
     for _ in range(int(rng.integers(2, 6))):
         at, beside = along + float(rng.normal(0, 0.35)), across + float(rng.normal(0, 0.35))
         radius = float(rng.uniform(0.025, 0.09))
-        if builder.claim(at, beside, 2 * radius, 2 * radius):
+        if builder.reserve(at, beside, 2 * radius, 2 * radius):
             builder.post(at, beside, -0.2, float(rng.uniform(1.2, 4.5)), radius, float(rng.uniform(0.1, 0.6)))
 
 
@@ -73,7 +73,7 @@ def bollards(builder: Builder, along: float, across: float) -> None:
     radius, height = float(rng.uniform(0.03, 0.18)), float(rng.uniform(0.4, 1.3))
     reflectance, step = float(rng.uniform(0.1, 0.6)), float(rng.uniform(1.0, 2.5))
     for i in range(int(rng.integers(1, 9))):
-        if builder.claim(along + i * step, across, 2 * radius, 2 * radius):
+        if builder.reserve(along + i * step, across, 2 * radius, 2 * radius):
             builder.post(along + i * step, across, -0.2, height + 0.2, radius, reflectance)
 
 
@@ -84,7 +84,7 @@ def delineators(builder: Builder, along: float, across: float) -> None:
     step = float(rng.uniform(2.0, 5.0) if cone else rng.uniform(12.0, 25.0))
     for i in range(int(rng.integers(1, 6))):
         at = along + i * step
-        if builder.near_junction(at, at) or not builder.claim(at, across, 0.3, 0.3):
+        if builder.near_junction(at, at) or not builder.reserve(at, across, 0.3, 0.3):
             continue
         if cone:
             builder.post(at, across, 0.0, float(rng.uniform(0.4, 1.0)), 0.18, 0.5, taper=0.15)
@@ -99,7 +99,7 @@ def cabinet(builder: Builder, along: float, across: float) -> None:
     yaw = float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.1))
     for i in range(int(rng.choice([1, 1, 1, 2, 3]))):
         at = along + i * (max(size[:2]) + 0.1)
-        if builder.claim(at, across, max(size[:2]), max(size[:2])):
+        if builder.reserve(at, across, max(size[:2]), max(size[:2])):
             height = size[2] * float(rng.uniform(0.7, 1.1))
             builder.box(at, across, -0.2, (size[0], size[1], height + 0.2), material(builder), yaw=yaw)
 
@@ -110,7 +110,7 @@ def bins(builder: Builder, along: float, across: float) -> None:
     size = (1.3, 0.95, 1.35) if rng.random() < 0.25 else (0.52, 0.6, 1.05)
     for i in range(int(rng.integers(1, 7))):
         at, beside = along + i * (size[0] + float(rng.uniform(0.03, 0.3))), across + float(rng.normal(0, 0.08))
-        if builder.claim(at, beside, size[0], size[1]):
+        if builder.reserve(at, beside, size[0], size[1]):
             yaw = float(rng.normal(0, 0.15))
             builder.box(at, beside, 0.08, (size[0], size[1], size[2] - 0.15), material(builder), yaw=yaw)
             builder.box(at, beside, size[2] - 0.07, (size[0], 1.08 * size[1], 0.07), (0.1, 0.4, 0.0), yaw=yaw)
@@ -120,7 +120,7 @@ def bench(builder: Builder, along: float, across: float) -> None:
     """A bench, or two with a table between."""
     rng = builder.rng
     table = rng.random() < 0.3
-    if not builder.claim(along, across, 1.8, 1.7 if table else 0.7):
+    if not builder.reserve(along, across, 1.8, 1.7 if table else 0.7):
         return
     plank = material(builder)
     if table:
@@ -137,7 +137,7 @@ def planter(builder: Builder, along: float, across: float) -> None:
     """A tub with something green in it."""
     rng = builder.rng
     size = (float(rng.uniform(0.5, 2.0)), float(rng.uniform(0.5, 1.0)), float(rng.uniform(0.3, 0.8)))
-    if builder.claim(along, across, *size[:2]):
+    if builder.reserve(along, across, *size[:2]):
         builder.box(along, across, -0.1, (size[0], size[1], size[2] + 0.1), material(builder))
         wide, tall = 0.5 * min(size[:2]), float(rng.uniform(0.15, 0.7))
         crown(builder, along, across, size[2] + tall, (wide, tall), float(rng.uniform(1.5, 6.0)), cross=False)
@@ -148,7 +148,7 @@ def shelter(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     booth = rng.random() < 0.4
     size = (0.9, 0.9, 2.3) if booth else (float(rng.uniform(2.5, 5.0)), 1.5, 2.5)
-    if not builder.claim(along, across, *size[:2]):
+    if not builder.reserve(along, across, *size[:2]):
         return
     glass = (0.06, 2.0, 0.0 if booth and rng.random() < 0.4 else float(rng.uniform(0.6, 0.95)))
     back = across + 0.7 * (1.0 if across > 0 else -1.0)
@@ -168,12 +168,12 @@ def billboard(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     if rng.random() < 0.25:
         radius = float(rng.uniform(0.45, 0.75))
-        if builder.claim(along, across, 2 * radius, 2 * radius):
+        if builder.reserve(along, across, 2 * radius, 2 * radius):
             builder.post(along, across, -0.2, float(rng.uniform(2.4, 3.8)), radius, float(rng.uniform(0.2, 0.6)))
         return
     wide = float(rng.choice([0.6, 1.3, 1.3, 3.6]))
     yaw = float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.15))
-    if builder.claim(along, across, wide, wide if yaw > 0.8 else 0.5):
+    if builder.reserve(along, across, wide, wide if yaw > 0.8 else 0.5):
         foot = float(rng.choice([0.0, 0.3, 0.8, 2.0]))
         builder.box(along, across, foot, (wide, 0.12, float(rng.uniform(0.9, 2.6))), material(builder), yaw=yaw)
         builder.post(along, across, -0.2, foot + 0.3, 0.06, 0.3)
@@ -187,7 +187,7 @@ def barrier_boards(builder: Builder, along: float, across: float) -> None:
     board: Material = (0.35, 0.4, 0.88) if mesh else (float(rng.uniform(0.4, 0.8)), 0.4, 0.0)
     for i in range(int(rng.integers(1, 7))):
         at, beside = along + i * step, across + float(rng.normal(0, 0.1))
-        if builder.near_junction(at, at) or not builder.claim(at, beside, step - 0.1, 0.3):
+        if builder.near_junction(at, at) or not builder.reserve(at, beside, step - 0.1, 0.3):
             continue
         builder.box(at - step / 2, beside, -0.05, (0.25, 0.6, 0.15), (0.1, 0.3, 0.0))
         builder.post(at - step / 2, beside, 0.0, height + 0.1, 0.025, 0.4)
@@ -201,7 +201,7 @@ def low_stones(builder: Builder, along: float, across: float) -> None:
     height, step = float(rng.uniform(0.06, 0.35)), length + float(rng.uniform(0.0, 0.8))
     stone = (float(rng.uniform(0.15, 0.5)), 0.3, 0.0)
     for i in range(int(rng.integers(1, 6))):
-        if builder.claim(along + i * step, across, length, length if yaw > 0.8 else 0.3):
+        if builder.reserve(along + i * step, across, length, length if yaw > 0.8 else 0.3):
             builder.box(
                 along + i * step,
                 across,
@@ -216,7 +216,7 @@ def island(builder: Builder, along: float, across: float) -> None:
     """A traffic island with its posts and signs, in the middle of the road before a junction."""
     rng = builder.rng
     length, width = float(rng.uniform(2.0, 6.0)), float(rng.uniform(0.8, 1.8))
-    if not builder.claim(along, across, length, width):
+    if not builder.reserve(along, across, length, width):
         return
     builder.box(along, across, -0.2, (length, width, 0.2 + float(rng.uniform(0.06, 0.16))), (0.35, 0.3, 0.0))
     for end in (-0.4, 0.4):
@@ -239,7 +239,7 @@ def beacon(builder: Builder, along: float, across: float) -> None:
     yaw = float(rng.choice([0.0, 0.0, 1.57]) + rng.normal(0, 0.3))
     for i in range(int(rng.choice([1, 1, 1, 2, 4]))):
         at = along + i * step
-        if not builder.near_junction(at, at) and builder.claim(at, across, 0.4, 0.4):
+        if not builder.near_junction(at, at) and builder.reserve(at, across, 0.4, 0.4):
             foot = float(rng.uniform(0.08, 0.3))
             builder.box(at, across, -0.05, (0.4, 0.35, 0.15), (0.1, 0.3, 0.0), yaw=yaw)
             builder.box(at, across, foot, size, foil, yaw=yaw)
@@ -251,7 +251,7 @@ def striped_post(builder: Builder, along: float, across: float) -> None:
     """A round or square post in bands, every other one of foil, with a cap, a sign or nothing on it."""
     rng = builder.rng
     wide, tall = float(rng.uniform(0.12, 0.35)), float(rng.uniform(0.8, 1.5))
-    if not builder.claim(along, across, wide, wide):
+    if not builder.reserve(along, across, wide, wide):
         return
     foil, paint = retroreflective(builder), material(builder)
     bands = int(rng.integers(2, 6))
@@ -272,7 +272,7 @@ def board(builder: Builder, along: float, across: float) -> None:
     """A narrow upright board near the ground: a striped plate, an arrow, a poster, some of them retroreflective."""
     rng = builder.rng
     size = (0.05, float(rng.uniform(0.2, 0.55)), float(rng.uniform(0.8, 1.5)))
-    if not builder.claim(along, across, size[1], size[1]):
+    if not builder.reserve(along, across, size[1], size[1]):
         return
     face = retroreflective(builder) if rng.random() < 0.6 else material(builder)
     foot = float(rng.uniform(0.0, 0.5))
@@ -285,7 +285,7 @@ def leaning_board(builder: Builder, along: float, across: float) -> None:
     """A board, a plank or a sheet that leans on a post: stacked slices, each a little farther from the foot."""
     rng = builder.rng
     wide, tall = float(rng.uniform(0.25, 0.7)), float(rng.uniform(0.9, 1.8))
-    if not builder.claim(along, across, 0.8, 0.8):
+    if not builder.reserve(along, across, 0.8, 0.8):
         return
     face, slices, lean = material(builder), 5, float(rng.uniform(0.15, 0.45))
     for i in range(slices):
@@ -298,7 +298,7 @@ def mast(builder: Builder, along: float, across: float) -> None:
     """A mast, thin or thick, with boxes as high as a person, bands of tape, notices and a foot wider than itself."""
     rng = builder.rng
     radius = float(rng.uniform(0.03, 0.09) if rng.random() < 0.6 else rng.uniform(0.09, 0.28))
-    if not builder.claim(along, across, 0.6, 0.6):
+    if not builder.reserve(along, across, 0.6, 0.6):
         return
     builder.post(along, across, -0.3, float(rng.uniform(2.4, 7.0)), radius, float(rng.uniform(0.15, 0.5)), taper=0.85)
     if rng.random() < 0.6:
@@ -322,7 +322,7 @@ def covered_thing(builder: Builder, along: float, across: float) -> None:
     """
     rng = builder.rng
     wide, tall = float(rng.uniform(0.14, 0.34)), float(rng.uniform(0.9, 1.9))
-    if not builder.claim(along, across, 2.2 * wide, 2.2 * wide):
+    if not builder.reserve(along, across, 2.2 * wide, 2.2 * wide):
         return
     wrapped(builder, along, across, wide, tall)
     if rng.random() < 0.4:
@@ -331,10 +331,10 @@ def covered_thing(builder: Builder, along: float, across: float) -> None:
 
 
 def wall_end(builder: Builder, along: float, across: float) -> None:
-    """Where a wall ends: a stub, a pillar before it, a gap."""
+    """End of a wall: a stub, a pillar before it, a gap."""
     rng = builder.rng
     length, thick, tall = float(rng.uniform(0.3, 1.6)), float(rng.uniform(0.15, 0.4)), float(rng.uniform(0.7, 2.2))
-    if builder.claim(along, across, length, length):
+    if builder.reserve(along, across, length, length):
         stone = material(builder)
         yaw = float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.1))
         builder.box(along, across, -0.3, (length, thick, tall + 0.3), stone, yaw=yaw)
@@ -356,7 +356,7 @@ def fragments(builder: Builder, along: float, across: float) -> None:
     for _ in range(int(rng.integers(1, 4))):
         at, beside = along + float(rng.normal(0, 0.4)), across + float(rng.normal(0, 0.4))
         size = (float(rng.uniform(0.08, 0.4)), float(rng.uniform(0.08, 0.4)), tall * float(rng.uniform(0.4, 1.0)))
-        if builder.claim(at, beside, size[0], size[1]):
+        if builder.reserve(at, beside, size[0], size[1]):
             foot = 0.0 if rng.random() < 0.7 else float(rng.uniform(0.1, 0.6))
             builder.box(at, beside, foot - 0.05, size, material(builder), yaw=float(rng.uniform(0, 3.1)))
 
@@ -367,5 +367,5 @@ def low_pieces(builder: Builder, along: float, across: float) -> None:
     for _ in range(int(rng.integers(1, 6))):
         at, beside = along + float(rng.normal(0, 1.5)), across + float(rng.normal(0, 1.0))
         size = (float(rng.uniform(0.15, 1.0)), float(rng.uniform(0.15, 0.6)), float(rng.uniform(0.1, 0.7)))
-        if builder.claim(at, beside, size[0], size[1]):
+        if builder.reserve(at, beside, size[0], size[1]):
             builder.box(at, beside, -0.1, (size[0], size[1], size[2] + 0.1), material(builder))

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
+from asca_pillars.geometry.arrays import Floats, Mask
 from asca_pillars.sim.casting import groundcast
 from asca_pillars.sim.casting.groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M, Street
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 LEVEL_WITHIN_M, SLOPE_LASTS_M = 28.0, 40.0
 # The lattice of the relief, and the share of the hills there: roads are laid out level where one drives, hills begin
 # some way off, with their crests or troughs at the car.
@@ -52,7 +51,7 @@ class Ground:
 
     @property
     def cross_u_m(self) -> float:
-        """Where the crossing road meets the main road, along it."""
+        """Position of the crossing road along the main road."""
         return self.street.cross_u_m
 
     @property
@@ -70,7 +69,7 @@ class Ground:
 
     @property
     def left_edge_m(self) -> float:
-        """Where the left side's pavement begins: behind the second carriageway, if there is one, and the tracks."""
+        """Start of the left side's pavement: behind the second carriageway, if there is one, and the tracks."""
         second = float(self.street.second_v_m + self.street.second_half_m)
         bed = float(self.street.rails_v_m + self.street.bed_half_m)
         return max(self.half_width_m, second, bed)
@@ -98,7 +97,7 @@ class Ground:
         x, y, _ = self.to_lidar(u, along_m * cos + across_m * sin)
         return x, y, float(street.yaw_rad + street.cross_tilt_rad + math.pi / 2 + yaw_rad)
 
-    def places(self, along_m: Floats, across_m: Floats, cross: Bools) -> Floats:
+    def places(self, along_m: Floats, across_m: Floats, cross: Mask) -> Floats:
         """`to_lidar` or, where `cross` (N,), `cross_to_lidar` of many: (N,) and (N,) -> (N,2) x and y."""
         street, u, v = self.street, along_m.copy(), across_m.copy()
         cos, sin = street.cos_tilt, street.sin_tilt
@@ -110,14 +109,14 @@ class Ground:
         result[:, 0], result[:, 1] = u * cos - v * sin, u * sin + v * cos
         return result
 
-    def headings(self, along_m: Floats, cross: Bools) -> Floats:
+    def headings(self, along_m: Floats, cross: Mask) -> Floats:
         """The road's heading (N,) in the LiDAR frame there."""
         street = self.street
         # NumPy's arc tangent differs from that of `to_lidar` in the last bit.
         turns = np.array([math.atan(slope) for slope in (street.bend_per_m * along_m).tolist()])
         return np.where(cross, street.yaw_rad + street.cross_tilt_rad + math.pi / 2, street.yaw_rad + turns)
 
-    def heights(self, xy: npt.ArrayLike) -> Floats:
+    def heights(self, xy: ArrayLike) -> Floats:
         """Height (N,) of the ground at (N,2) in the LiDAR frame, metres."""
         points = np.asarray(xy, float).reshape(-1, 2)
         return np.asarray(groundcast.heights(points, self.street, self.relief, self.z_m))

@@ -1,24 +1,23 @@
-"""Where road users of each class stand, drive and walk on a street; u along it, v to its left."""
+"""Places where road users of each class stand, drive and walk on a street; u along it, v to its left."""
 
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
 
-Floats = npt.NDArray[np.float64]
 QUARTER_TURNS = (0.0, np.pi, np.pi / 2, -np.pi / 2)
 NOSE_IN_M, ALONG_M = (0.5, 1.1), (0.4, 1.8)  # gaps between parked cars side by side and one behind the other
 
 
 Going: TypeAlias = Literal["still", "lane", "crossing", "riding", "walking"]
-"""What something does where it stands: in a scan nothing shows it, in a sequence it moves by it."""
+"""Motion of an object: invisible in a single scan, followed in a sequence."""
 
 
 class Neighbor(NamedTuple):
-    """Where something stands that others may stand beside: metres, heading against the street, length of its box."""
+    """Position of an object that others may stand beside: metres, heading against the street, length of its box."""
 
     u: float
     v: float

@@ -27,7 +27,7 @@ def banded_bollards(builder: Builder, along: float, across: float) -> None:
     foil = _foil(builder)
     for i in range(int(rng.integers(3, 11))):
         at = along + i * step
-        if builder.near_junction(at, at) or not builder.claim(at, across, 2 * radius, 2 * radius):
+        if builder.near_junction(at, at) or not builder.reserve(at, across, 2 * radius, 2 * radius):
             continue
         high = float(rng.uniform(2.2, 2.9)) if rng.random() < 0.06 else tall
         builder.post(at, across, -0.2, high + 0.2, radius, dark)
@@ -39,7 +39,7 @@ def litter_bin(builder: Builder, along: float, across: float) -> None:
     """A bin that hangs on a post with a gap below, mostly with a sticker, sometimes with another thing beside it."""
     rng = builder.rng
     wide, deep = float(rng.uniform(0.3, 0.45)), float(rng.uniform(0.28, 0.4))
-    if not builder.claim(along, across, 0.5, 0.5):
+    if not builder.reserve(along, across, 0.5, 0.5):
         return
     foot, top = float(rng.uniform(0.2, 0.45)), float(rng.uniform(0.9, 1.15))
     builder.post(along, across, -0.2, top + 0.2 + float(rng.choice([0.0, 0.1, 1.5])), 0.035, 0.3)
@@ -49,14 +49,14 @@ def litter_bin(builder: Builder, along: float, across: float) -> None:
         size = (wide + 0.02, 0.5 * deep, float(rng.uniform(0.15, 0.3)))
         builder.box(along, across + 0.1, top - size[2] - 0.1, size, (_foil(builder), 0.3, 0.0), yaw=yaw)
     beside = along + float(rng.uniform(0.6, 1.0))
-    if rng.random() < 0.4 and builder.claim(beside, across, 0.7, 0.4):
+    if rng.random() < 0.4 and builder.reserve(beside, across, 0.7, 0.4):
         builder.box(beside, across, -0.1, (0.6, 0.4, float(rng.uniform(0.8, 1.2)) + 0.1), material(builder), yaw=yaw)
 
 
 def cabinet_and_panel(builder: Builder, along: float, across: float) -> None:
     """A low cabinet right beside a higher panel, which sometimes has a bright sign on top."""
     rng = builder.rng
-    if not builder.claim(along, across, 1.3, 0.5):
+    if not builder.reserve(along, across, 1.3, 0.5):
         return
     deep, paint = float(rng.uniform(0.25, 0.4)), material(builder)
     low, high = float(rng.uniform(0.9, 1.2)), float(rng.uniform(1.4, 2.0))
@@ -73,7 +73,7 @@ def before_a_wall(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     length, side = float(rng.uniform(3.0, 8.0)), 1.0 if across > 0 else -1.0
     gap = float(rng.uniform(0.3, 0.8))
-    if not builder.claim(along, across + side * 0.3, length, 1.6):
+    if not builder.reserve(along, across + side * 0.3, length, 1.6):
         return
     stone = material(builder)
     builder.box(along, across + side * (0.4 + gap), -0.3, (length, 0.25, float(rng.uniform(1.5, 2.8)) + 0.3), stone)
@@ -91,7 +91,7 @@ def footed_trunk(builder: Builder, along: float, across: float) -> None:
     """A trunk or an advertising column that widens towards the ground, without a branch as far up as one sees."""
     rng = builder.rng
     radius, foot = float(rng.uniform(0.13, 0.26)), float(rng.uniform(0.3, 0.48))
-    if not builder.claim(along, across, 2 * foot, 2 * foot):
+    if not builder.reserve(along, across, 2 * foot, 2 * foot):
         return
     bark = float(rng.uniform(0.15, 0.45))
     tall = float(rng.uniform(2.0, 2.7) if rng.random() < 0.4 else rng.uniform(2.7, 6.0))
@@ -107,7 +107,7 @@ def tapered_stone(builder: Builder, along: float, across: float) -> None:
     foot = float(rng.uniform(0.2, 0.32))
     for i in range(int(rng.choice([1, 1, 2]))):
         at = along + i * float(rng.uniform(0.8, 2.5))
-        if builder.claim(at, across, 2 * foot, 2 * foot):
+        if builder.reserve(at, across, 2 * foot, 2 * foot):
             tall, taper = float(rng.uniform(0.8, 1.4)), float(rng.uniform(0.35, 0.7))
             builder.post(at, across, -0.1, tall + 0.1, foot, float(rng.uniform(0.1, 0.5)), taper=taper)
 
@@ -115,7 +115,7 @@ def tapered_stone(builder: Builder, along: float, across: float) -> None:
 def slim_pillars(builder: Builder, along: float, across: float) -> None:
     """An upright post or stone as tall as a person, without a head, and a lower one beside it or leaning at it."""
     rng = builder.rng
-    if not builder.claim(along, across, 1.2, 0.6):
+    if not builder.reserve(along, across, 1.2, 0.6):
         return
     radius, grey = float(rng.uniform(0.07, 0.15)), float(rng.uniform(0.15, 0.4))
     builder.post(along - 0.3, across, -0.2, float(rng.uniform(1.3, 1.75)) + 0.2, radius, grey)
@@ -129,7 +129,7 @@ def slim_pillars(builder: Builder, along: float, across: float) -> None:
 def low_sign(builder: Builder, along: float, across: float) -> None:
     """A disc or a plate at a person's height on a post that mostly goes on above; its back is dark."""
     rng = builder.rng
-    if not builder.claim(along, across, 0.6, 0.6):
+    if not builder.reserve(along, across, 0.6, 0.6):
         return
     size, foot = float(rng.uniform(0.22, 0.36)), float(rng.uniform(0.6, 1.7))
     bright = rng.random() < 0.6
@@ -149,7 +149,7 @@ def warning_barrier(builder: Builder, along: float, across: float) -> None:
     """A bright board across the way of sight on legs that hardly return, or on a tripod."""
     rng = builder.rng
     wide = float(rng.uniform(0.5, 1.7))
-    if not builder.claim(along, across, 0.6, wide):
+    if not builder.reserve(along, across, 0.6, wide):
         return
     foot, tall = float(rng.uniform(0.6, 0.9)), float(rng.uniform(0.2, 0.5))
     yaw = float(rng.normal(0.0, 0.4))
@@ -161,7 +161,7 @@ def warning_barrier(builder: Builder, along: float, across: float) -> None:
 def bicycle_at_post(builder: Builder, along: float, across: float) -> None:
     """A parked bicycle that leans at a post or a trunk, which stands out of it on both sides."""
     rng = builder.rng
-    if not builder.claim(along, across, 1.8, 0.7):
+    if not builder.reserve(along, across, 1.8, 0.7):
         return
     thick = float(rng.uniform(0.04, 0.2))
     builder.post(along + float(rng.normal(0, 0.2)), across, -0.2, float(rng.uniform(1.9, 4.0)), thick, 0.3)
@@ -173,7 +173,7 @@ def wall_corner(builder: Builder, along: float, across: float) -> None:
     """The corner of a low wall, a raised bed or a clipped hedge, open behind: two faces as a car shows them."""
     rng = builder.rng
     long, short = float(rng.uniform(2.0, 4.5)), float(rng.uniform(1.2, 2.2))
-    if not builder.claim(along, across, long, short):
+    if not builder.reserve(along, across, long, short):
         return
     stone, tall, thick = material(builder), float(rng.uniform(0.4, 1.1)), float(rng.uniform(0.12, 0.4))
     side, end = (1.0 if across > 0 else -1.0), float(rng.choice([-0.5, 0.5]))
@@ -187,7 +187,7 @@ def posts_at_corners(builder: Builder, along: float, across: float) -> None:
     """Three or four low things about where the corners of a parked car would be, and nothing between them."""
     rng = builder.rng
     long, wide = float(rng.uniform(3.0, 4.6)), float(rng.uniform(1.3, 1.9))
-    if not builder.claim(along, across, long, wide):
+    if not builder.reserve(along, across, long, wide):
         return
     for at in (-0.5, 0.5):
         for beside in (-0.5, 0.5):

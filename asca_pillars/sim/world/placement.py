@@ -5,14 +5,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from asca_pillars.base.compiling import cached
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
 from asca_pillars.sim.world.habits import Candidate, Going, Habits
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class SizeStatistics:
         return np.asarray(np.array(self.deviation)[:, None] * factor)
 
 
-# Of all of KITTI's training labels; the bounds are the 1st and 99th percentile, narrowed where a body needs it.
+# Sizes in all of KITTI's training labels; bounds are the 1st and 99th percentile, narrowed where a body needs it.
 SIZES = {
     "Car": SizeStatistics(
         (3.884, 1.629, 1.526), (0.426, 0.102, 0.137), (2.94, 1.36, 1.27), (4.89, 1.88, 1.97), (0.35, 0.17, 0.31)

@@ -1,4 +1,4 @@
-"""What lines the streets on both sides: houses, walls, fences, guard rails, and what closes the view far behind."""
+"""Linings of the streets on both sides: houses, walls, fences, guard rails, and the end of the view far behind."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +26,7 @@ def _wall(builder: Builder, stretch: Stretch, height: float, pillars: bool) -> N
     stone = (float(rng.uniform(0.2, 0.55)), 0.3, 0.0)
     uneven = float(rng.choice([0.0, 0.0, 0.15]))
     for along in stretch.along(4.0):
-        if builder.claim(along, across, 3.6, thick, cross):
+        if builder.reserve(along, across, 3.6, thick, cross):
             top = height + uneven * float(rng.normal())
             builder.box(along, across, -0.6, (4.0, thick, max(top, 0.2) + 0.6), stone, cross)
             if pillars:
@@ -40,7 +40,7 @@ def fence(builder: Builder, stretch: Stretch) -> None:
     reflectance = float(rng.uniform(0.15, 0.55))
     board = (reflectance, 0.4, float(rng.choice([0.0, 0.3, 0.6, 0.8, 0.93])))
     for along in stretch.along(step):
-        if builder.claim(along, across, step - 0.2, 0.05, cross):
+        if builder.reserve(along, across, step - 0.2, 0.05, cross):
             builder.box(along, across, 0.08, (step, 0.04, height - 0.1), board, cross)
             builder.box(along + step / 2, across, -0.3, (0.09, 0.09, height + 0.35), (reflectance, 0.4, 0.0), cross)
 
@@ -55,7 +55,7 @@ def railing(builder: Builder, stretch: Stretch) -> None:
     bars: Material = (iron[0], 0.5, float(rng.uniform(0.4, 0.85)))
     step = float(rng.uniform(2.0, 4.0))
     for along in stretch.along(step):
-        if builder.claim(along, across, step - 0.3, thick, cross):
+        if builder.reserve(along, across, step - 0.3, thick, cross):
             builder.box(along, across, -0.5, (step, thick, base + 0.5), stone, cross)
             builder.box(along, across, base, (step, 0.03, max(top - base, 0.1)), bars, cross)
             builder.box(along, across, top - 0.04, (step, 0.05, 0.06), iron, cross)
@@ -71,7 +71,7 @@ def bars(builder: Builder, stretch: Stretch) -> None:
     steel: Material = (float(rng.uniform(0.15, 0.5)), 0.5, 0.0)
     levels = int(rng.integers(1, 4))
     for along in stretch.along(step):
-        if builder.claim(along, across, step - 0.1, 0.05, cross):
+        if builder.reserve(along, across, step - 0.1, 0.05, cross):
             builder.post(along - step / 2, across, -0.2, height + 0.2, 0.03, steel[0], cross)
             for level in range(levels):
                 builder.box(along, across, height * (level + 1) / levels - 0.05, (step, 0.05, 0.05), steel, cross)
@@ -84,7 +84,7 @@ def guard_rail(builder: Builder, stretch: Stretch) -> None:
     across, cross = stretch.side * stretch.away_m, stretch.cross
     double, low = bool(rng.random() < 0.3), float(rng.uniform(0.35, 0.5))
     for along in stretch.along(4.0):
-        if builder.claim(along, across, 3.6, 0.1, cross):
+        if builder.reserve(along, across, 3.6, 0.1, cross):
             builder.box(along, across, low, (4.0, 0.08, 0.31), steel, cross)
             if double:
                 builder.box(along, across + 0.4 * stretch.side, low, (4.0, 0.08, 0.31), steel, cross)
@@ -98,7 +98,7 @@ def concrete_barrier(builder: Builder, stretch: Stretch) -> None:
     stone: Material = (float(rng.uniform(0.2, 0.45)), 0.3, 0.0)
     height = float(rng.uniform(0.75, 1.1))
     for along in stretch.along(3.0):
-        if builder.claim(along, across, 2.9, 0.6, cross):
+        if builder.reserve(along, across, 2.9, 0.6, cross):
             builder.box(along, across, -0.2, (2.95, 0.6, 0.4), stone, cross)
             builder.box(along, across, 0.2, (2.95, 0.25, height - 0.2), stone, cross)
 
@@ -112,7 +112,7 @@ def building(builder: Builder, stretch: Stretch) -> None:
     for middle in stretch.along(width):
         away = stretch.away_m + uneven * rng.random()
         passage = 0.0 if rng.random() < 0.7 else float(rng.uniform(0.8, 3.0))
-        if builder.claim(middle, stretch.side * (away + 0.2 + depth / 2), 0.9 * width, depth, stretch.cross):
+        if builder.reserve(middle, stretch.side * (away + 0.2 + depth / 2), 0.9 * width, depth, stretch.cross):
             _house(builder, middle, stretch.side, away, (width - passage, depth, height), stretch.cross)
 
 
@@ -144,7 +144,7 @@ def _before_house(builder: Builder, place: float, side: float, away: float, ston
     extra, long = rng.random(), float(rng.uniform(1.2, 3.0))
     if extra < 0.25:  # stairs
         steps = int(rng.integers(1, 5))
-        if builder.claim(place, side * (away - 0.15 * steps), long, 0.3 * steps, cross):
+        if builder.reserve(place, side * (away - 0.15 * steps), long, 0.3 * steps, cross):
             for i in range(steps):
                 deep = 0.3 * (steps - i)
                 builder.box(place, side * (away - deep / 2), -0.3, (long, deep, 0.3 + 0.17 * (i + 1)), stone, cross)
@@ -152,15 +152,15 @@ def _before_house(builder: Builder, place: float, side: float, away: float, ston
         builder.box(place, side * (away - 0.5), 2.3, (long, 1.0, 1.1), stone, cross)
     elif extra < 0.5:  # awning
         builder.box(place, side * (away - 0.7), 2.2, (1.5 * long, 1.4, 0.12), (0.4, 0.3, 0.0), cross)
-    elif extra < 0.62 and builder.claim(place, side * (away - 0.35), long, 0.7, cross):  # bay window
+    elif extra < 0.62 and builder.reserve(place, side * (away - 0.35), long, 0.7, cross):  # bay window
         builder.box(place, side * (away - 0.35), -0.5, (long, 0.7, 4.0), stone, cross)
-    elif extra < 0.7 and builder.claim(place, side * (away - 0.6), 0.2, 0.2, cross):  # porch
+    elif extra < 0.7 and builder.reserve(place, side * (away - 0.6), 0.2, 0.2, cross):  # porch
         builder.post(place, side * (away - 0.7), -0.2, 2.6, 0.07, stone[0], cross)
         builder.box(place, side * (away - 0.5), 2.3, (2.0, 1.2, 0.2), stone, cross)
 
 
 def close_view(builder: Builder, along: float, half_width: float) -> None:
-    """What stands across the end of a street: a wood or a house."""
+    """Close the end of a street with a wood or a house."""
     rng = builder.rng
     if rng.random() < 0.6:
         wood_across(builder, along, half_width)
@@ -169,7 +169,7 @@ def close_view(builder: Builder, along: float, half_width: float) -> None:
     glass: Material = (float(rng.uniform(0.03, 0.25)), 2.0, 0.0)
     wide, toward = float(rng.uniform(9.0, 20.0)), -1.0 if along > 0 else 1.0
     middle = float(rng.normal(0.0, 3.0))
-    if builder.claim(along, middle, 6.0, wide):
+    if builder.reserve(along, middle, 6.0, wide):
         builder.box(along, middle, -1.5, (6.0, wide, 9.0), glass)
         front = along + 3.1 * toward
         builder.box(front, middle, -1.5, (0.2, wide, 2.3), stone)
@@ -186,7 +186,7 @@ def garages(builder: Builder, stretch: Stretch) -> None:
     gate: Material = (float(rng.uniform(0.1, 0.4)), 0.5, 0.0)
     away = stretch.away_m + float(rng.choice([0.0, 2.0, 5.0]))
     for along in stretch.along(3.0):
-        if not builder.claim(along, side * (away + depth / 2), 2.9, depth, cross):
+        if not builder.reserve(along, side * (away + depth / 2), 2.9, depth, cross):
             continue
         recess = float(rng.uniform(0.1, 0.5)) if rng.random() < 0.85 else depth - 0.4
         builder.box(
@@ -205,7 +205,7 @@ def open_roof(builder: Builder, stretch: Stretch) -> None:
     radius = float(rng.uniform(0.04, 0.15))
     for along in stretch.along(float(rng.uniform(2.0, 4.0))):
         for away in (0.1, deep - 0.1):
-            if builder.claim(along, side * (stretch.away_m + away), 2 * radius, 2 * radius, cross):
+            if builder.reserve(along, side * (stretch.away_m + away), 2 * radius, 2 * radius, cross):
                 builder.post(along, side * (stretch.away_m + away), -0.2, height + 0.2, radius, beam[0], cross)
     middle = side * (stretch.away_m + deep / 2)
     builder.box(stretch.middle_m, middle, height, (stretch.length_m, deep, 0.2), beam, cross)
@@ -219,7 +219,7 @@ def scaffolding(builder: Builder, stretch: Stretch) -> None:
     building(builder, Stretch(stretch.start_m, stretch.length_m, side, stretch.away_m + 1.3, cross))
     for along in stretch.along(2.2):
         for away in (0.0, 0.8):
-            if builder.claim(along, side * (stretch.away_m + away), 0.08, 0.08, cross):
+            if builder.reserve(along, side * (stretch.away_m + away), 0.08, 0.08, cross):
                 builder.post(along, side * (stretch.away_m + away), -0.1, 6.0, 0.03, 0.4, cross)
         for level in (0.15, 2.1):
             builder.box(along, side * (stretch.away_m + 0.4), level, (2.2, 0.7, 0.05), wood, cross)
@@ -342,7 +342,7 @@ def lawn(builder: Builder, stretch: Stretch) -> None:
         tree(builder, stretch.middle_m, stretch.side * away, stretch.cross)
 
 
-# What stands beside a kind of street, by share.
+# Shares of the linings of each kind of street.
 LININGS: dict[str, dict[Lining, float]] = {
     "residential": {
         building: 0.28,

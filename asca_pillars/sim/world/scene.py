@@ -21,7 +21,7 @@ from asca_pillars.sim.world.streets import draw_ground, draw_kind, draws_of
 # Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
 KEPT_CLEAR_M = 6.0, 4.0
 BEAM_M_PER_M = 0.004  # width of a laser's beam per metre of distance
-# Of cars, of people on foot and of cyclists.
+# Factors on the rates of cars, people on foot and cyclists.
 RATE_FACTORS = {
     "residential": (1.15, 0.75, 0.9),
     "urban": (1.0, 1.5, 1.2),

@@ -3,18 +3,16 @@
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.world.builder import Builder, Stretch
-
-Floats = npt.NDArray[np.float64]
 
 # Far clusters are larger and fewer, as no ray tells the difference.
 FINEST, FINE_WITHIN_M, COARSER_PER_M = 0.75, 8.0, 0.033
 
 
 def coarseness(builder: Builder, along: float, across: float, cross: bool) -> float:
-    """How many times larger clusters of leaves may be at a place than some 17 m away."""
+    """Factor on the size of leaf clusters at a place, relative to those some 17 m away."""
     x, y, _ = builder.to_lidar(along, across, cross)
     return FINEST + COARSER_PER_M * max(math.hypot(x, y) - FINE_WITHIN_M, 0.0)
 
@@ -25,7 +23,7 @@ def hedge(builder: Builder, stretch: Stretch) -> None:
     height, thick = float(rng.uniform(0.7, 2.8)), float(rng.uniform(0.5, 1.4))
     across = stretch.side * (stretch.away_m + thick / 2)
     gaps = 0.0 if rng.random() < 0.6 else 0.2
-    starts = [a for a in stretch.along(2.4) if rng.random() >= gaps and builder.claim(a, across, 2.3, thick, cross)]
+    starts = [a for a in stretch.along(2.4) if rng.random() >= gaps and builder.reserve(a, across, 2.3, thick, cross)]
     if not starts:
         return
     step = 0.55 * coarseness(builder, stretch.middle_m, across, cross)
@@ -37,7 +35,7 @@ def hedge_block(builder: Builder, along: float, across: float) -> None:
     """A hedge cut to a block, as large as a car or a person."""
     rng = builder.rng
     length, width, height = rng.uniform(0.6, 4.5), rng.uniform(0.5, 1.8), rng.uniform(0.6, 2.0)
-    if builder.claim(along, across, float(length), float(width)):
+    if builder.reserve(along, across, float(length), float(width)):
         places = along + np.arange(-length / 2 + 0.3, length / 2 - 0.2, 0.5)
         _leaves_of_hedge(builder, places, across, (0.5, float(width), float(height)), cross=False)
 
@@ -68,7 +66,7 @@ def wood(builder: Builder, stretch: Stretch) -> None:
     """The dense edge of a wood or an overgrown slope, as it closes most views in KITTI; trunks in front of it."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     front = side * (stretch.away_m + 1.0)
-    free = np.array([a for a in stretch.along(3.0) if builder.claim(a, front, 2.9, 1.8, cross)])
+    free = np.array([a for a in stretch.along(3.0) if builder.reserve(a, front, 2.9, 1.8, cross)])
     if not len(free):
         return
     coarse = coarseness(builder, stretch.middle_m, front, cross)
@@ -81,7 +79,7 @@ def wood(builder: Builder, stretch: Stretch) -> None:
     waves = 0.6 * np.sin(along * rng.uniform(0.3, 1.2) + rng.uniform(0.0, 6.0))
     away = stretch.away_m + 0.7 + waves + np.abs(rng.normal(0.0, 0.6, count))
     _clusters(builder, along, side * away, rng.uniform(0.1, height, count), radius, density, cross)
-    # What comes through meets the inside of the wood.
+    # Rays that come through meet the inside of the wood.
     deep = max(count // 6, 2)
     along = rng.choice(free, deep) + rng.uniform(-1.5, 1.5, deep)
     away = stretch.away_m + rng.uniform(2.0, 5.0, deep)
@@ -98,7 +96,7 @@ def overgrow(builder: Builder, stretch: Stretch) -> None:
     for _ in range(1 + int(stretch.length_m / 8.0)):
         middle, long = stretch.start_m + rng.uniform(0.0, stretch.length_m), rng.uniform(0.4, 3.0)
         height, deep = rng.uniform(0.5, 3.0), rng.uniform(0.15, 0.7)
-        if not builder.claim(float(middle), side * (stretch.away_m - deep), 2 * long, deep, cross):
+        if not builder.reserve(float(middle), side * (stretch.away_m - deep), 2 * long, deep, cross):
             continue
         count = max(int(2 * long * height * 0.5 / radius**2), 3)
         # Thinner upward and to its ends.
@@ -112,7 +110,7 @@ def wood_across(builder: Builder, along: float, half_width: float) -> None:
     """A wood's edge across the road's direction, where the view ends."""
     rng = builder.rng
     places = np.arange(-half_width, half_width, 3.0)
-    free = np.array([v for v in places if builder.claim(along, float(v), 1.8, 2.9)])
+    free = np.array([v for v in places if builder.reserve(along, float(v), 1.8, 2.9)])
     if not len(free):
         return
     radius = 0.4 * coarseness(builder, along, 0.0, cross=False)
@@ -174,7 +172,7 @@ def trunk(builder: Builder, along: float, across: float, height: float, cross: b
     rng = builder.rng
     thick = rng.random() < builder.config.thick_trunks
     radius = float(rng.uniform(0.175, 0.30) if thick else np.exp(rng.uniform(np.log(0.06), np.log(0.40))))
-    if not builder.claim(along, across, 2.4 * radius, 2.4 * radius, cross):
+    if not builder.reserve(along, across, 2.4 * radius, 2.4 * radius, cross):
         return False
     boles = 1 if thick else int(rng.choice([1, 1, 1, 2, 3]))
     bark = float(rng.uniform(0.1, 0.4))
@@ -212,7 +210,7 @@ def shrub(builder: Builder, along: float, across: float, cross: bool = False, ta
     else:
         wide = float(rng.uniform(0.4, 1.2) if tall else rng.uniform(0.2, 0.7))
         height = float(rng.uniform(1.0, 3.0) if tall else rng.uniform(0.3, 1.4))
-    if builder.claim(along, across, 1.6 * wide, 1.6 * wide, cross):
+    if builder.reserve(along, across, 1.6 * wide, 1.6 * wide, cross):
         density = float(np.exp(rng.uniform(np.log(1.0), np.log(8.0))))
         crown(builder, along, across, 0.5 * height, (0.8 * wide, 0.45 * height), density, cross)
 
@@ -221,7 +219,7 @@ def weeds(builder: Builder, along: float, across: float) -> None:
     """Tufts of grass, weeds and leaves, knee-high at most, along a kerb or anywhere."""
     rng = builder.rng
     long, wide = float(rng.uniform(0.3, 4.0)), float(rng.uniform(0.2, 0.9))
-    if builder.claim(along, across, long, wide):
+    if builder.reserve(along, across, long, wide):
         count = 2 + int(4.0 * long * wide**0.5)
         radii = rng.uniform(0.08, 0.28, (count, 1)) * rng.uniform(0.7, 1.4, (count, 3))
         places = along + long * rng.uniform(-0.5, 0.5, count), across + wide * rng.uniform(-0.5, 0.5, count)
@@ -233,7 +231,7 @@ def bush(builder: Builder, along: float, across: float) -> None:
     """A bush or a clump of them as large as a car, broad at the foot or at the top."""
     rng = builder.rng
     long, wide, height = float(rng.uniform(0.7, 2.3)), float(rng.uniform(0.6, 1.3)), float(rng.uniform(0.9, 2.6))
-    if not builder.claim(along, across, 1.8 * long, 1.8 * wide):
+    if not builder.reserve(along, across, 1.8 * long, 1.8 * wide):
         return
     count = int(30 * long * wide * height**0.5)
     up = rng.random(count)

@@ -36,7 +36,7 @@ def frame(
     truncated: Sequence[float] | None = None,
     counted: Sequence[bool] | None = None,
     object_points: Sequence[int] | None = None,
-    excused: Sequence[bool] | None = None,
+    ignored: Sequence[bool] | None = None,
 ) -> ErrorFrame:
     """A frame of (type, box) and (type, score, box)."""
     return ErrorFrame(
@@ -51,7 +51,7 @@ def frame(
         found=np.array([box for *_, box in found], np.float64).reshape(-1, 7),
         found_types=tuple(kind for kind, *_ in found),
         scores=np.array([score for _, score, _ in found], np.float64),
-        excused=np.array([False] * len(found) if excused is None else excused, bool),
+        ignored=np.array([False] * len(found) if ignored is None else ignored, bool),
     )
 
 

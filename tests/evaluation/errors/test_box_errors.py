@@ -101,11 +101,11 @@ def test_kinds_of_detections() -> None:
         ("Car", 0.7, van),  # neither right nor wrong
         ("Car", 0.6, rider),  # on a cyclist
         ("Car", 0.6, np.add(CAR, [30, 0, 0, 0, 0, 0, 0])),  # on nothing
-        ("Car", 0.5, np.add(CAR, [40, 0, 0, 0, 0, 0, 0])),  # on nothing, excused
+        ("Car", 0.5, np.add(CAR, [40, 0, 0, 0, 0, 0, 0])),  # on nothing, ignored
         ("Car", 0.1, np.add(CAR, [50, 0, 0, 0, 0, 0, 0])),  # not reported
         ("Cyclist", 0.9, rider),
     ]
-    made = frame([("Car", CAR), ("Van", van), ("Cyclist", rider)], found, excused=[False] * 5 + [True] + [False] * 2)
+    made = frame([("Car", CAR), ("Van", van), ("Cyclist", rider)], found, ignored=[False] * 5 + [True] + [False] * 2)
     objects, detections = match_frame(made, 3, "Car", 0.3)
     assert [(item.kind, item.label) for item in detections] == [
         ("found", ""),

@@ -34,7 +34,7 @@ def rewritten(folder: Path, **changes) -> list[KittiObject]:
 
 def test_objects_count_within_the_limits_of_moderate(frames: KittiErrorFrames) -> None:
     made = frames.read("000000")
-    assert made.types == ("Car", "Car", "Pedestrian", "Cyclist") and made.counted.all() and not made.excused.any()
+    assert made.types == ("Car", "Car", "Pedestrian", "Cyclist") and made.counted.all() and not made.ignored.any()
     assert (made.object_points > 30).all()
     np.testing.assert_allclose(made.found, made.objects, atol=1e-3)
     for changes in ({"occluded": 2}, {"truncated": 0.5}, {"bbox": (0.0, 100.0, 50.0, 120.0)}, {"type": "Van"}):
@@ -47,14 +47,14 @@ def test_objects_count_within_the_limits_of_moderate(frames: KittiErrorFrames) -
     assert made.object_points[0] == 0 and not made.counted[0], "nobody can find what holds no point"
 
 
-def test_detections_in_dont_care_areas_and_low_ones_are_excused(frames: KittiErrorFrames) -> None:
+def test_detections_in_dont_care_areas_and_low_ones_are_ignored(frames: KittiErrorFrames) -> None:
     car, *_ = read_labels(frames.labels / "000000.txt")
     area = KittiObject("DontCare", -1, -1, -10, car.bbox, -1, -1, -1, -1000, -1000, -1000, -10)
     write_labels(frames.labels / "000000.txt", [*read_labels(frames.labels / "000000.txt"), area])
     made = frames.read("000000")
-    assert made.excused[0] and len(made.objects) == 4
+    assert made.ignored[0] and len(made.objects) == 4
     rewritten(frames.predictions, bbox=(0.0, 100.0, 50.0, 120.0))
-    assert frames.read("000000").excused[0]
+    assert frames.read("000000").ignored[0]
 
 
 def test_boxes_are_seen_from_the_sensor(tmp_path: Path) -> None:

@@ -57,11 +57,13 @@ def test_the_bar_of_a_ratio_bounds_both_sides(value: float, kept: bool) -> None:
 
 
 def test_few_real_objects_excuse_what_chance_explains() -> None:
-    assert Row("reflectance", "van", None, None, "distance", 0.3, 0.15, noise=0.33).excused
-    assert not Row("reflectance", "van", None, None, "distance", 0.3, 0.15, noise=0.29).excused
-    assert not Row("reflectance", "van", None, None, "distance", 0.1, 0.15, noise=0.33).excused, "nothing to excuse"
-    assert Row("points per car", "at 10 m", 100, 80, "ratio", 0.8, 0.15, noise=0.21).excused
-    assert not Row("points per car", "at 10 m", 100, 80, "ratio", 0.8, 0.15).excused
+    assert Row("reflectance", "van", None, None, "distance", 0.3, 0.15, noise=0.33).within_noise
+    assert not Row("reflectance", "van", None, None, "distance", 0.3, 0.15, noise=0.29).within_noise
+    assert not Row("reflectance", "van", None, None, "distance", 0.1, 0.15, noise=0.33).within_noise, (
+        "nothing to excuse"
+    )
+    assert Row("points per car", "at 10 m", 100, 80, "ratio", 0.8, 0.15, noise=0.21).within_noise
+    assert not Row("points per car", "at 10 m", 100, 80, "ratio", 0.8, 0.15).within_noise
 
 
 def test_what_cannot_be_compared_is_said(measured: Measured, tmp_path: Path) -> None:

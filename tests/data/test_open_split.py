@@ -8,21 +8,21 @@ import pytest
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.open_split import labels_beside
+from asca_pillars.data.open_split import labels_of_scan
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.scenes import write_dataset
 
 
 def test_kitti(tmp_path: Path) -> None:
     split = KittiSplit(write_dataset(tmp_path / "kitti", 1))
-    boxes = labels_beside(split.scan_path("000000"))
+    boxes = labels_of_scan(split.scan_path("000000"))
     assert boxes is not None and len(boxes)
     np.testing.assert_array_equal(boxes, split.labeled_boxes("000000").boxes)
     split.label_path("000000").write_text("damaged")
     with pytest.raises(DatasetError, match=r"000000\.txt:1"):
-        labels_beside(split.scan_path("000000"))
+        labels_of_scan(split.scan_path("000000"))
     split.label_path("000000").unlink()
-    assert labels_beside(split.scan_path("000000")) is None
+    assert labels_of_scan(split.scan_path("000000")) is None
 
 
 def test_boxes_are_in_the_frame_of_the_scan(tmp_path: Path) -> None:
@@ -30,12 +30,12 @@ def test_boxes_are_in_the_frame_of_the_scan(tmp_path: Path) -> None:
     (root / "dataset.yaml").write_text("{axes: y-forward, labels: labels.jsonl}\n")
     box = [[-3, 12, -1, 4, 2, 1.5, 1.2]]
     (root / "labels.jsonl").write_text(json_line("000000.bin", records_from(np.array(box), ["Car"])))
-    boxes = labels_beside(root / "scans" / "000000.bin")
+    boxes = labels_of_scan(root / "scans" / "000000.bin")
     assert boxes is not None
     np.testing.assert_allclose(boxes, box, atol=1e-4)
-    assert labels_beside(root / "scans" / "000001.bin") is None  # without a line
-    assert labels_beside(tmp_path / "own" / "elsewhere.bin") is None  # not one of its scans
+    assert labels_of_scan(root / "scans" / "000001.bin") is None  # without a line
+    assert labels_of_scan(tmp_path / "own" / "elsewhere.bin") is None  # not one of its scans
 
 
 def test_none(tmp_path: Path) -> None:
-    assert labels_beside(tmp_path / "scan.bin") is None
+    assert labels_of_scan(tmp_path / "scan.bin") is None
