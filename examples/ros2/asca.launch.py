@@ -1,4 +1,4 @@
-"""ros2 launch asca.launch.py topic:=/ouster/points arguments:="--around --track" """
+"""Starts the node: `ros2 launch asca.launch.py topic:=/ouster/points arguments:="--around --track"`."""
 
 import shlex
 from typing import Any
