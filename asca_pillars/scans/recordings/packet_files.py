@@ -1,8 +1,7 @@
 """Captures of a sensor's packets (`.pcap`), cut into scans of one revolution by the libraries that know the packets.
 
-Ouster's by its maker's `ouster-sdk`, with the sensor's metadata in a `.json` beside the capture, of the same name or its
-beginning;
-Velodyne's by `velodyne-decoder`.
+Ouster's by its maker's `ouster-sdk`, with the sensor's metadata in a `.json` beside the capture, whose name is the
+capture's or its beginning; Velodyne's by `velodyne-decoder`.
 """
 
 from collections.abc import Iterator
