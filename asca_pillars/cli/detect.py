@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from asca_pillars.base.errors import ConfigError, ScanError
+from asca_pillars.base.errors import ConfigError, PartialError
 from asca_pillars.cli.options import (
     AroundOption,
     AxesOption,
@@ -24,6 +24,7 @@ from asca_pillars.cli.options import (
     read_scores,
     scan_settings,
 )
+from asca_pillars.data.importing.formats import TOOLS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -78,6 +79,14 @@ def detect(
         Path | None,
         typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
     ] = None,
+    write: Annotated[
+        str | None,
+        typer.Option(
+            "--write",
+            metavar="FORMAT",
+            help=f"Also write the boxes as labels to correct, to OUT/FORMAT: {', '.join(TOOLS)} (docs/LABELLING.md).",
+        ),
+    ] = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
@@ -86,7 +95,7 @@ def detect(
     line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image. Labels beside
     the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white.
 
-    A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
+    A scan that cannot be read is named and left out; the others are detected, and the exit code is 3.
 
     A recording (.mcap, .db3, .bag, a rosbag2 folder) is detected scan by scan; OUT/detections.jsonl has a line for
     each, with its time. After a kill the same command goes on where it was.
@@ -115,13 +124,19 @@ def detect(
     from asca_pillars.scans.recordings.open_recording import is_recording
 
     console = Console(markup=False)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     reading = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
     recordings = [path for path in scans or () if is_recording(path)]
+    if write is not None:
+        from asca_pillars.data.importing.tool_labels import require_unchanged
+
+        if recordings:
+            raise ConfigError(f"--write {write}: labels belong to scan files, and {recordings[0]} is a recording")
+        require_unchanged(out, write)
     if recordings:
         if cluster is not None or len(scans or ()) > 1:
             raise ConfigError(f"{recordings[0]}: is a recording; give one alone, without --cluster")
@@ -172,6 +187,7 @@ def detect(
                 progress=bars,
                 remark=bars.remark,
             )
+        _write_labels(out, write, console)
         _print_archive(archive, out, console)
         return
     from asca_deploy.detect_scans import detect_scans
@@ -188,11 +204,21 @@ def detect(
             progress=bars,
             failed=lambda line: print(f"asca: {line}", file=sys.stderr),
         )
+    _write_labels(out, write, console)
     _print_scans(found, out, console)
 
 
+def _write_labels(out: Path, name: str | None, console: "Console") -> None:
+    """Write the boxes of the run that `out` holds as labels of a tool, if one was named."""
+    if name is not None:
+        from asca_deploy.result_files import RUN_FILE
+        from asca_pillars.data.importing.tool_labels import write_prelabels
+
+        console.print(f"Labels to correct: {write_prelabels(out / RUN_FILE, name, out)}/", soft_wrap=True)
+
+
 def _print_scans(found: "DetectedScans", out: Path, console: "Console") -> None:
-    """Print boxes or a line per scan, remarks and times; ScanError if some scans failed."""
+    """Print boxes or a line per scan, remarks and times; PartialError if some scans failed."""
     from asca_deploy.auto import summary
     from asca_pillars.cli import detect_tables as show
 
@@ -210,24 +236,24 @@ def _print_scans(found: "DetectedScans", out: Path, console: "Console") -> None:
     console.print(show.timing(reports[1:], detector))
     console.print(f"Results: {out}/")
     if unwritten := len(found.failed) - found.unreadable:
-        raise ScanError(f"results of {unwritten} of {asked} scans could not be written; they are named above")
+        raise PartialError(f"results of {unwritten} of {asked} scans could not be written; they are named above")
     if found.unreadable:
-        raise ScanError(f"{found.unreadable} of {asked} scans could not be read; they are named above")
+        raise PartialError(f"{found.unreadable} of {asked} scans could not be read; they are named above")
 
 
 def _print_recording(found: "RecordingResult", console: "Console") -> None:
-    """Print counts and files; ScanError if parts of the recording could not be read."""
+    """Print counts and files; PartialError if parts of the recording could not be read."""
     boxes = ", ".join(f"{count} {name}" for name, count in found.boxes.items())
     console.print(f"{found.scans} scans, in all {boxes}", highlight=False)
     if found.cpu_ms_per_scan is not None:
         console.print(f"{found.cpu_ms_per_scan:.1f} ms of CPU per scan")
     console.print(f"Results: {', '.join(map(str, found.files))}", soft_wrap=True)
     if found.problems:
-        raise ScanError("; ".join(found.problems))
+        raise PartialError("; ".join(found.problems))
 
 
 def _print_archive(found: "ArchiveResult", out: Path, console: "Console") -> None:
-    """Print counts; ScanError if some scans could not be read."""
+    """Print counts; PartialError if some scans could not be read."""
     from asca_deploy.result_files import RUN_FILE, UNREADABLE_FILE
 
     detected, unreadable = found.counts
@@ -238,4 +264,6 @@ def _print_archive(found: "ArchiveResult", out: Path, console: "Console") -> Non
     console.print(f"{detected} scans: {out / RUN_FILE}", highlight=False, soft_wrap=True)
     if unreadable:
         named = out / UNREADABLE_FILE
-        raise ScanError(f"{unreadable} of {detected + unreadable} scans could not be read; they are named in {named}")
+        raise PartialError(
+            f"{unreadable} of {detected + unreadable} scans could not be read; they are named in {named}"
+        )

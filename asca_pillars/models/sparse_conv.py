@@ -38,7 +38,7 @@ def linear_rows(features: Tensor, weight: Tensor, bias: Tensor | None = None) ->
 CHUNK_VALUES = 1 << 20  # gathered at a time: on a CPU they stay in its cache; all at once would be memory-bound
 
 
-def table_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
+def rulebook_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
     """A convolution without bias at M output cells: (N, C) -> (M, outputs).
 
     Under autocast it computes in the lower precision, as a convolution would.
@@ -53,11 +53,11 @@ def table_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor | N
     device = features.device.type
     if torch.is_autocast_enabled(device):
         features, weight = (each.to(torch.get_autocast_dtype(device)) for each in (features, weight))
-    result: Tensor = _TableConv.apply(features, weight, table, table.flip(1) if back is None else back)
+    result: Tensor = _RulebookConv.apply(features, weight, table, table.flip(1) if back is None else back)
     return result
 
 
-class _TableConv(torch.autograd.Function):
+class _RulebookConv(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, table: Tensor, back: Tensor) -> Tensor:
         ctx.save_for_backward(features, weight, table, back)

@@ -19,7 +19,7 @@ from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config, ModelConfig
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.checkpoint_file import read_plain, unread
+from asca_pillars.models.checkpoint_file import read_failure, read_plain
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
@@ -141,7 +141,7 @@ def _why_unusable(path: Path, model: ModelConfig) -> str | None:
     try:
         content = read_plain(path)
     except _UNREADABLE as error:
-        return f"is damaged ({unread(error)})"
+        return f"is damaged ({read_failure(error)})"
     if "state_dict" not in content:
         return "is no checkpoint of a run (no 'state_dict')"
     if any(name not in content for name in _OF_A_RUN):

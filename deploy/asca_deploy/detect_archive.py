@@ -261,7 +261,7 @@ def _job(
     spec = load_bundle(bundle).spec  # a damaged one is named here, not by every worker
     if score is not None:
         spec.with_score_threshold(score)
-    given = options.bundle
+    given = None if options.bundle is None else Path(options.bundle)
     return DetectShard(
         shards=out.absolute() / SHARDS,
         start=Path.cwd(),
@@ -302,7 +302,7 @@ def _scores(job: DetectShard) -> ScoreThresholds | None:
 @lru_cache(maxsize=1)
 def _detector(job: DetectShard) -> Detector:
     """Opened once in a worker's process."""
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # warnings are in the lines
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # warnings are in the lines
     detector = open_detector(job.options, _scores(job), job.mounting, around=job.around)
     if bundle_digest(detector.folder) != job.bundle_sha256:
         raise BundleError(f"{detector.folder}: is another bundle than the command's; give every machine the same one")

@@ -229,6 +229,7 @@ def scan_content(path: Path, scan: Scan, detections: ScanDetections, scope: Dete
         "frame": "that of the scan; box centers; yaw about z, from x towards y",
         "boxes": detections.to_dicts(),
         "detector": scope.to_json(),
+        "made_by": dict(detections.made_by),
         **asdict(report.counts),
         "passes": report.passes,
         "points_not_finite": report.non_finite_points + notes.dropped_points,

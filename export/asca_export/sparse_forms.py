@@ -23,7 +23,7 @@ from asca_export.row_graphs import RowGraph
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck, block_layers
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.ops.pillar.neck_rulebooks import SAME, NeckTables, table_inputs
+from asca_pillars.ops.pillar.neck_rulebooks import SAME, NeckRulebooks, rulebook_inputs
 
 
 class NeckProduct(NamedTuple):
@@ -95,9 +95,9 @@ class SparseBackbone(nn.Module):
         assert isinstance(product, nn.Linear)
         return product
 
-    def passes(self, features: Tensor, tables: NeckTables[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
+    def passes(self, features: Tensor, tables: NeckRulebooks[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Name, what it reads and what it gives of each product in turn: unitless (P, C), or STEP_VALUE times steps."""
-        inputs, maps = table_inputs(tables), []
+        inputs, maps = rulebook_inputs(tables), []
         missing = self.empty * STEP_VALUE
         for level in self.levels:
             for layer in level.convolutions:
@@ -114,7 +114,7 @@ class SparseBackbone(nn.Module):
         joined = torch.cat(maps, dim=1)
         yield HEAD, joined, self.product(HEAD)(joined)
 
-    def forward(self, features: Tensor, tables: NeckTables[Tensor]) -> HeadMaps[Tensor]:
+    def forward(self, features: Tensor, tables: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
         """Pillar features (P, C) -> scores (H, A), boxes (H, 7A), directions (H, 2A) at H head cells."""
         for _, _, output in self.passes(features, tables):
             last = output
@@ -175,9 +175,9 @@ def export_sparse_backbone(
     graph.save(path, "sparse_backbone")
 
 
-def sparse_multiply_accumulates(backbone: SparseBackbone, tables: NeckTables[NDArray[np.int32]]) -> int:
+def sparse_multiply_accumulates(backbone: SparseBackbone, tables: NeckRulebooks[NDArray[np.int32]]) -> int:
     """Count of multiply-accumulates of the products on the scan that these tables, indices (M, 9), are of."""
-    inputs, total = table_inputs(tables), 0
+    inputs, total = rulebook_inputs(tables), 0
     for level in backbone.levels:
         for layer in level.convolutions:
             rows = len(inputs[layer.table])

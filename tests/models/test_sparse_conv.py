@@ -6,7 +6,7 @@ import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models import sparse_conv as module
-from asca_pillars.models.sparse_conv import table_conv
+from asca_pillars.models.sparse_conv import rulebook_conv
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
 from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
 
@@ -49,7 +49,7 @@ def test_equals_the_dense_convolution(
         volume.view(y, x, z, 3).permute(3, 2, 0, 1)[None], weight, None, convolution.stride, convolution.padding
     )
     expected = volume[0].permute(2, 3, 1, 0).reshape(-1, 5)[torch.from_numpy(target.cells)]
-    found = table_conv(features, weight, table, None if target is source else back)
+    found = rulebook_conv(features, weight, table, None if target is source else back)
     torch.testing.assert_close(found, expected)
     upstream = torch.randn_like(expected)
     for one, other in zip(
@@ -66,13 +66,13 @@ def test_gradients_are_those_of_finite_differences(convolution: Convolution) -> 
     source, _, tables = make_tables((4, 3, 4), convolution, share=0.3)
     features = torch.randn(len(source), 2, dtype=torch.float64, requires_grad=True)
     weight = torch.randn(3, 2, *convolution.kernel, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda f, w: table_conv(f, w, *tables), (features, weight))
+    assert torch.autograd.gradcheck(lambda f, w: rulebook_conv(f, w, *tables), (features, weight))
 
 
 def test_nothing_active_gives_nothing() -> None:
     _, _, (table, back) = make_tables((1, 8, 10), map_convolution(3, stride=2, padding=1), share=0)
     weight = torch.randn(3, 2, 1, 3, 3, requires_grad=True)
-    found = table_conv(torch.empty(0, 2), weight, table, back)
+    found = rulebook_conv(torch.empty(0, 2), weight, table, back)
     assert found.shape == (0, 3)
     found.sum().backward()
     assert weight.grad is not None and not weight.grad.any()
@@ -83,10 +83,10 @@ def test_autocast_computes_in_bfloat16_and_adds_up_in_float32() -> None:
     source, _, (table, back) = make_tables((1, 40, 40), map_convolution(3, padding=1), share=0.5)
     features = torch.randn(len(source), 8, requires_grad=True)
     weight = torch.randn(8, 8, 1, 3, 3, requires_grad=True)
-    expected = table_conv(features, weight, table, back)
+    expected = rulebook_conv(features, weight, table, back)
     (exact,) = torch.autograd.grad(expected.square().sum(), weight)
     with torch.autocast("cpu", torch.bfloat16):
-        found = table_conv(features, weight, table, back)
+        found = rulebook_conv(features, weight, table, back)
     assert found.dtype == torch.bfloat16
     torch.testing.assert_close(found.float(), expected, rtol=0.02, atol=0.2)
     (rounded,) = torch.autograd.grad(found.float().square().sum(), weight)
@@ -104,7 +104,7 @@ def test_the_same_bits_in_every_run() -> None:
         torch.set_num_threads(4)
         results = []
         for _ in range(20):
-            found = table_conv(features, weight, table, back)
+            found = rulebook_conv(features, weight, table, back)
             results.append((found.detach(), *torch.autograd.grad(found.square().sum(), (features, weight))))
     finally:
         torch.set_num_threads(threads)

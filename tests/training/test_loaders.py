@@ -75,7 +75,7 @@ def test_training_where_shared_memory_is_small(size: str, tmp_path: Path) -> Non
         [*small, *command, "--out", str(tmp_path / "run")], capture_output=True, text=True, timeout=300
     )
     if size == "4k":
-        assert run.returncode == 2 and len(run.stderr.splitlines()) == 1
+        assert run.returncode > 1 and len(run.stderr.splitlines()) == 1
         assert "data.workers=0" in run.stderr and "--shm-size" in run.stderr
     else:
         assert run.returncode == 0, run.stderr

@@ -16,7 +16,7 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint_file import read_plain, unread
+from asca_pillars.models.checkpoint_file import read_failure, read_plain
 from asca_pillars.models.openpcdet.links import Link, convert_state
 from asca_pillars.models.openpcdet.mmdetection3d_links import FIRST_LINEAR, FUSION, mmdetection3d_links
 from asca_pillars.models.openpcdet.pointpillars_links import pointpillars_links
@@ -63,8 +63,9 @@ def read_foreign(path: str | Path) -> ForeignWeights:
         content = load_weights_alone(path)
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
         raise TrainingError(
-            f"{path}: damaged, or holds more than weights, which is not read ({unread(error)}); where the library that "
-            "wrote it is installed, write a file with `model_state` (OpenPCDet) or `state_dict` (mmdetection3d) alone"
+            f"{path}: damaged, or holds more than weights, which is not read ({read_failure(error)}); "
+            "where the library that wrote it is installed, write a file with `model_state` (OpenPCDet) or `state_dict` "
+            "(mmdetection3d) alone"
         ) from error
     if "hyper_parameters" in content:
         raise TrainingError(f"{path}: a checkpoint of `asca train`, which needs no import; give it to `asca export`")

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.map_backbone import MapBackbone
-from asca_pillars.models.sparse_conv import at_active_cells, linear_rows, table_conv
+from asca_pillars.models.sparse_conv import at_active_cells, linear_rows, rulebook_conv
 from asca_pillars.ops.pillar.grid import HEAD_STRIDE, NECK_STRIDE
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebooks
 
 _STRIDES = (2, 2, 2)
 assert math.prod(_STRIDES) == NECK_STRIDE, "what the grid is made for"
@@ -41,7 +41,7 @@ class SparseRPNNeck(MapBackbone):
         # A tap's channels lie side by side in memory, as gathered rows do: products read the weights without a copy.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, pillars: Tensor, tables: NeckTables[Tensor]) -> Tensor:  # type: ignore[override]
+    def forward(self, pillars: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:  # type: ignore[override]
         """Unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
@@ -51,11 +51,11 @@ class SparseRPNNeck(MapBackbone):
                     (level.first, level.first_back),
                     (level.same, None),
                 )[min(number, 2)]
-                pillars = torch.relu(at_active_cells(norm, table_conv(pillars, convolution.weight, table, back)))
+                pillars = torch.relu(at_active_cells(norm, rulebook_conv(pillars, convolution.weight, table, back)))
             maps.append(_upsampled(deblock, pillars, level.places))
         return torch.cat(maps, dim=1)
 
-    def forward_dense(self, canvas: Tensor, tables: NeckTables[Tensor]) -> Tensor:
+    def forward_dense(self, canvas: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:
         """The same function by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):

@@ -18,7 +18,7 @@ from asca_pillars.models.pillar.loss import detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, PillarPreparation
 from asca_pillars.models.trainable import Trainable
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 from asca_pillars.ops.pillar.spec import PillarSpec
 
 
@@ -31,7 +31,7 @@ class PillarOutputs(NamedTuple):
     """
 
     maps: HeadMaps[Tensor]
-    neck: NeckTables[Tensor] | None
+    neck: NeckRulebooks[Tensor] | None
 
 
 class PillarDetector(Trainable):

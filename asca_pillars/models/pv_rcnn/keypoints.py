@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.two_stage.sets import SetAbstraction, found_once, mlp
+from asca_pillars.models.two_stage.sets import SetAbstraction, first_occurrences, mlp
 from asca_pillars.ops.points.neighbors import PointScale
 
 _SHARE = 4  # by which the impact's hidden layer is narrower, which the paper does not give
@@ -65,7 +65,7 @@ class AdaptiveScales(nn.Module):
         for lift, adjust, scale in zip(self.lift, self.adjust, scales, strict=True):
             assert isinstance(lift, SetAbstraction)
             grouped = lift.grouped(positions, features, scale.positions, scale.groups)  # (M, T, C)
-            features = adjust(grouped, found_once(scale.groups, positions.shape[0])).max(dim=1).values
+            features = adjust(grouped, first_occurrences(scale.groups, positions.shape[0])).max(dim=1).values
             positions = scale.positions
             found.append(features)
         joined = found[-1]
@@ -122,7 +122,7 @@ class PaperDeformation(nn.Module):
         offsets = F.pad(self.offset(around.features), (0, 0, 0, 1))  # linear: W (f_i - f_j) = W f_i - W f_j
         own = (_gathered(offsets, around.nearest) * around.nearest_weights[:, :, None]).sum(dim=1)  # (K, 16)
         relative, _ = _relative(around, index)  # v_j - v_i
-        found = found_once(index, around.positions.shape[0]).to(own)  # the sum has every neighbor once
+        found = first_occurrences(index, around.positions.shape[0]).to(own)  # the sum has every neighbor once
         difference = (own[:, None] - _gathered(offsets, index)) * found[:, :, None]
         mean = difference.transpose(1, 2) @ -relative / found.sum(dim=1).clamp(min=1)[:, None, None]  # (K, 16, 3)
         return [around.keypoints + torch.tanh(self.align(torch.relu(mean).flatten(1)))]

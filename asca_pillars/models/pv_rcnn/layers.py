@@ -17,7 +17,7 @@ from asca_pillars.models.map_backbone import (
 )
 from asca_pillars.models.pv_rcnn.keypoints import AdaptiveScales, AuthorsDeformation, PaperDeformation, Surroundings
 from asca_pillars.models.pv_rcnn.preparation import VoxelBatch, deformed_balls
-from asca_pillars.models.sparse_conv import table_conv
+from asca_pillars.models.sparse_conv import rulebook_conv
 from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, RoiHead, SourceRows
 from asca_pillars.models.two_stage.sets import SetAbstraction, VectorPool
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, Source, VoxelSetSettings
@@ -70,7 +70,7 @@ class DualAttention(nn.Module):
 _CONVS = 2  # submanifold convolutions of each level but the last
 
 
-class TableLayer(nn.Module):
+class SparseConvBlock(nn.Module):
     """A convolution by table, BatchNorm over active cells, ReLU; its weight has the shape of a dense convolution's."""
 
     def __init__(self, in_channels: int, channels: int, convolution: Convolution) -> None:
@@ -79,8 +79,8 @@ class TableLayer(nn.Module):
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
 
     def forward(self, features: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
-        """Unitless (N, in_channels) -> (M, channels), see `table_conv`."""
-        return torch.relu(self.norm(table_conv(features, self.convolution.weight, table, back)))
+        """Unitless (N, in_channels) -> (M, channels), see `rulebook_conv`."""
+        return torch.relu(self.norm(rulebook_conv(features, self.convolution.weight, table, back)))
 
 
 class VoxelBackbone(nn.Module):
@@ -96,12 +96,14 @@ class VoxelBackbone(nn.Module):
         super().__init__()
         *inner, out = channels
         self.down = nn.ModuleList(
-            TableLayer(before, after, convolution)
+            SparseConvBlock(before, after, convolution)
             for before, after, convolution in zip(channels[:-1], channels[1:], strided, strict=True)
         )
         reads = [in_channels, *inner[1:]]
         self.same = nn.ModuleList(
-            nn.ModuleList(TableLayer(read if number == 0 else width, width, SUBMANIFOLD) for number in range(_CONVS))
+            nn.ModuleList(
+                SparseConvBlock(read if number == 0 else width, width, SUBMANIFOLD) for number in range(_CONVS)
+            )
             for read, width in zip(reads, inner, strict=True)
         )
         self.out_channels = out
@@ -191,7 +193,9 @@ class PvRcnn(nn.Module):
         empty = features.new_zeros(frames * rows * columns * nz, features.shape[1])
         return empty.index_put((cells,), features).view(frames, rows, columns, -1)
 
-    def describe(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor], canvas: Tensor) -> tuple[Tensor, Tensor]:
+    def encode_keypoints(
+        self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor], canvas: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Weighted features (K, C) of the keypoints, and logits (K,) of their being part of an object."""
         cells = canvas.flatten(0, 2)
         bev = sum(

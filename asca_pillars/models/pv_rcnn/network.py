@@ -71,7 +71,7 @@ class PvRcnnDetector(Trainable):
         """Head maps, proposals and their refinements; training draws the proposals that it learns from."""
         scans = batch.scans
         if self.training and min(len(scans.keypoints), *(len(level.cells) for level in scans.levels)) < 2:
-            return self._silence(scans)  # no statistics of a batch
+            return self._zero_outputs(scans)  # no statistics of a batch
         first = self.network.propose(scans)
         proposals = self._proposals(first.maps, batch)
         with torch.autocast(first.canvas.device.type, enabled=False):  # positions need float32, `SetAbstraction`
@@ -131,7 +131,7 @@ class PvRcnnDetector(Trainable):
         self, scans: VoxelBatch[Tensor], first: FirstStageOutputs, proposals: Sequence[Detections]
     ) -> Refinements:
         levels, canvas = [level.float() for level in first.levels], first.canvas.float()
-        features, keypoint_logits = self.network.describe(scans, levels, canvas)
+        features, keypoint_logits = self.network.encode_keypoints(scans, levels, canvas)
         if self.training and not sum(map(len, proposals)):
             nothing = zero_of_weights(self.network.refine)
             return Refinements(
@@ -151,7 +151,7 @@ class PvRcnnDetector(Trainable):
         confidence, residuals = self.network.refine(scans.keypoints, features, points, indices)
         return Refinements(confidence, residuals, keypoint_logits)
 
-    def _silence(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
+    def _zero_outputs(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
         nothing, frames = zero_of_weights(self), len(scans.frame_keypoints)
         height, width, anchors, _ = self.model.spec.anchors.shape

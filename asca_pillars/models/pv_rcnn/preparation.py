@@ -168,7 +168,7 @@ class VoxelPreparation:
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
-        scan = voxel_scan(points, spec, self.settings, spec.table_builder(training=True))
+        scan = voxel_scan(points, spec, self.settings, spec.rulebook_builder(training=True))
         return TargetedVoxels(
             scan,
             assign_targets(

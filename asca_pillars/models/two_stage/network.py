@@ -74,7 +74,7 @@ class RefineDetector(Trainable):
         inputs = batch.inputs
         rows = min(len(inputs.points), len(inputs.keypoints), len(inputs.roi_features))
         if self.training and rows < 2:  # no statistics of a batch, and nothing to learn
-            return RefineOutputs(self._silence(inputs), batch.proposals)
+            return RefineOutputs(self._zero_outputs(inputs), batch.proposals)
         with torch.autocast(inputs.points.device.type, enabled=False):  # positions need float32, `SetAbstraction`
             found: Refinements = self.refiner(inputs)
         return RefineOutputs(found, batch.proposals)
@@ -97,7 +97,7 @@ class RefineDetector(Trainable):
         confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
         return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.refine.scores)
 
-    def _silence(self, inputs: RefineInputs) -> Refinements:
+    def _zero_outputs(self, inputs: RefineInputs) -> Refinements:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
         nothing = zero_of_weights(self)
         rois, keypoints = len(inputs.roi_features), len(inputs.keypoints)
@@ -154,12 +154,12 @@ def refine(
         post: suppression among the refined boxes.
         scores: of the refined boxes.
     """
-    confidence, residuals = judge(network, points, proposed, settings)
+    confidence, residuals = refine_logits(network, points, proposed, settings)
     values = refined_scores(proposed.proposals, confidence, scores)
     return refined_detections(proposed.proposals, values, residuals, post)
 
 
-def judge(
+def refine_logits(
     network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Confidence logits (R,) and residuals (R, 7) of the proposals of one scan, see `refine`."""

@@ -75,7 +75,7 @@ class SetAbstraction(nn.Module):
         return pairs
 
 
-def found_once(indices: Tensor, count: int) -> Tensor:
+def first_occurrences(indices: Tensor, count: int) -> Tensor:
     """(Q, T) 1 for what `ball_query` found, 0 where it repeats a ball's first member, and for index `count`."""
     again = (indices[:, 1:] != indices[:, :1]) & (indices[:, 1:] < count)
     return torch.cat([indices[:, :1] < count, again], dim=1).float()

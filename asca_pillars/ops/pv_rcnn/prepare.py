@@ -14,7 +14,7 @@ from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.detection.proposals import AnchorProposals
 from asca_pillars.ops.points.neighbors import PointScale, ball_query, point_scales, three_nearest
 from asca_pillars.ops.points.sampling import bilinear_cells, farthest_points
-from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, VoxelTableBuilder
+from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, VoxelRulebookBuilder
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import voxelize
 from asca_pillars.ops.two_stage.prepare import GridSettings
@@ -151,7 +151,7 @@ class VoxelScan(NamedTuple):
 
 
 def voxel_scan(
-    points: NDArray[np.float32], spec: VoxelSpec, settings: VoxelSetSettings, builder: VoxelTableBuilder
+    points: NDArray[np.float32], spec: VoxelSpec, settings: VoxelSetSettings, builder: VoxelRulebookBuilder
 ) -> VoxelScan:
     """Voxels, tables, keypoints and their neighbors of the finite points (N, 4) of one scan.
 
@@ -173,7 +173,7 @@ class VoxelizedScan(NamedTuple):
     counts: ScanCounts
 
 
-def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelTableBuilder) -> VoxelizedScan:
+def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelRulebookBuilder) -> VoxelizedScan:
     """Voxels and tables of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
     voxels = voxelize(points, spec.grid, builder.maps[0])
     counts = ScanCounts(len(points), voxels.points_outside, 0)

@@ -99,9 +99,9 @@ def detect_recording(
     topic: str | None = None,
     track: bool = False,
     odometry: str | None = None,
-    calib: Path | None = None,
-    foxglove: Path | None = None,
-    rerun: Path | None = None,
+    calib: str | Path | None = None,
+    foxglove: str | Path | None = None,
+    rerun: str | Path | None = None,
     options: RuntimeOptions = _PLAIN,
     reading: ScanSettings = _AS_TRAINED,
     score: ScoreThresholds | None = None,
@@ -139,9 +139,9 @@ def detect_recording(
         topic=topic,
         track=track,
         odometry=odometry,
-        calib=calib,
-        foxglove=foxglove,
-        rerun=rerun,
+        calib=None if calib is None else Path(calib),
+        foxglove=None if foxglove is None else Path(foxglove),
+        rerun=None if rerun is None else Path(rerun),
     )
     return _detect(task, reading, options, Reporter(progress, remark))
 
@@ -267,7 +267,7 @@ class _Run:
             yield
 
 
-def _thresholds(bundle: Path | None, score: ScoreThresholds | None) -> dict[str, float]:
+def _thresholds(bundle: str | Path | None, score: ScoreThresholds | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track; ConfigError if it is none."""
     spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)
@@ -305,6 +305,7 @@ def _about(
         "recording": str(task.path),
         "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files],
         "topic": topic,
+        "made_by": detector.made_by,
         "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         "runs_on": detector.runs_on,
         **detector_scope(detector.spec, around=task.around).to_json(),

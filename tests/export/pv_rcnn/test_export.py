@@ -204,7 +204,7 @@ def test_a_place_for_each_radius(trained: Trained, tmp_path: Path) -> None:
     widths = dataclasses.replace(NETWORK, source_widths=((8, 8), (8, 8)))
     network = tiny_detector(settings=settings, network=widths).eval().network
     export_deform(network, bundle, tmp_path / "deform.onnx")
-    scan = voxel_scan(SCANS[0], SPEC, settings, SPEC.table_builder())
+    scan = voxel_scan(SCANS[0], SPEC, settings, SPEC.rulebook_builder())
     batch = batch_scans([scan], SPEC)
     with torch.inference_mode():
         levels = network.propose(batch).levels

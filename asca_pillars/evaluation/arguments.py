@@ -1,38 +1,65 @@
-"""Which options of `asca eval` go together."""
+"""What an evaluation is asked for, which wishes go together, and what it gives."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from asca_deploy.open_model import RuntimeOptions
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation.model import MIN_SCORE
+from asca_pillars.evaluation.report_page import ReportPage
 
 
-@dataclass(frozen=True)
-class EvalArguments:
+@dataclass(frozen=True, kw_only=True)
+class EvaluationTask:
     """What is evaluated and on what; the options of `asca eval` by the same names."""
 
     protocol: str
-    model: Path | None
-    data: Path | None
-    split: str | None
-    predictions: Path | None
-    labels: Path | None
+    model: Path | None = None
+    data: Path | None = None
+    split: str | None = None
+    predictions: Path | None = None
+    labels: Path | None = None
     out: Path
-    gallery: int | None
-    compare: Path | None
-    score: ScoreThresholds | None
-    min_score: float
-    around: bool
+    json: Path | None = None
+    gallery: int | None = None
+    compare: Path | None = None
+    score: ScoreThresholds | None = None
+    min_score: float = MIN_SCORE
+    around: bool = False
     errors: bool = False
     errors_by: str | None = None
-    beside: list[Path] | None = None
+    beside: tuple[Path, ...] = ()
+
+    @property
+    def split_name(self) -> str:
+        """The list of frames."""
+        return "val" if self.split is None else self.split
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A finished evaluation.
+
+    Attributes:
+        protocol: kitti, waymo, iou, distance or tracking.
+        report: all figures, as in the JSON file.
+        page: the tables, which `page.markdown()` gives as text.
+        errors: the main tables of the error analysis; None if there was none.
+        out: folder of the files.
+        remarks: what is odd about the data, or was left out.
+    """
+
+    protocol: str
+    report: dict[str, Any]
+    page: ReportPage
+    errors: ReportPage | None
+    out: Path
+    remarks: tuple[str, ...] = ()
 
 
 def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
@@ -40,10 +67,8 @@ def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
     return "kitti" if data is None or isinstance(open_split(data), KittiSplit) else "iou"
 
 
-def check_arguments(given: EvalArguments, options: RuntimeOptions) -> None:
+def check_arguments(given: EvaluationTask) -> None:
     """Refuse options that do not go together, with a ConfigError that says which and what to do."""
-    if given.predictions is not None:
-        _check_no_runtime(given.predictions, options, given.min_score)
     if given.split is not None and given.data is None:
         raise ConfigError(f"--split {given.split} is a list of the frames of a dataset: give --data ROOT, too")
     _check_errors(given)
@@ -63,21 +88,7 @@ def check_arguments(given: EvalArguments, options: RuntimeOptions) -> None:
         raise ConfigError(f"--score {wrong[0]} must be a number")  # any: predictions from elsewhere may hold logits
 
 
-def _check_no_runtime(predictions: Path, options: RuntimeOptions, min_score: float) -> None:
-    plain = RuntimeOptions()
-    given = {
-        f"--provider {options.provider}": options.provider != plain.provider,
-        f"--precision {options.precision}": options.precision != plain.precision,
-        f"--threads {options.threads}": options.threads != plain.threads,
-        f"--min-score {min_score:g}": min_score != MIN_SCORE,
-    }
-    if options_given := [name for name, differs in given.items() if differs]:
-        raise ConfigError(
-            f"{options_given[0]} is for running a model; --predictions {predictions} are scored as they are"
-        )
-
-
-def _check_errors(given: EvalArguments) -> None:
+def _check_errors(given: EvaluationTask) -> None:
     if not given.errors:
         if given.errors_by is not None or given.beside:
             option = "--beside" if given.errors_by is None else f"--errors-by {given.errors_by}"
@@ -89,7 +100,7 @@ def _check_errors(given: EvalArguments) -> None:
         raise ConfigError("--errors looks at the points of the scans: give --data ROOT that has them")
 
 
-def _check_tracking(given: EvalArguments) -> None:
+def _check_tracking(given: EvaluationTask) -> None:
     if given.model is not None:
         raise ConfigError(
             f"{given.model}: --protocol tracking runs no model; give --predictions, of asca detect --track"
@@ -105,7 +116,7 @@ def _check_tracking(given: EvalArguments) -> None:
         raise ConfigError("--protocol tracking: give --data ROOT and --predictions, the output of asca detect --track")
 
 
-def _check_boxes(given: EvalArguments) -> None:
+def _check_boxes(given: EvaluationTask) -> None:
     if given.data is None:
         raise ConfigError(f"--protocol {given.protocol} needs the labels: give --data ROOT")
     if given.around and given.predictions is not None:
@@ -113,7 +124,7 @@ def _check_boxes(given: EvalArguments) -> None:
     _check_no_text(given)
 
 
-def _check_no_text(given: EvalArguments) -> None:
+def _check_no_text(given: EvaluationTask) -> None:
     """What only labels as KITTI text have."""
     if given.labels is not None:
         raise ConfigError(f"--labels {given.labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
@@ -125,7 +136,7 @@ def _check_no_text(given: EvalArguments) -> None:
         raise ConfigError(f"--compare {given.compare} belongs to the gallery of --protocol kitti; leave it out")
 
 
-def _check_kitti(given: EvalArguments) -> None:
+def _check_kitti(given: EvaluationTask) -> None:
     if given.around:
         raise ConfigError("--around needs labels in every direction: give --protocol iou or distance, too")
     if given.predictions is None and given.labels is not None:
@@ -150,7 +161,7 @@ def _check_kitti(given: EvalArguments) -> None:
         )
 
 
-def _check_compare(compare: Path, given: EvalArguments) -> None:
+def _check_compare(compare: Path, given: EvaluationTask) -> None:
     if given.protocol != "kitti":
         raise ConfigError(f"--compare {compare} belongs to the gallery of --protocol kitti; leave it out")
     if given.data is None or given.gallery == 0:

@@ -1,16 +1,17 @@
-"""The steps of `asca eval --errors`: which rows stand beside those of the data, and the report."""
+"""Preparation of an error analysis: which rows stand beside those of the data, and the report."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
-from asca_pillars.cli.eval_files import MADE_BY
+from asca_pillars.base.progress import Reporter
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
 from asca_pillars.evaluation.errors.error_report import ErrorReport, parts_of, read_report, write_errors
+from asca_pillars.evaluation.report_files import MADE_BY
+from asca_pillars.evaluation.report_page import ReportPage
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class ErrorAnalysis:
     beside: tuple[ErrorReport, ...]
 
 
-def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: list[Path] | None) -> ErrorAnalysis:
+def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: Sequence[Path]) -> ErrorAnalysis:
     """Read what stands beside an evaluation: before a model runs, so that mistakes show at once.
 
     Args:
@@ -44,7 +45,7 @@ def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: list[P
     where = f"{who} {root.resolve().name}"
     parts = {} if by is None else parts_of(root, split.name, split.frame_ids, by)
     named = {f"{where}/{part}": ids for part, ids in parts.items()}
-    return ErrorAnalysis(f"{where}/{split.name}", named, tuple(read_report(path) for path in beside or ()))
+    return ErrorAnalysis(f"{where}/{split.name}", named, tuple(read_report(path) for path in beside))
 
 
 def who_predicted(predictions: Path) -> str:
@@ -63,10 +64,10 @@ def report_errors(
     subject: str,
     about: dict[str, Any],
     out: Path,
-    console: Console,
-) -> None:
-    """Analyze, print and write; `scores` holds the classes to evaluate."""
-    write_errors(
+    reporter: Reporter,
+) -> ReportPage:
+    """Analyze and write; `scores` holds the classes to evaluate."""
+    return write_errors(
         frames,
         scores,
         subject=subject,
@@ -75,5 +76,5 @@ def report_errors(
         beside=analysis.beside,
         about=about,
         out=out,
-        console=console,
+        reporter=reporter,
     )

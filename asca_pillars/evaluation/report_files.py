@@ -4,8 +4,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from asca_pillars.base.errors import OutputError
 from asca_pillars.base.files import remove_directory, write_json, write_text
 from asca_pillars.base.own_files import (
@@ -90,25 +88,22 @@ def write_report(
     out: Path,
     json_path: Path | None,
     scored: Path,
-    console: Console,
 ) -> None:
-    """Print a report; write `name`.json and `name`.md below `out`, and the JSON to `json_path`, too.
+    """Write `name`.json and `name`.md below `out`, and the JSON to `json_path`, too.
 
     An earlier evaluation's analysis of errors is removed.
 
     Args:
         name: of the files, see REPORTS.
-        page: what is printed and written as Markdown.
+        page: what is written as Markdown.
         content: what is written as JSON.
         out: of the evaluation, see `claim`.
         json_path: None for no other copy.
         scored: the predictions that it is about; those that an earlier evaluation left in `out` are removed.
-        console: to print on.
 
     Raises:
         OutputError, OSError: something cannot be written or removed.
     """
-    page.print(console)
     _remove_predictions_of_another(out, scored)
     remove_errors(out)
     for path in (out / f"{name}.json", *([] if json_path is None else [json_path])):
