@@ -75,13 +75,16 @@ def bench(
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Of a recording: the topic of its scans. Default: the only one.")
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Time every stage from points to boxes: p50, p95, p99, FPS, cold start, memory, and the machine it ran on.
 
     Two lines say where to look for more speed: what is spent outside the graphs, and the roofline, the share of the
     machine's measured matrix multiplications per second that the backbone reaches. Of more than 100 scans some are
-    timed, evenly spaced.
+    timed, evenly spaced; of a recording the first 100 with points.
 
     Example: asca bench my_scans/ --matrix --compare asca_small_sim
     """
@@ -95,11 +98,14 @@ def bench(
     from asca_deploy.manifest import load_bundle
     from asca_deploy.open_model import RuntimeOptions, open_detector
     from asca_pillars.base.errors import ConfigError, ScanError
+    from asca_pillars.base.extras import require
     from asca_pillars.base.files import write_json
     from asca_pillars.base.own_files import json_object, require_own_file
     from asca_pillars.base.writable_file import require_writable
     from asca_pillars.cli.bench_parts import Parts, measure_parts, named_bundles
     from asca_pillars.scans.find_scans import name_scans
+    from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
+    from asca_pillars.scans.recordings.recorded_scans import RecordedScans
     from asca_pillars.scans.scan_input import ScanInput
 
     # A pipe has no width, and the tables are wider than the 80 columns that rich takes then.
@@ -111,14 +117,29 @@ def bench(
     settings = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
-    paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
-    scan_input = ScanInput(settings, paths)
-    for line in scan_input.said:
+    if recordings := [path for path in scans or () if is_recording(path)]:
+        if len(scans or ()) > 1:
+            raise ConfigError(f"{recordings[0]}: is a recording; give one alone")
+        require("recordings")
+        recording = open_recording(recordings[0])
+        recorded = RecordedScans(recording, recording.point_cloud_topic(topic), settings.reflectance_scale)
+        mounting, said = recorded.mounting(settings)
+        points = [scan.points for scan in recorded.first(MOST_SCANS)]
+        if not points:
+            raise ScanError(f"{recordings[0]}: none of the first scans of {recorded.topic.name} has points")
+        said.append(f"timing the first {len(points)} scans with points")
+    else:
+        if topic is not None:
+            raise ConfigError(f"--topic {topic}: is for recordings (.mcap, .db3, .bag); leave it out")
+        paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
+        scan_input = ScanInput(settings, paths)
+        mounting, said = scan_input.mounting, scan_input.said
+        timed = paths[:: -(-len(paths) // MOST_SCANS)]
+        if len(timed) < len(paths):
+            said.append(f"timing {len(timed)} of the {len(paths)} scans, evenly spaced")
+        points = [scan_input.read(path).points for path in timed]
+    for line in said:
         console.print(line, style="yellow", soft_wrap=True)
-    timed = paths[:: -(-len(paths) // MOST_SCANS)]
-    if len(timed) < len(paths):
-        console.print(f"timing {len(timed)} of the {len(paths)} scans, evenly spaced", style="yellow")
-    points = [scan_input.read(path).points for path in timed]
     if scaling and not len(points[0]):
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
     bundles = named_bundles([bundle, *(compare or ())])
@@ -127,7 +148,7 @@ def bench(
     report_json = "asca bench", json_object("fps", "stages_ms", "runs_on", "graphs_sha256")
     require_writable(json, *report_json)
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
-    detector = open_detector(options, mounting=scan_input.mounting, around=around)
+    detector = open_detector(options, mounting=mounting, around=around)
     parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold, deadline_ms=deadline)
     result = measure_parts(detector, points, rounds, parts, bundles, console)
     if json is not None:

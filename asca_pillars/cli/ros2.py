@@ -78,7 +78,7 @@ def ros2(
     from asca_deploy.tracker import WEAK_SHARE, Tracker
     from asca_pillars.scans.mounting import Mounting
 
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are in the diagnostics
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are in the diagnostics
     reading = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=None
     )

@@ -1,7 +1,4 @@
-"""Launch the detector as a ROS 2 node.
-
-ros2 launch asca.launch.py topic:=/ouster/points arguments:="--around --track"
-"""
+"""Start the node: `ros2 launch asca.launch.py topic:=/ouster/points arguments:="--around --track"`."""
 
 import shlex
 from typing import Any

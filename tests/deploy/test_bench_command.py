@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from asca_deploy import Detector
-from asca_pillars.base.errors import BundleError, ConfigError, OutputError
+from asca_pillars.base.errors import BundleError, ConfigError, OutputError, ScanError
 from asca_pillars.cli.main import app
 from asca_pillars.scans.scan_reader import write_scan
+from tests.scans.recordings.cloud_recordings import clouds, write_mcap
 
 Points = NDArray[np.float32]
 
@@ -45,6 +46,17 @@ def test_all_parts_are_printed_and_written(tiny_bundle: Path, bundle_copy: Path,
     assert report["compare"]["boxes"]["other"]["pairs"] > 0 and "without a partner" in result.output
     assert {row["way"]["bundle"] for row in report["matrix"]} == {"tiny", "other"}
     assert len(report["scaling"]) > 1 and report["stream"]["stream_fps"] > 0
+
+
+def test_a_recording_is_timed(tiny_bundle: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
+    path = write_mcap(tmp_path / "drive.mcap", {"/lidar": clouds(3), "/other": clouds(1)})
+    command = ["bench", str(path), "-b", str(tiny_bundle), "--rounds", "1"]
+    assert isinstance(CliRunner().invoke(app, command).exception, ScanError), "which topic?"
+    result = CliRunner().invoke(app, [*command, "--topic", "/lidar"], catch_exceptions=False)
+    assert "timing the first 3 scans with points" in result.output
+    for wrong in ([str(path), str(path)], ["--topic", "/lidar"]):
+        assert isinstance(CliRunner().invoke(app, ["bench", *wrong]).exception, ConfigError)
 
 
 def test_json_replaces_its_own_report_alone(tiny_bundle: Path, scan: Points, tmp_path: Path) -> None:

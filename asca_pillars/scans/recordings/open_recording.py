@@ -10,6 +10,7 @@ from asca_pillars.base.input_files import require_content
 from asca_pillars.scans.find_scans import is_scan, natural_order, visible_files
 from asca_pillars.scans.recordings.decompression import ZSTD_SUFFIXES, decompress_file
 from asca_pillars.scans.recordings.mcap_files import McapRecording
+from asca_pillars.scans.recordings.packet_files import PacketCapture
 from asca_pillars.scans.recordings.recording import Recording
 from asca_pillars.scans.recordings.ros_bags import RosBag
 from asca_pillars.scans.recordings.rosbag2 import METADATA_FILE, BagMetadata, SplitRecording, read_metadata
@@ -19,6 +20,7 @@ _READERS: dict[str, Callable[[Path, Path | None], Recording]] = {
     ".mcap": McapRecording,
     ".db3": SqliteRecording,
     ".bag": RosBag,
+    ".pcap": PacketCapture,
 }
 RECORDING_SUFFIXES = tuple(_READERS)
 _ROSBAG2_SUFFIXES = (".mcap", ".db3")

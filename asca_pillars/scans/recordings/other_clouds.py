@@ -74,6 +74,13 @@ def livox_cloud(message: Message) -> tuple[Any, StoredPoints]:
     return header, assemble_points(count, columns, fields)
 
 
+def packed_points(message: Message) -> tuple[Any, StoredPoints]:
+    """Header and points of a revolution as `packet_files` puts it into a message."""
+    table = np.frombuffer(message.data, _FLOAT).reshape(-1, 4)
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
+    return header, StoredPoints(table[:, :3], table[:, 3], _FLOAT)
+
+
 def foxglove_cloud(message: Message) -> Any:
     """A stored foxglove.PointCloud, JSON or Protobuf, as an object with the fields of PointCloud2, and a `pose`.
 

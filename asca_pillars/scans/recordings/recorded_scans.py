@@ -5,10 +5,14 @@ from itertools import islice
 from typing import NamedTuple
 
 from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.ground_height import NamedPoints
+from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Recording, Topic
 from asca_pillars.scans.recordings.scan_types import kind_of_scans
+from asca_pillars.scans.scan_input import said_of_scale
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, finite_scan
+from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
 from asca_pillars.scans.stored_scans import FolderScale, common_reflectance_scale, has_finite_point
 
 SEARCHED_MESSAGES = 300
@@ -50,6 +54,22 @@ class RecordedScans:
     def first(self, count: int) -> Iterator[Scan]:
         """The first scans with points, at most `count`; none is looked for beyond SEARCHED_MESSAGES."""
         return (finite_scan(cloud.points, self.scale.scale) for cloud in self._first(count))
+
+    def mounting(self, reading: ScanSettings) -> tuple[Mounting, list[str]]:
+        """The sensor's mounting, with a height of "auto" by the first scans, and what a user is to know.
+
+        Raises:
+            ConfigError, ScanError: as `ScanSettings.mounting`.
+        """
+        said = [f"{self.topic.name}: {self.topic.messages} scans", *said_of_scale(self.scale)]
+        first = enumerate(self.first(SEARCHED_SCANS), start=1)
+        samples = (
+            NamedPoints(f"scan {number} with points of {self.topic.name}", scan.points) for number, scan in first
+        )
+        mounting, estimate = reading.mounting(samples)
+        if estimate is not None:
+            said.append(f"sensor height: {estimate}")
+        return mounting, said
 
     def read(self, start: int = 0) -> Iterator[RecordedScan]:
         """All scans from message `start` on; what damage ends the recording early, `recording.damage` tells."""

@@ -8,8 +8,8 @@ from typing import Literal, NamedTuple
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.scan_types import conversion_of, kind_of_scans
 
-Encoding = Literal["cdr", "ros1", "json", "protobuf"]
-"""How a message's fields are written: ROS 2's CDR, ROS 1's own, or one of those of Foxglove's types."""
+Encoding = Literal["cdr", "ros1", "json", "protobuf", "points"]
+"""How a message's fields are written: ROS 2's CDR, ROS 1's own, one of those of Foxglove's types, or points alone."""
 
 
 UNKNOWN_TYPE = "unknown"

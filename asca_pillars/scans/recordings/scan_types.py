@@ -13,12 +13,13 @@ _CONVERSIONS = (
     (r".*(Scans?|Packets?|PacketMsg|UdpFrame|PointCloud\d?|CustomMsg)", _REPLAY),
 )
 
-ScanKind = Literal["PointCloud2", "PointCloud", "Livox", "Foxglove"]
+ScanKind = Literal["PointCloud2", "PointCloud", "Livox", "Foxglove", "Packets"]
 _READ: tuple[tuple[str, ScanKind], ...] = (
     (r"sensor_msgs/(msg/)?PointCloud2", "PointCloud2"),
     (r"sensor_msgs/(msg/)?PointCloud", "PointCloud"),
     (r"livox_\w+/(msg/)?CustomMsg", "Livox"),
     (r"foxglove\.PointCloud", "Foxglove"),
+    (r"(velodyne|ouster)/Packets", "Packets"),
 )
 
 

@@ -45,13 +45,11 @@ from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.pictures.video import VideoView
-from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.odometry import Poses, read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.scans.scan_input import said_of_scale
-from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
+from asca_pillars.scans.scan_settings import ScanSettings
 
 _PLAIN = RuntimeOptions()
 _AS_TRAINED = ScanSettings()
@@ -176,12 +174,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     poses = None if task.odometry is None else read_poses(recording, task.odometry)
     damages = set() if poses is None else {recording.damage}
     scans = RecordedScans(recording, topic, reading.reflectance_scale)
-    said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
-    first = enumerate(scans.first(SEARCHED_SCANS), start=1)
-    samples = (NamedPoints(f"scan {number} with points of {topic.name}", scan.points) for number, scan in first)
-    mounting, estimate = reading.mounting(samples)
-    if estimate is not None:
-        said.append(f"sensor height: {estimate}")
+    mounting, said = scans.mounting(reading)
     for line in said:
         reporter.remark(line)
     births = _thresholds(options.bundle, task.score)

@@ -58,7 +58,7 @@ def marker_array(stamp: Stamp, found: Detections | Tracks, *, lifetime_s: float 
         lifetime_s: after which RViz removes them if no further scan comes.
     """
     lifetime = {"sec": int(lifetime_s), "nanosec": round(lifetime_s % 1 * 1e9)}
-    common = {"header": stamp.header(), "lifetime": lifetime}
+    common: Fields = {"header": stamp.header(), "lifetime": lifetime}
     markers: list[Fields] = [{"header": stamp.header(), "action": _DELETE_ALL}]
     for number, (box, track) in enumerate(_with_tracks(found)):
         red, green, blue = class_shares(box.class_name)

@@ -112,7 +112,13 @@ def test_no_points_not_numbers_and_other_fields(tiny_bundle: Path, scan: NDArray
 def test_the_oldest_scan_gives_way(tiny_bundle: Path, scan: NDArray[np.float32]) -> None:
     running = Running(tiny_bundle)
     hold, entered = threading.Event(), threading.Event()
-    running.live._answer = lambda stamp, found: (entered.set(), hold.wait(20), running.answers.append((stamp, found)))
+
+    def held(stamp: Stamp, found: Detections | Tracks) -> None:
+        entered.set()
+        hold.wait(20)
+        running.answers.append((stamp, found))
+
+    running.live._answer = held
     running.live.take(cloud(scan, 0))
     assert entered.wait(20)
     for sec in range(1, 11):

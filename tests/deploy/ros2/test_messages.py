@@ -85,7 +85,8 @@ class Inner:
 
 class Outer:
     def __init__(self) -> None:
-        self.one, self.many, self.kept = Inner(), [], 4.0
+        self.one, self.kept = Inner(), 4.0
+        self.many: list[Inner] = []
 
     def get_fields_and_field_types(self) -> dict[str, str]:
         return {"one": "a_msgs/Inner", "many": "sequence<a_msgs/Inner, 5>", "kept": "double"}
@@ -100,7 +101,7 @@ def test_messages_are_filled_by_their_own_types(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_types_are_found_by_their_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(messages.importlib, "import_module", lambda name: type("module", (), {"Inner": name}))
+    monkeypatch.setattr("importlib.import_module", lambda name: type("module", (), {"Inner": name}))
     for kind in ("a_msgs/Inner", "sequence<a_msgs/Inner>", "sequence<a_msgs/Inner, 5>"):
         assert messages.message_type(kind) == "a_msgs.msg"
     with pytest.raises(ValueError, match="no type"):

@@ -1,0 +1,132 @@
+"""Captures of a sensor's packets (`.pcap`), cut into scans of one revolution by the libraries that know the packets.
+
+Ouster's by its maker's `ouster-sdk`, with the sensor's metadata in a `.json` beside the capture, whose name is the
+capture's or its beginning; Velodyne's by `velodyne-decoder`.
+"""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.base.extras import require
+from asca_pillars.scans.find_scans import visible_files
+from asca_pillars.scans.recordings.recording import Message, Recording, Topic, reason
+
+VELODYNE, OUSTER = "velodyne/Packets", "ouster/Packets"
+_TOPIC = "/packets"
+_VELODYNE_BYTES = 1206  # of a packet of points
+_LOOKED_AT = 1000
+"""Packets that are looked at for those of a Velodyne: others, such as positions, may lie between them."""
+
+
+class PacketCapture(Recording):
+    """A `.pcap` of one sensor. Its messages hold (N, 4) float32 x, y, z in metres and reflectance 0..1.
+
+    Their times are those at which the capturing computer got the first packet of each revolution.
+
+    Args:
+        path: of the capture, for messages.
+        file: where it is read; None: at `path`.
+
+    Raises:
+        ScanError: no capture of a sensor that is known, or one without its metadata.
+    """
+
+    def __init__(self, path: Path, file: Path | None = None) -> None:
+        require("packets")
+        self.path, self._file = path, file or path
+        is_velodyne = self._has_velodyne_packets()
+        self._metadata = None if is_velodyne else _metadata_beside(path)
+        self._type = VELODYNE if is_velodyne else OUSTER
+        self.topics = [Topic(_TOPIC, self._type, sum(1 for _ in self.messages(_TOPIC)))]
+
+    def messages(self, topic: str) -> Iterator[Message]:
+        """The revolutions, up to where the capture breaks off."""
+        self.damage, count = None, 0
+        revolutions = self._velodyne() if self._type == VELODYNE else self._ouster()
+        try:
+            for time_ns, points in revolutions:
+                yield Message(time_ns, points.astype("<f4").tobytes(), "points")
+                count += 1
+        except (ScanError, GeneratorExit):
+            raise
+        except Exception as error:  # the libraries have errors of their own
+            self.damage = f"{self.path}: ends early, after {count} scans ({reason(error)})"
+
+    def _payloads(self) -> Iterator[tuple[float, bytes]]:
+        """Time and content of each UDP packet."""
+        import dpkt
+
+        with self._file.open("rb") as stream:
+            try:
+                reader: Any = dpkt.pcap.UniversalReader(stream)
+            except (ValueError, dpkt.UnpackError) as error:
+                raise ScanError(f"{self.path}: no readable pcap ({reason(error)}); capture it again") from None
+            link = dpkt.sll.SLL if reader.datalink() == dpkt.pcap.DLT_LINUX_SLL else dpkt.ethernet.Ethernet
+            for time_s, content in reader:
+                try:
+                    packet = link(content).data.data
+                except (dpkt.UnpackError, AttributeError):
+                    continue
+                if isinstance(packet, dpkt.udp.UDP):
+                    yield float(time_s), bytes(packet.data)
+
+    def _has_velodyne_packets(self) -> bool:
+        try:
+            return any(len(payload) == _VELODYNE_BYTES for _, payload in islice(self._payloads(), _LOOKED_AT))
+        except ScanError:
+            raise
+        except Exception as error:
+            raise ScanError(f"{self.path}: no readable pcap ({reason(error)}); capture it again") from None
+
+    def _velodyne(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        import velodyne_decoder
+
+        config = velodyne_decoder.Config()
+        config.timestamp_first_packet = True
+        decoder = velodyne_decoder.StreamDecoder(config)
+        try:
+            for time_s, payload in self._payloads():
+                if len(payload) == _VELODYNE_BYTES and (scan := decoder.decode(time_s, payload)) is not None:
+                    yield _of_velodyne(scan)
+        finally:
+            last = decoder.finish()  # what lies before a tear, too
+        if last is not None:
+            yield _of_velodyne(last)
+
+    def _ouster(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        from ouster.sdk import core, open_source
+
+        source = open_source(str(self._file), meta=[str(self._metadata)])
+        table = core.XYZLut(source.sensor_info[0], use_extrinsics=False)
+        for scans in source:
+            for scan in scans:
+                if scan is None:
+                    continue
+                ranges, times = scan.field("RANGE"), scan.packet_timestamp
+                points = np.column_stack([table(ranges).reshape(-1, 3), scan.field("REFLECTIVITY").reshape(-1) / 255.0])
+                yield int(times[times > 0].min()), points[ranges.reshape(-1) > 0].astype(np.float32)
+
+
+def _metadata_beside(path: Path) -> Path:
+    """The `.json` whose name the capture's name is or begins with, the longest of them."""
+    name = path.name.partition(".pcap")[0]
+    beside = [one for one in visible_files(path.parent, "*.json") if name.startswith(one.stem)]
+    if not beside:
+        raise ScanError(
+            f"{path}: holds no packets of a Velodyne, and for those of an Ouster the sensor's metadata must lie "
+            f"beside it as {name}.json"
+        )
+    return max(beside, key=lambda one: len(one.stem))
+
+
+def _of_velodyne(scan: Any) -> tuple[int, NDArray[np.float32]]:
+    stamp, points = scan
+    scaled = np.array(points[:, :4], np.float32)
+    scaled[:, 3] /= 255.0
+    return round(stamp.host * 1e9), scaled

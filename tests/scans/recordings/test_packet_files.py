@@ -1,0 +1,114 @@
+"""Packets of a Velodyne, packed after its manual, become whole revolutions; Ouster's real captures, where they are.
+
+`ASCA_OUSTER_CAPTURES` names a folder of `.pcap` with `.json` beside.
+"""
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("velodyne_decoder", reason="needs pip install -e '.[packets]'")
+pytest.importorskip("dpkt", reason="needs pip install -e '.[packets]'")
+pytest.importorskip("ouster.sdk", reason="needs pip install -e '.[packets]'")
+
+from asca_pillars.base.errors import ScanError
+from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+
+START_S = 1_700_000_000
+CAPTURES = os.environ.get("ASCA_OUSTER_CAPTURES")
+CAPTURES_THERE = sorted(Path(CAPTURES).glob("O*.pcap")) if CAPTURES else []
+
+
+def udp_packet(payload: bytes) -> bytes:
+    udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+    ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, bytes(4), bytes(4)) + udp
+    return bytes(12) + b"\x08\x00" + ip
+
+
+def capture(path: Path, payloads: list[bytes], step_s: float = 0.001327) -> Path:
+    with path.open("wb") as file:
+        file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
+        for number, payload in enumerate(payloads):
+            time_s, packet = START_S + number * step_s, udp_packet(payload)
+            file.write(struct.pack("<IIII", int(time_s), round(time_s % 1 * 1e6), len(packet), len(packet)) + packet)
+    return path
+
+
+def vlp16_packets(revolutions: float, distance_m: float, reflectivity: int) -> list[bytes]:
+    """Packets of a VLP-16 at 10 Hz, strongest return, all of whose returns come from one distance."""
+    count = round(revolutions * 75.4)
+    packets, azimuth = [], 0.0
+    for number in range(count):
+        blocks = b""
+        for _ in range(12):
+            channel = struct.pack("<HB", round(distance_m / 0.002), reflectivity)
+            blocks += struct.pack("<HH", 0xEEFF, round(azimuth) % 36000) + 32 * channel
+            azimuth += 39.8
+        packets.append(blocks + struct.pack("<IBB", round(number * 1327.1), 0x37, 0x22))
+    return packets
+
+
+def scans_of(path: Path) -> list[RecordedScan]:
+    recording = open_recording(path)
+    return list(RecordedScans(recording, recording.point_cloud_topic(), "auto").read())
+
+
+def test_a_velodyne_is_cut_by_revolution(tmp_path: Path) -> None:
+    path = capture(tmp_path / "drive.pcap", [b"other", *vlp16_packets(3, 10.0, 51)])
+    assert is_recording(path)
+    scans = scans_of(path)
+    assert 3 <= len(scans) <= 4
+    times = [one.time_ns / 1e9 for one in scans]
+    assert np.diff(times[:3]) == pytest.approx(0.1, abs=0.01) and times[0] == pytest.approx(START_S, abs=0.01)
+    whole = scans[1].scan
+    assert whole is not None and len(whole.points) == pytest.approx(28_900, rel=0.05)
+    x, y, z, reflectance = whole.points.T
+    assert np.sqrt(x**2 + y**2 + z**2) == pytest.approx(10, abs=0.2)
+    assert np.degrees(np.arcsin(z / 10)).max() == pytest.approx(15, abs=0.6)
+    assert reflectance == pytest.approx(0.2)
+    directions = np.histogram(np.arctan2(y, x), bins=12)[0]
+    assert directions.min() > 0.8 * directions.mean()
+
+
+def test_what_lies_before_a_tear_is_read(tmp_path: Path) -> None:
+    path = capture(tmp_path / "drive.pcap", vlp16_packets(3, 10.0, 51))
+    whole = scans_of(path)
+    path.write_bytes(path.read_bytes()[: -path.stat().st_size // 3])
+    torn = scans_of(path)
+    assert 2 <= len(torn) < len(whole)
+    first, same = torn[0].scan, whole[0].scan
+    assert first is not None and same is not None and np.array_equal(first.points, same.points)
+
+
+@pytest.mark.parametrize("content", [b"no capture", b""])
+def test_no_capture(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "drive.pcap").write_bytes(content)
+    with pytest.raises(ScanError, match=r"drive\.pcap"):
+        open_recording(tmp_path / "drive.pcap")
+
+
+def test_packets_of_an_ouster_need_its_metadata(tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match=r"drive\.json"):
+        open_recording(capture(tmp_path / "drive.pcap", [b"12345"]))
+
+
+@pytest.mark.skipif(not CAPTURES_THERE, reason="needs real captures: ASCA_OUSTER_CAPTURES")
+@pytest.mark.parametrize("path", CAPTURES_THERE, ids=lambda path: path.stem)
+def test_real_captures_of_an_ouster_are_what_its_library_says(path: Path) -> None:
+    from ouster.sdk import core, open_source
+
+    source = open_source(str(path))
+    expected = []
+    for scan in (one for both in source for one in both if one is not None):
+        xyz = core.XYZLut(source.sensor_info[0], use_extrinsics=False)(scan)
+        expected.append(xyz[scan.field("RANGE") > 0].astype(np.float32))
+    scans = scans_of(path)
+    assert len(scans) == len(expected) >= 1
+    for one, xyz in zip(scans, expected, strict=True):
+        assert one.scan is not None and np.array_equal(one.scan.points[:, :3], xyz)
+        assert one.scan.points[:, 3].min() >= 0 and one.scan.points[:, 3].max() == 1.0
+        assert one.time_ns > 1_600_000_000 * 10**9
