@@ -37,7 +37,6 @@ from asca_pillars.base.own_files import page_end
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.base.writable_file import require_writable
-from asca_pillars.cli import eval_files
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.cluster.shards import Shard, ShardFolder
 from asca_pillars.config.tree import Config, load_config
@@ -45,6 +44,7 @@ from asca_pillars.data.boxes.box_records import read_frame_file
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.importing.imported import MARKER, require_own_dataset
+from asca_pillars.evaluation import report_files as eval_files
 from asca_pillars.evaluation.boxes.box_predictions import read_box_predictions
 from asca_pillars.evaluation.tracking.tracking_report import tracking_report
 from asca_pillars.pictures.visualize import png_bytes

@@ -14,6 +14,7 @@ EXTRAS = {
     "recordings": ("rosbags", "mcap"),
     "video": ("imageio_ffmpeg",),
     "view": ("rerun", "rosbags", "mcap"),
+    "ros2": ("rclpy", "sensor_msgs", "visualization_msgs", "diagnostic_msgs"),
     "cluster": ("ray",),
 }
 

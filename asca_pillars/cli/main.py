@@ -18,6 +18,7 @@ from asca_pillars.cli.import_dataset import import_dataset
 from asca_pillars.cli.import_weights import import_weights
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.cli.prepare import prepare
+from asca_pillars.cli.ros2 import ros2
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.cli.simulate import simulate
 from asca_pillars.cli.train import train
@@ -48,6 +49,7 @@ _add(export)
 _add(import_weights, "import-weights")
 app.add_typer(bundle, name="bundle")
 _add(ablate)
+_add(ros2)
 _add(doctor)
 
 

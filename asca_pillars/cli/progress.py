@@ -4,6 +4,7 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.progress import Progress
+from rich.status import Status
 
 from asca_pillars.base.errors import printable
 
@@ -20,6 +21,7 @@ class Bars:
         self._console, self._transient = console, transient
         self._bar: Progress | None = None
         self._step = ""
+        self._status: Status | None = None
 
     def __enter__(self) -> "Bars":
         return self
@@ -40,6 +42,14 @@ class Bars:
         if done >= total:
             self._stop()
 
+    def step(self, text: str) -> None:
+        """Show what is being done, where nobody knows how long it takes."""
+        if self._status is None:
+            self._stop()
+            self._status = self._console.status(text)
+            self._status.start()
+        self._status.update(text)
+
     def remark(self, text: str) -> None:
         """Print a line that the user is to notice; it may quote names of files and topics."""
         self._console.print(printable(text), style="yellow", soft_wrap=True)
@@ -48,3 +58,6 @@ class Bars:
         if self._bar is not None:
             self._bar.stop()
         self._bar = None
+        if self._status is not None:
+            self._status.stop()
+        self._status = None

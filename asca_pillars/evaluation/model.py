@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,28 @@ class Model:
     camera_view: bool
     about: dict[str, Any]
     unlike: list[str] = field(default_factory=list)
+
+
+OpenModel: TypeAlias = Callable[[float | None], Model]
+"""Opens the model to evaluate for scans of a sensor of this height, metres; None: as high as in the training."""
+
+
+def model_scores(model: Model, score: ScoreThresholds | None, min_score: float) -> dict[str, float]:
+    """For each of the model's classes the score from which on detections count for precision and recall.
+
+    Raises:
+        ConfigError: a score that the model is not run down to.
+    """
+    scores = scores_by_class(score, {item.name: item.score_threshold for item in model.spec.classes})
+    for name, fixed in scores.items():
+        if fixed > 1:
+            raise ConfigError(f"--score {fixed:g}: no detection of a model has such a score; at most 1")
+        if fixed < min_score:
+            raise ConfigError(
+                f"score {fixed:g} of {name} is below --min-score {min_score:g}, the lowest that {model.name} is "
+                "run with; lower --min-score"
+            )
+    return scores
 
 
 def scores_by_class(stated: ScoreThresholds | None, defaults: Mapping[str, float]) -> dict[str, float]:

@@ -261,7 +261,7 @@ def _job(
     spec = load_bundle(bundle).spec  # a damaged one is named here, not by every worker
     if score is not None:
         spec.with_score_threshold(score)
-    given = options.bundle
+    given = None if options.bundle is None else Path(options.bundle)
     return DetectShard(
         shards=out.absolute() / SHARDS,
         start=Path.cwd(),

@@ -23,7 +23,7 @@ from asca_pillars.scans.mounting import Mounting
 class RuntimeOptions:
     """Which model runs, and how. The arguments of `Detector` by the same names."""
 
-    bundle: Path | None = None
+    bundle: str | Path | None = None
     provider: str = "cpu"
     precision: str | None = None
     threads: int | None = None
@@ -66,10 +66,11 @@ def open_model(
     Raises:
         AscaError: missing, damaged, or not to be run as asked; one line.
     """
-    if options.bundle is not None and (options.bundle.is_file() or options.bundle.suffix == ".ckpt"):
+    path = None if options.bundle is None else Path(options.bundle)
+    if path is not None and (path.is_file() or path.suffix == ".ckpt"):
         if around:
             raise ConfigError("--around runs bundles: export the checkpoint first (asca export)")
-        return _open_checkpoint(options.bundle, options, min_score, Mounting(sensor_height_m))
+        return _open_checkpoint(path, options, min_score, Mounting(sensor_height_m))
     return _open_bundle(options, min_score, Mounting(sensor_height_m), around=around)
 
 

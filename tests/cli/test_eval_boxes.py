@@ -147,7 +147,7 @@ def test_a_model_gets_the_points_that_it_was_trained_on(
         return sample(points)
 
     model = Model("any", detect, sample.spec, camera_view, {})
-    monkeypatch.setattr("asca_pillars.cli.eval_boxes.open_model", lambda *_, **__: model)
+    monkeypatch.setattr("asca_deploy.evaluate.open_model", lambda *_, **__: model)
     invoke("eval", "--data", root, "--out", tmp_path / "out", "--protocol", "distance")
     split = KittiSplit(root, "val")
     assert given == [len(split.points(one, camera_view=camera_view)) for one in split.frame_ids]

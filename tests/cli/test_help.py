@@ -1,8 +1,11 @@
 """Help is even: options in the same panels and short names with one meaning in every command, no ragged lines."""
 
+import shlex
 from collections import defaultdict
+from pathlib import Path
 
 import click
+import yaml
 from typer.main import get_command
 
 from asca_pillars.cli.main import app
@@ -42,3 +45,15 @@ def test_paragraphs_are_one_line_each() -> None:
     """Else the terminal breaks lines that are broken already."""
     for name, command in commands().items():
         assert all("\n" not in text for text in (command.help or "").split("\n\n")), name
+
+
+def test_commands_of_the_container_exist() -> None:
+    docker = Path(__file__).parents[2] / "examples" / "docker"
+    services = yaml.safe_load((docker / "compose.yaml").read_text())["services"]
+    asca, name, *words = shlex.split(services["node"]["command"])
+    known = {option for parameter in commands()[name].params for option in parameter.opts}
+    assert asca == "asca" and {word for word in words if word.startswith("--")} <= known
+    context = docker / services["node"]["build"]["context"]
+    assert (context / services["node"]["build"]["dockerfile"]).samefile(docker / "Dockerfile")
+    kept = [line[1:] for line in (context / ".dockerignore").read_text().splitlines() if line.startswith("!")]
+    assert all((context / path).exists() for path in kept)

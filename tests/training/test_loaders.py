@@ -14,8 +14,8 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config, TrainConfig
 from asca_pillars.training import loaders
-from asca_pillars.training.loader_processes import loader_context, start_loader_process
 from asca_pillars.training.loaders import BatchLoader
+from asca_pillars.training.shared_batches import loader_context, start_loader_process
 from tests.scenes import SPEC, write_dataset
 from tests.training.failing_numbers import Numbers
 

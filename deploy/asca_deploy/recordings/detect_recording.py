@@ -32,7 +32,7 @@ from asca_deploy.recordings.results import (
 )
 from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
 from asca_deploy.shipped import find_bundle
-from asca_deploy.tracker import Tracker
+from asca_deploy.tracker import WEAK_SHARE, Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
@@ -49,10 +49,6 @@ from asca_pillars.scans.recordings.open_recording import open_recording, recordi
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.scans.scan_input import said_of_scale
 from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
-
-WEAK_SHARE = 0.7
-"""Detections from this share of the lowest threshold on carry tracks on that better ones began."""
-
 
 _PLAIN = RuntimeOptions()
 _AS_TRAINED = ScanSettings()
@@ -103,9 +99,9 @@ def detect_recording(
     topic: str | None = None,
     track: bool = False,
     odometry: str | None = None,
-    calib: Path | None = None,
-    foxglove: Path | None = None,
-    rerun: Path | None = None,
+    calib: str | Path | None = None,
+    foxglove: str | Path | None = None,
+    rerun: str | Path | None = None,
     options: RuntimeOptions = _PLAIN,
     reading: ScanSettings = _AS_TRAINED,
     score: ScoreThresholds | None = None,
@@ -143,9 +139,9 @@ def detect_recording(
         topic=topic,
         track=track,
         odometry=odometry,
-        calib=calib,
-        foxglove=foxglove,
-        rerun=rerun,
+        calib=None if calib is None else Path(calib),
+        foxglove=None if foxglove is None else Path(foxglove),
+        rerun=None if rerun is None else Path(rerun),
     )
     return _detect(task, reading, options, Reporter(progress, remark))
 
@@ -271,7 +267,7 @@ class _Run:
             yield
 
 
-def _thresholds(bundle: Path | None, score: ScoreThresholds | None) -> dict[str, float]:
+def _thresholds(bundle: str | Path | None, score: ScoreThresholds | None) -> dict[str, float]:
     """The score of each class from which on a detection begins a track; ConfigError if it is none."""
     spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)

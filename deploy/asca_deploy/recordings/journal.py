@@ -3,7 +3,7 @@
 The journal holds what detection gave, scan by scan and to the last bit; identities and all files that a user wants are
 made of it at the end, in one go and atomically. So they are the same whether the run was killed or not. Its first line
 says what the results depend on; a journal of anything else is begun anew. Every line has a digest
-(`base.sealed_lines`): one that a kill cut in two, or that was damaged since, is dropped, and its scan done again.
+(`base.files`): one that a kill cut in two, or that was damaged since, is dropped, and its scan done again.
 """
 
 import json
@@ -17,10 +17,9 @@ import numpy as np
 
 from asca_deploy.result_files import COMMAND
 from asca_pillars.base.errors import OutputError
-from asca_pillars.base.files import atomic_path
+from asca_pillars.base.files import atomic_path, sealed, unsealed
 from asca_pillars.base.locks import only_writer
 from asca_pillars.base.own_files import require_no_link
-from asca_pillars.base.sealed_lines import sealed, unsealed
 from asca_pillars.detection.detections import Detections
 
 JOURNAL_FILE = "detections.partial.jsonl"
