@@ -21,6 +21,8 @@ from asca_pillars.cli.options import (
     ScoreOption,
     SensorHeightOption,
     ThreadsOption,
+    VideoOption,
+    VideoViewOption,
     read_scores,
     scan_settings,
 )
@@ -101,6 +103,8 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
+    video: VideoOption = None,
+    video_view: VideoViewOption = "above",
     calib: Annotated[
         Path | None,
         typer.Option(
@@ -124,7 +128,8 @@ def detect(
 
     OUT/NAME.json holds the boxes of one scan in the scan's own frame, OUT/detections.jsonl those of the whole run, one
     line per scan. In a KITTI folder NAME.txt is KITTI text, and the boxes are drawn on the camera image. Labels beside
-    the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white.
+    the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white. OUT/index.html shows all pictures,
+    sorted by scores and misses.
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 3.
 
@@ -143,6 +148,8 @@ def detect(
 
     asca detect drive.mcap --track --foxglove boxes.mcap
 
+    asca detect drive.mcap --track --video drive.mp4 --video-view chase
+
     asca detect /mnt/archive --out /mnt/boxes --cluster local
     """
     import logging
@@ -151,6 +158,7 @@ def detect(
 
     from asca_deploy import sample_scan_path
     from asca_deploy.open_model import RuntimeOptions
+    from asca_deploy.recordings.video import require_video
     from asca_pillars.cli.progress import Bars
     from asca_pillars.scans.recordings.open_recording import is_recording
 
@@ -161,6 +169,7 @@ def detect(
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
+    view = require_video(video, video_view, [*(scans or ()), *([] if calib is None else [calib])])
     recordings = [path for path in scans or () if is_recording(path)]
     if write is not None:
         from asca_pillars.data.importing.tool_labels import require_unchanged
@@ -187,6 +196,8 @@ def detect(
                 calib=calib,
                 foxglove=foxglove,
                 rerun=rerun,
+                video=video,
+                video_view=view,
                 options=options,
                 reading=reading,
                 score=scores,
@@ -203,6 +214,8 @@ def detect(
         from asca_deploy.detect_archive import detect_archive
         from asca_pillars.scans.find_scans import name_scans
 
+        if video is not None:
+            raise ConfigError(f"--video {video}: is not made with --cluster; leave one of them out")
         if pictures:
             raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
         paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
@@ -232,6 +245,8 @@ def detect(
             score=scores,
             around=around,
             pictures=pictures is not False,
+            video=video,
+            video_view=view,
             progress=bars,
             failed=lambda line: print(f"asca: {line}", file=sys.stderr),
         )

@@ -140,6 +140,14 @@ AroundOption = Annotated[
         rich_help_panel="Sensor",
     ),
 ]
+VideoOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--video",
+        help="Also write an .mp4 of the boxes, with identities and trails given --track. Needs the extra video.",
+    ),
+]
+VideoViewOption = Annotated[str, typer.Option("--video-view", help="above, or chase: in 3D from behind the sensor.")]
 ClusterOption = Annotated[
     str | None,
     typer.Option(

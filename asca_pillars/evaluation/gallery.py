@@ -5,7 +5,7 @@ Of one detector the worst frames; of two those in which they differ most, side b
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import cv2
 import numpy as np
@@ -18,14 +18,14 @@ from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.drawing import BACKGROUND, BoxLayer, Color, Image, Texts
+from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page
 from asca_pillars.pictures.visualize import draw_layers, draw_on_image, read_image, write_png
 from asca_pillars.scans.scan_reader import read_scan
 
-INDEX = "index.md"
+INDEX = "index.html"
 INDEX_END = page_end("asca eval")
-_INTRODUCTION = """# {title}: {which}
+_INTRODUCTION = """{chosen}
 
-{chosen}
 A false detection may well stand on an object: to find it, its 3D overlap must exceed 0.7 for cars and 0.5 for the
 others. Objects beyond the difficulty's limits are not counted, and what only touches them or DontCare areas is ignored.
 """
@@ -105,7 +105,7 @@ def write_gallery(
     *,
     reporter: Reporter = SILENT,
 ) -> None:
-    """Draw frames: RANK_FRAME.png each, and index.md that lists them.
+    """Draw frames: RANK_FRAME.png each, and index.html that shows them.
 
     Args:
         folder: for the pictures.
@@ -121,25 +121,28 @@ def write_gallery(
     """
     if len(detectors) == 1:
         chosen: list[tuple[ScoreMatches, ...]] = [(frame,) for frame in worst_frames(detectors[0].frames, count)]
-        words, heads = _WORST, ["missed", "false"]
+        words, kinds = _WORST, [("missed", "false")]
     else:
         first, second = detectors
         chosen = [*most_different_frames(first.frames, second.frames, count)]
-        words, heads = _DIFFERENT, [f"{kind}, {one.name}" for one in detectors for kind in ("missed", "false")]
+        words, kinds = _DIFFERENT, [(f"missed, {one.name}", f"false, {one.name}") for one in detectors]
     title = " and ".join(one.name for one in detectors)
-    rows = [
-        _INTRODUCTION.format(title=title, **words),
-        f"| frame | {' | '.join(heads)} |",
-        f"| --- |{' ---: |' * len(heads)}",
-    ]
+    cards = []
     bar = reporter.track(chosen, "Drawing")
     for rank, matches in enumerate(bar, start=1):
         frame_id = matches[0].frame_id
         name = f"{portable_name(f'{rank:03d}_{frame_id}')}.png"
         write_png(Path(folder) / name, _draw(matches, detectors, split, Path(labels), ranges))
-        counts = [f"{kind.sum()}" for one in matches for kind in (one.missed, one.false_positive)]
-        rows.append(f"| [{frame_id}]({name}) | {' | '.join(counts)} |")
-    write_text(Path(folder) / INDEX, "\n".join([*rows, ""]) + INDEX_END)
+        values: dict[str, float] = {}
+        if len(matches) == 1:
+            values["errors"] = matches[0].errors
+        else:
+            values["difference"] = _difference(*matches)
+        for (missed, false), one in zip(kinds, matches, strict=True):
+            values |= {missed: int(one.missed.sum()), false: int(one.false_positive.sum())}
+        cards.append(GalleryCard(frame_id, PurePath(name), values))
+    page = gallery_page(f"{title}: {words['which']}", _INTRODUCTION.format(**words), cards, None, end=INDEX_END)
+    write_text(Path(folder) / INDEX, page)
 
 
 def _draw(

@@ -20,6 +20,7 @@ from asca_pillars.base.errors import ScanError, printable
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
+from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.find_scans import name_scans
 from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import ScanNotes
@@ -78,6 +79,8 @@ def detect_scans(
     score: ScoreThresholds | None = None,
     around: bool = False,
     pictures: bool = True,
+    video: str | Path | None = None,
+    video_view: VideoView = "above",
     progress: Progress | None = None,
     failed: Remark | None = None,
 ) -> DetectedScans:
@@ -91,6 +94,8 @@ def detect_scans(
         score: report detections from this score on, or by class; None: the thresholds of the model.
         around: look in every direction, by turned passes.
         pictures: whether pictures are drawn into `out`.
+        video: an .mp4 of all scans, written with `out`; None makes none.
+        video_view: from above, or "chase" in 3D.
         progress: called after each scan.
         failed: called with a line for each scan that cannot be read or written, as soon as that is known.
 
@@ -105,7 +110,14 @@ def detect_scans(
     writer = None
     if out is not None:
         scope = detector_scope(detector.spec, around=around)
-        writer = ResultWriter(Path(out), [name for _, name in named], pictures=pictures, scope=scope)
+        writer = ResultWriter(
+            Path(out),
+            [name for _, name in named],
+            pictures=pictures,
+            scope=scope,
+            video=None if video is None else Path(video),
+            video_view=video_view,
+        )
     reporter = Reporter(progress if len(named) > 1 else None, failed)
     results: list[DetectedScan] = []
     unreadable = 0

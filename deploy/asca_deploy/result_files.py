@@ -1,10 +1,11 @@
 """The files that `asca detect` writes: boxes of each scan and of the whole run, pictures, KITTI text."""
 
 import json
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import TracebackType
 from typing import IO, Any
 
@@ -18,9 +19,11 @@ from asca_pillars.base.input_files import require_content
 from asca_pillars.base.locks import recover
 from asca_pillars.base.own_files import (
     Recognizer,
+    ending_with,
     is_own_picture,
     json_lines,
     json_object,
+    page_end,
     require_no_link,
     require_own,
     require_own_file,
@@ -28,7 +31,10 @@ from asca_pillars.base.own_files import (
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import Calibration, is_detection_text, read_calibration
 from asca_pillars.data.open_split import labels_beside
+from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.pictures.drawing import Image
+from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page
+from asca_pillars.pictures.video import BoxVideo, VideoFile, VideoView
 from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 from asca_pillars.scans.scan_reader import Scan
 
@@ -37,6 +43,11 @@ RUN_FILE = "detections.jsonl"
 ABOUT_FILE = "recording.json"
 KITTI_FILE = "tracks.txt"
 UNREADABLE_FILE = "unreadable.jsonl"
+INDEX_FILE = "index.html"
+SCAN_RATE_HZ = 10.0
+"""Of the scans of a folder, which have no times: how fast their video runs."""
+MISSED_IOU = 0.1
+"""A label that no box overlaps so far, seen from above, counts as missed on the page of pictures."""
 
 
 def _is_kitti_text(path: Path) -> bool:
@@ -55,6 +66,7 @@ _COMPANIONS: dict[str, Recognizer] = {
     ABOUT_FILE: json_object("recording", "files", "topic", "model", "runs_on"),
     KITTI_FILE: _is_tracking_text,
     UNREADABLE_FILE: json_lines("error", "scan"),
+    INDEX_FILE: ending_with(page_end(COMMAND)),
 }
 """Files that other kinds of runs write beside RUN_FILE, about the same scans."""
 _OF_A_SCAN: dict[str, Recognizer] = {
@@ -94,18 +106,36 @@ def remove_companions(out: Path, written: Collection[str]) -> None:
 class ResultWriter:
     """Writes the results of scan after scan to a folder; `detections.jsonl` appears when the block ends well.
 
+    With pictures there is a page of them, index.html.
+
     Args:
         out: the folder: absent, empty, or that of an earlier run. Results of other scans in it stay.
         names: of the scans' results, paths below `out` without endings.
         pictures: False writes no picture.
         scope: what the detector could find.
+        video: an MP4 of all scans; None: none is made.
+        video_view: "above" or "chase".
 
     Raises:
         OutputError: when the block is entered, if something else would be replaced.
     """
 
-    def __init__(self, out: Path, names: Sequence[Path], *, pictures: bool, scope: DetectorScope) -> None:
+    def __init__(
+        self,
+        out: Path,
+        names: Sequence[Path],
+        *,
+        pictures: bool,
+        scope: DetectorScope,
+        video: Path | None = None,
+        video_view: VideoView = "above",
+    ) -> None:
         self.out, self._names, self._pictures, self._scope = out, names, pictures, scope
+        self._video_path, self._video_view = video, video_view
+        self._video: BoxVideo | None = None
+        self._cards: list[GalleryCard] = []
+        self._count = 0
+        self._all_kept = True
         self._stack = ExitStack()
         self._written: set[str] = set()
         self._lines: IO[str] | None = None
@@ -128,6 +158,10 @@ class ResultWriter:
     ) -> None:
         self._stack.__exit__(kind, error, trace)
         if kind is None and self._lines is not None:
+            if self._cards:
+                write_text(self.out / INDEX_FILE, self._page())
+            if self._cards or self._all_kept:
+                self._written.add(INDEX_FILE)
             remove_companions(self.out, self._written)
 
     def __call__(self, path: Path, name: Path, scan: Scan, detections: ScanDetections) -> None:
@@ -141,16 +175,37 @@ class ResultWriter:
         content = scan_content(path, scan, detections, self._scope)
         line = as_line(content)
         kept = self._has_boxes(name, json.loads(line)["boxes"])
+        self._all_kept &= kept
         write_json(self._named(name, ".json"), content)
         self._lines.write(line)
         written = {".json"}
         if self._pictures:
-            write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=self._labels(path)))
+            labels = self._labels(path)
+            write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=labels))
             written.add("_bev.png")
+            self._cards.append(_card(name, detections, labels, content["warnings"]))
+        if self._video_path is not None:
+            self._add_to_video(self._video_path, scan, detections)
         if calibration is not None:
             written |= self._write_camera_view(path, name, detections, calibration)
         for ending in () if kept else _OF_A_SCAN.keys() - written:
             self._named(name, ending).unlink(missing_ok=True)
+
+    def _add_to_video(self, path: Path, scan: Scan, detections: ScanDetections) -> None:
+        if self._video is None:
+            file = self._stack.enter_context(VideoFile(self._stack.enter_context(atomic_path(path)), SCAN_RATE_HZ))
+            self._video = BoxVideo(file, self._video_view, detections.ranges, detections.level)
+        self._video.add(scan.points, detections, self._count / SCAN_RATE_HZ)
+        self._count += 1
+
+    def _page(self) -> str:
+        """The page of all pictures."""
+        has_labels = any("missed" in card.values for card in self._cards)
+        introduction = "Boxes seen from above, with their scores; ahead of the sensor is up."
+        if has_labels:
+            introduction += f"\n\nLabels are white; missed ones overlap no box by {MISSED_IOU:g} (IoU from above)."
+        title = f"{COMMAND}: {len(self._cards)} scan{'s' if len(self._cards) != 1 else ''}"
+        return gallery_page(title, introduction, self._cards, "missed" if has_labels else None, end=page_end(COMMAND))
 
     def _has_boxes(self, name: Path, boxes: list[dict[str, Any]]) -> bool:
         """Return whether the scan's JSON of an earlier run holds these boxes."""
@@ -208,6 +263,22 @@ class ResultWriter:
     def _named(self, name: Path, ending: str) -> Path:
         # Not with_suffix: a name may hold dots of its own.
         return self.out / name.with_name(name.name + ending)
+
+
+def _card(
+    name: Path, detections: ScanDetections, labels: NDArray[np.floating] | None, warnings: Sequence[str]
+) -> GalleryCard:
+    """What the page of pictures says of a scan; `labels` are boxes (M, 7) in its frame."""
+    values: dict[str, float] = {"boxes": len(detections)}
+    if len(detections):
+        values |= {"best score": float(detections.scores.max()), "lowest score": float(detections.scores.min())}
+    if labels is not None:
+        level = labels if detections.level is None else detections.level.boxes(labels)
+        seen = labels[detections.ranges.hold_centers(level)]
+        overlaps = bev_iou(seen.astype(np.float64), detections.boxes.astype(np.float64))
+        values["missed"] = int((overlaps.max(axis=1, initial=0.0) < MISSED_IOU).sum())
+    picture = PurePath(name.with_name(name.name + "_bev.png"))
+    return GalleryCard(name.as_posix(), picture, values, Counter(detections.names), warnings)
 
 
 def _write_kitti(path: Path, detections: ScanDetections, calibration: Calibration, image: Any) -> None:

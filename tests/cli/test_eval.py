@@ -24,6 +24,7 @@ from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.gallery_cards import cards, title
 from tests.saved_checkpoint import save_checkpoint
 from tests.scenes import SPEC
 from tests.training.test_loop import CONFIG
@@ -134,10 +135,10 @@ def test_predictions_with_a_dataset_are_scored_on_its_split_and_drawn(
     report = evaluate(predictions=texts["predictions"], data=root, out=tmp_path / "out", gallery=None, score=["0.95"])
     assert report["frames"] == 2  # of three, because `val` lists two
     names = {path.name for path in (tmp_path / "out" / "gallery").iterdir()}
-    assert names == {"001_000001.png", "002_000002.png", "index.md"}  # nothing reaches 0.95: four misses each
+    assert names == {"001_000001.png", "002_000002.png", "index.html"}  # nothing reaches 0.95: four misses each
     assert {point["score"] for point in report["operating_points"]} == {0.95}
     evaluate(**texts, data=root, out=tmp_path / "out", gallery=None)
-    assert {path.name for path in (tmp_path / "out" / "gallery").iterdir()} == {"001_000002.png", "index.md"}
+    assert {path.name for path in (tmp_path / "out" / "gallery").iterdir()} == {"001_000002.png", "index.html"}
 
 
 def test_another_detector_is_drawn_beside_the_first(
@@ -147,17 +148,18 @@ def test_another_detector_is_drawn_beside_the_first(
     shutil.copytree(found, other)
     compared = {"predictions": found, "data": root, "out": out, "gallery": None, "compare": other}
     evaluate(**compared)
-    assert {path.name for path in (out / "gallery").iterdir()} == {"index.md"}, "they are the same"
+    assert {path.name for path in (out / "gallery").iterdir()} == {"index.html"}, "they are the same"
     # As an evaluation of a model leaves it, whose scores of cars do not reach its own threshold.
     about = {"model": {"name": "newer"}, "scores": {"Car": 0.95, "Pedestrian": 0.3, "Cyclist": 0.3}, "files": []}
     (other / "made_by.json").write_text(json.dumps(about))
     (other / "000001.txt").unlink()
     capsys.readouterr()
     evaluate(**compared)
-    assert {path.name for path in (out / "gallery").iterdir()} == {"001_000002.png", "index.md"}
-    index = (out / "gallery" / "index.md").read_text()
-    assert index.startswith(f"# {found} and newer: where they differ most\n")
-    assert "| [000002](001_000002.png) | 0 | 0 | 2 | 0 |\n" in index
+    assert {path.name for path in (out / "gallery").iterdir()} == {"001_000002.png", "index.html"}
+    index = (out / "gallery" / "index.html").read_text()
+    assert title(out / "gallery" / "index.html") == f"{found} and newer: where they differ most"
+    counts = {f"missed, {found}": 0, f"false, {found}": 0, "missed, newer": 2, "false, newer": 0}
+    assert cards(index) == {"000002": {"difference": 2} | counts}
     said = " ".join(capsys.readouterr().out.split())
     assert f"--compare {other}: evaluated on 1 of 2 frames: no prediction file for 000001" in said
 

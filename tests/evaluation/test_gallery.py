@@ -11,6 +11,7 @@ from asca_pillars.data.kitti.kitti_labels import KittiObject
 from asca_pillars.evaluation.gallery import Judged, most_different_frames, worst_frames, write_gallery
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches, matches_at_score
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
+from tests.gallery_cards import cards, sources, title
 from tests.scenes import GRID, write_dataset
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
@@ -66,10 +67,14 @@ def test_the_worst_frames_come_first_and_flawless_ones_not_at_all(root: Path) ->
 def test_misses_and_false_detections_have_their_colors(root: Path) -> None:
     folder = draw(root, 3)
     names = ["001_000001.png", "002_000003.png", "003_000002.png"]
-    assert sorted(path.name for path in folder.iterdir()) == [*names, "index.md"]
-    index = (folder / "index.md").read_text()
-    assert index.startswith("# made up: worst frames\n")
-    assert "| [000001](001_000001.png) | 4 | 0 |\n| [000003](002_000003.png) | 1 | 2 |\n" in index
+    assert sorted(path.name for path in folder.iterdir()) == [*names, "index.html"]
+    assert title(folder / "index.html") == "made up: worst frames"
+    index = (folder / "index.html").read_text()
+    counts = [
+        {"errors": missed + false, "missed": missed, "false": false} for missed, false in ((4, 0), (1, 2), (0, 1))
+    ]
+    assert cards(index) == dict(zip(("000001", "000003", "000002"), counts, strict=True))
+    assert sources(index) == [name for name in names for _ in range(2)]
     colors = [
         [pixels(np.asarray(cv2.imread(str(folder / name))), color) for color in (RED, MAGENTA, GREEN)] for name in names
     ]
@@ -126,11 +131,11 @@ def test_two_detectors_stand_side_by_side_on_the_same_part_of_the_scan(root: Pat
     far = KittiObject(**(vars(objects[0]) | {"x_m": 0.0, "z_m": GRID.x_range_m[1]}))  # false, beyond all points
     write_labels(root.parent / "det" / "000001.txt", [far])
     folder = draw(root, 1, another(root))
-    index = (folder / "index.md").read_text()
-    assert index.startswith("# made up and another: where they differ most\n")
-    assert "| frame | missed, made up | false, made up | missed, another | false, another |\n" in index
-    assert "| [000001](001_000001.png) | 4 | 1 | 0 | 0 |\n" in index
-    assert sorted(path.name for path in folder.iterdir()) == ["001_000001.png", "index.md"]
+    index = (folder / "index.html").read_text()
+    assert title(folder / "index.html") == "made up and another: where they differ most"
+    counts = {"missed, made up": 4, "false, made up": 1, "missed, another": 0, "false, another": 0}
+    assert cards(index) == {"000001": {"difference": 5} | counts}
+    assert sorted(path.name for path in folder.iterdir()) == ["001_000001.png", "index.html"]
     picture = np.asarray(cv2.imread(str(folder / "001_000001.png")))
     assert picture.shape[1] == 2000
     left, right = picture[:, :1000], picture[:, 1000:]

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_deploy.around import ranges_around
 from asca_deploy.detect_scans import DetectedScan, repairs
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
@@ -30,6 +31,7 @@ from asca_deploy.recordings.results import (
     said_of_stamps,
     tracked,
 )
+from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz
 from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
 from asca_deploy.shipped import find_bundle
 from asca_deploy.tracker import WEAK_SHARE, Tracker
@@ -42,6 +44,7 @@ from asca_pillars.base.writable_file import require_suffix, require_writable
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.detection.spec import ScoreThresholds
+from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.odometry import Poses, read_poses
@@ -90,6 +93,8 @@ class _Task:
     calib: Path | None
     foxglove: Path | None
     rerun: Path | None
+    video: Path | None = None
+    video_view: VideoView = "above"
 
 
 def detect_recording(
@@ -102,6 +107,8 @@ def detect_recording(
     calib: str | Path | None = None,
     foxglove: str | Path | None = None,
     rerun: str | Path | None = None,
+    video: str | Path | None = None,
+    video_view: VideoView = "above",
     options: RuntimeOptions = _PLAIN,
     reading: ScanSettings = _AS_TRAINED,
     score: ScoreThresholds | None = None,
@@ -120,6 +127,8 @@ def detect_recording(
         calib: KITTI calibration, for KITTI's tracking text in `out`.
         foxglove: an .mcap to write for Foxglove.
         rerun: an .rrd to write for the rerun viewer.
+        video: an .mp4 to write, boxes with their tracks.
+        video_view: from above, or "chase" in 3D.
         options: which model runs, and how.
         reading: how the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
@@ -142,6 +151,8 @@ def detect_recording(
         calib=None if calib is None else Path(calib),
         foxglove=None if foxglove is None else Path(foxglove),
         rerun=None if rerun is None else Path(rerun),
+        video=None if video is None else Path(video),
+        video_view=video_view,
     )
     return _detect(task, reading, options, Reporter(progress, remark))
 
@@ -197,11 +208,12 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
             _check_times(times_ns, task, topic.name, poses, reporter)
         results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
         scope = detector_scope(detector.spec, around=task.around)
-        written, classes = _write(task, results, scans, calibration, scope, about)
+        video = _video(task, detector, scans, times_ns, poses)
+        written, classes = _write(task, results, scans, calibration, scope, about, video)
         journal.remove()
     for line in repairs(run.kept):
         reporter.remark(line)
-    others = (None if task.calib is None else task.out / KITTI_FILE, task.foxglove, task.rerun)
+    others = (None if task.calib is None else task.out / KITTI_FILE, task.foxglove, task.rerun, task.video)
     return RecordingResult(
         written,
         {name: classes[name] for name in detector.spec.class_names},
@@ -323,6 +335,24 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
     return np.asarray(poses.at(time_ns) @ level)
 
 
+def _video(
+    task: _Task, detector: Detector, scans: RecordedScans, times_ns: Sequence[int], poses: Poses | None
+) -> Callable[[Path], RecordingVideo] | None:
+    """A function that opens the video, or None where there is none."""
+    if task.video is None:
+        return None
+    mounting = detector.mounting
+    return partial(
+        RecordingVideo,
+        rate_hz=recording_rate_hz(times_ns),
+        view=task.video_view,
+        ranges=ranges_around(detector.spec.ranges, detector.passes),
+        level=None if mounting.level.is_identity else mounting.level,
+        scans=scans.read(),
+        pose_at=None if poses is None else partial(_pose_of_scan, poses, mounting),
+    )
+
+
 def _write(
     task: _Task,
     results: Iterator[Found],
@@ -330,6 +360,7 @@ def _write(
     calibration: Any,
     scope: DetectorScope,
     about: dict[str, Any],
+    video: Callable[[Path], RecordingVideo] | None,
 ) -> tuple[int, Counter[str]]:
     """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
     with ExitStack() as places, ExitStack() as handles:
@@ -349,6 +380,11 @@ def _write(
             rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
             handles.callback(rerun.finish)
             files.append(rerun)
+        if task.video is not None and video is not None:
+            place = places.enter_context(atomic_path(task.video))
+            drawn = video(place)
+            handles.callback(drawn.finish)
+            files.append(drawn)
         scans_written = 0
         classes: Counter[str] = Counter()
         for found in results:
