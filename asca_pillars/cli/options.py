@@ -145,9 +145,12 @@ VideoOption = Annotated[
     typer.Option(
         "--video",
         help="Also write an .mp4 of the boxes, with identities and trails given --track. Needs the extra video.",
+        rich_help_panel="Output",
     ),
 ]
-VideoViewOption = Annotated[str, typer.Option("--video-view", help="above, or chase: in 3D from behind the sensor.")]
+VideoViewOption = Annotated[
+    str, typer.Option("--video-view", help="above, or chase: in 3D from behind the sensor.", rich_help_panel="Output")
+]
 ClusterOption = Annotated[
     str | None,
     typer.Option(

@@ -79,7 +79,7 @@ def test_cmake_names_what_is_missing(tmp_path: Path) -> None:
     cmake = shutil.which("cmake")
     if COMPILER is None or cmake is None:
         pytest.skip("needs cmake and a C++ compiler")
-    command = [cmake, "-S", EXAMPLE, "-B", tmp_path / "build", f"-DONNXRUNTIME_ROOT={tmp_path}"]
+    command: list[str | Path] = [cmake, "-S", EXAMPLE, "-B", tmp_path / "build", f"-DONNXRUNTIME_ROOT={tmp_path}"]
     command += ["-DCMAKE_DISABLE_FIND_PACKAGE_onnxruntime=ON", "-DONNXRUNTIME_LIBRARY=ONNXRUNTIME_LIBRARY-NOTFOUND"]
     done = subprocess.run([*command, "-DCMAKE_FIND_USE_CMAKE_SYSTEM_PATH=OFF"], capture_output=True, text=True)
     assert done.returncode != 0 and "give -DONNXRUNTIME_ROOT=FOLDER" in " ".join(done.stderr.split())
