@@ -68,7 +68,7 @@ def test_commands_of_other_blocks_exist(name: str, block: Block) -> None:
 
 def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
     left_out = [(name, block) for name, block in not_run() if name not in RECORDS]
-    assert len(left_out) <= 20
+    assert len(left_out) <= 25
     assert all(len(block.reason or "") > 10 for _, block in left_out)
     for name in JOURNEYS:
         assert runs(name), f"nothing of {name} is run"

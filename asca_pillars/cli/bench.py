@@ -62,12 +62,21 @@ def bench(
     deadline: Annotated[
         float | None,
         typer.Option(
-            "--deadline", min=0.001, help="Milliseconds, such as 100: print the share of scans that take longer."
+            "--deadline",
+            min=0.001,
+            help="Milliseconds, such as 100: print the share of scans that take longer.",
+            rich_help_panel="Output",
         ),
     ] = None,
     late_share: Annotated[
         float,
-        typer.Option("--late", min=0, max=1, help="With --deadline: exit with code 1 if a larger share takes longer."),
+        typer.Option(
+            "--late",
+            min=0,
+            max=1,
+            help="With --deadline: exit with code 1 if a larger share takes longer.",
+            rich_help_panel="Output",
+        ),
     ] = 1.0,
     around: AroundOption = False,
     sensor_height: SensorHeightOption = None,

@@ -41,7 +41,9 @@ TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame a
 def detect(
     scans: ScansArgument = None,
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.")] = Path("detections"),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.", rich_help_panel="Output")
+    ] = Path("detections"),
     bundle: BundleOption = None,
     score: ScoreOption = None,
     pictures: Annotated[
@@ -49,6 +51,7 @@ def detect(
         typer.Option(
             "--pictures/--no-pictures",
             help="Draw a bird's-eye picture of each scan; without, faster. Default: drawn, but not with --cluster.",
+            rich_help_panel="Output",
         ),
     ] = None,
     provider: ProviderOption = "cpu",
@@ -61,27 +64,54 @@ def detect(
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
     topic: Annotated[
-        str | None, typer.Option("--topic", help="Of a recording: the topic of its scans. Default: the only one.")
+        str | None,
+        typer.Option(
+            "--topic",
+            help="Of a recording: the topic of its scans. Default: the only one.",
+            rich_help_panel="Recording",
+        ),
     ] = None,
     track: Annotated[
-        bool, typer.Option("--track", help="In a recording: give boxes identities and velocities over time.")
+        bool,
+        typer.Option(
+            "--track",
+            help="In a recording: give boxes identities and velocities over time.",
+            rich_help_panel="Recording",
+        ),
     ] = False,
     odometry: Annotated[
         str | None,
-        typer.Option("--odometry", help="With --track: the topic of the car's poses (nav_msgs/Odometry)."),
+        typer.Option(
+            "--odometry",
+            help="With --track: the topic of the car's poses (nav_msgs/Odometry).",
+            rich_help_panel="Recording",
+        ),
     ] = None,
     foxglove: Annotated[
-        Path | None, typer.Option("--foxglove", help="Of a recording: also write the boxes as an MCAP for Foxglove.")
+        Path | None,
+        typer.Option(
+            "--foxglove",
+            help="Of a recording: also write the boxes as an MCAP for Foxglove.",
+            rich_help_panel="Recording",
+        ),
     ] = None,
     rerun: Annotated[
         Path | None,
-        typer.Option("--rerun", help="Of a recording: also write scans and boxes as an .rrd for the rerun viewer."),
+        typer.Option(
+            "--rerun",
+            help="Of a recording: also write scans and boxes as an .rrd for the rerun viewer.",
+            rich_help_panel="Recording",
+        ),
     ] = None,
     video: VideoOption = None,
     video_view: VideoViewOption = "above",
     calib: Annotated[
         Path | None,
-        typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
+        typer.Option(
+            "--calib",
+            help="Of a recording: a KITTI calibration; also write KITTI's tracking text.",
+            rich_help_panel="Recording",
+        ),
     ] = None,
     write: Annotated[
         str | None,
@@ -89,6 +119,7 @@ def detect(
             "--write",
             metavar="FORMAT",
             help=f"Also write the boxes as labels to correct, to OUT/FORMAT: {', '.join(TOOLS)} (docs/LABELLING.md).",
+            rich_help_panel="Output",
         ),
     ] = None,
     cluster: ClusterOption = None,

@@ -19,6 +19,7 @@ def import_weights(
         Path | None,
         typer.Option(
             "--config",
+            "-c",
             help="YAML of the model, or the name of one that ships. Default: the published model on KITTI "
             "(openpcdet_pointpillars_kitti, pv_rcnn_kitti, mmdetection3d_pointpillars_kitti, "
             "mmdetection3d_pv_rcnn_kitti). Other ranges, classes or widths need their own.",

@@ -1,5 +1,7 @@
 """The command `asca`: registers what `cli` holds. Each command imports what it needs when it runs."""
 
+import inspect as inspect_module
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -27,20 +29,28 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command()(detect)
-app.command()(bench)
-app.command()(simulate)
-app.command("import")(import_dataset)
-app.command()(inspect)
-app.command()(prepare)
-app.command()(train)
-app.command("eval")(evaluate)
-app.command()(export)
-app.command("import-weights")(import_weights)
+
+
+def _add(function: Callable[..., None], name: str | None = None) -> None:
+    """Register a command; each paragraph of its help is one line, which the terminal breaks where it is full."""
+    paragraphs = inspect_module.cleandoc(function.__doc__ or "").split("\n\n")
+    app.command(name, help="\n\n".join(" ".join(text.split()) for text in paragraphs))(function)
+
+
+_add(detect)
+_add(bench)
+_add(simulate)
+_add(import_dataset, "import")
+_add(inspect)
+_add(prepare)
+_add(train)
+_add(evaluate, "eval")
+_add(export)
+_add(import_weights, "import-weights")
 app.add_typer(bundle, name="bundle")
-app.command()(ablate)
-app.command()(ros2)
-app.command()(doctor)
+_add(ablate)
+_add(ros2)
+_add(doctor)
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ BundleOption = Annotated[
         help="Model bundle: a folder, or the name of one that comes with asca: asca_sim, asca_small_sparse_sim (half "
         "as wide: faster), asca_refine_sim (asca_sim and a second stage) or asca_small_sim (a dense neck, for "
         "providers that need one), each also with _int8, and pvrcnn_small_sim (PV-RCNN). Default: asca_sim_int8.",
+        rich_help_panel="Input",
     ),
 ]
 ScoreOption = Annotated[
@@ -34,11 +35,15 @@ ScoreOption = Annotated[
         "--score",
         help="VALUE or CLASS=VALUE: report detections, or those of a class, from this score on. Repeatable for "
         "classes. Default: the model's, per class.",
+        rich_help_panel="Output",
     ),
 ]
 
 ProviderOption = Annotated[
-    str, typer.Option("--provider", help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")
+    str,
+    typer.Option(
+        "--provider", help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.", rich_help_panel="Speed"
+    ),
 ]
 PrecisionOption = Annotated[
     str | None,
@@ -46,14 +51,23 @@ PrecisionOption = Annotated[
         "--precision",
         help="float32, or reduced: bfloat16, TF32 or float16 where the provider has it. "
         "Default: float32; with --provider auto either.",
+        rich_help_panel="Speed",
     ),
 ]
 ThreadsOption = Annotated[
-    int | None, typer.Option("--threads", help="CPU threads. Default: the physical cores granted to the process.")
+    int | None,
+    typer.Option(
+        "--threads", help="CPU threads. Default: the physical cores granted to the process.", rich_help_panel="Speed"
+    ),
 ]
 DataOption = Annotated[
     Path,
-    typer.Option("--data", "-d", help="Folder of a dataset: KITTI's layout, or with a dataset.yaml (docs/DATA.md)."),
+    typer.Option(
+        "--data",
+        "-d",
+        help="Folder of a dataset: KITTI's layout, or with a dataset.yaml (docs/DATA.md).",
+        rich_help_panel="Input",
+    ),
 ]
 ConfigArgument = Annotated[
     Path, typer.Argument(help="YAML of the model and its recipe, or the name of one that ships.")
@@ -70,7 +84,9 @@ InitOption = Annotated[
         "that ships). Where model.train_first_stage is false, its first stage alone is taken.",
     ),
 ]
-JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write everything measured to this file.")]
+JsonOption = Annotated[
+    Path | None, typer.Option("--json", help="Also write everything measured to this file.", rich_help_panel="Output")
+]
 
 
 SensorHeightOption = Annotated[
@@ -79,6 +95,7 @@ SensorHeightOption = Annotated[
         "--sensor-height",
         help="Metres of the scans' origin above the ground (0 where z = 0 is the ground), or auto: estimated from the "
         "scans. Default: as in training.",
+        rich_help_panel="Sensor",
     ),
 ]
 AxesOption = Annotated[
@@ -87,6 +104,7 @@ AxesOption = Annotated[
         "--axes",
         help="x-forward, y-forward (x to the right), or where forward, left and up are found in the scan, such as "
         "-y,x,z or, with z down, x,-y,-z.",
+        rich_help_panel="Sensor",
     ),
 ]
 PoseOption = Annotated[
@@ -95,6 +113,7 @@ PoseOption = Annotated[
         "--pose",
         help="Text file with a 4x4 matrix, 16 numbers row by row, from the scan to a level frame, x forward, y left, "
         "z up, in metres; instead of --axes.",
+        rich_help_panel="Sensor",
     ),
 ]
 ReflectanceScaleOption = Annotated[
@@ -102,30 +121,43 @@ ReflectanceScaleOption = Annotated[
     typer.Option(
         "--reflectance-scale",
         help="Stored value that is a reflectance of 1: 1, 100, 255, 65535. Default: by the files, once for a folder.",
+        rich_help_panel="Sensor",
     ),
 ]
 ColumnsOption = Annotated[
     int | None,
-    typer.Option("--columns", help="Values of a point in a .bin file. Default: 4, or 5 where the fifth counts rings."),
+    typer.Option(
+        "--columns",
+        help="Values of a point in a .bin file. Default: 4, or 5 where the fifth counts rings.",
+        rich_help_panel="Sensor",
+    ),
 ]
 AroundOption = Annotated[
     bool,
-    typer.Option("--around", help="Look in every direction: turned passes, merged. Costs a pass for each of them."),
+    typer.Option(
+        "--around",
+        help="Look in every direction: turned passes, merged. Costs a pass for each of them.",
+        rich_help_panel="Sensor",
+    ),
 ]
 VideoOption = Annotated[
     Path | None,
     typer.Option(
         "--video",
         help="Also write an .mp4 of the boxes, with identities and trails given --track. Needs the extra video.",
+        rich_help_panel="Output",
     ),
 ]
-VideoViewOption = Annotated[str, typer.Option("--video-view", help="above, or chase: in 3D from behind the sensor.")]
+VideoViewOption = Annotated[
+    str, typer.Option("--video-view", help="above, or chase: in 3D from behind the sensor.", rich_help_panel="Output")
+]
 ClusterOption = Annotated[
     str | None,
     typer.Option(
         "--cluster",
         help="Work on a Ray cluster: its address (HOST:PORT), auto, or local for all cores of this machine. "
         "Needs the extra cluster, which `asca doctor` says how to install; docs/CLUSTER.md.",
+        rich_help_panel="Speed",
     ),
 ]
 

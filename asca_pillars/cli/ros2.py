@@ -25,20 +25,27 @@ def ros2(
         list[str] | None, typer.Argument(help="After --, arguments for ROS: -- --ros-args -r __ns:=/front")
     ] = None,
     *,
-    topic: Annotated[str, typer.Option("--topic", help="Of the scans, sensor_msgs/PointCloud2.")] = "/points",
+    topic: Annotated[
+        str, typer.Option("--topic", help="Of the scans, sensor_msgs/PointCloud2.", rich_help_panel="Input")
+    ] = "/points",
     qos: Annotated[
         str,
         typer.Option(
-            "--qos", help="auto, best_effort or reliable. auto: reliable where all publishers are, else best_effort."
+            "--qos",
+            help="auto, best_effort or reliable. auto: reliable where all publishers are, else best_effort.",
+            rich_help_panel="Input",
         ),
     ] = "auto",
-    track: Annotated[bool, typer.Option("--track", help="Give boxes identities and velocities over time.")] = False,
+    track: Annotated[
+        bool, typer.Option("--track", help="Give boxes identities and velocities over time.", rich_help_panel="Output")
+    ] = False,
     frame: Annotated[
         str | None,
         typer.Option(
             "--frame",
             help="The vehicle's frame (base_link), x forward, y left, z up: how the scans lie in it is taken from TF. "
             "--sensor-height is then the height of that frame.",
+            rich_help_panel="Sensor",
         ),
     ] = None,
     bundle: BundleOption = None,
@@ -51,7 +58,10 @@ def ros2(
     axes: AxesOption = "x-forward",
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
-    log_every: Annotated[int, typer.Option("--log-every", help="Scans between two lines of figures in the log.")] = 100,
+    log_every: Annotated[
+        int,
+        typer.Option("--log-every", help="Scans between two lines of figures in the log.", rich_help_panel="Output"),
+    ] = 100,
 ) -> None:
     """Answer every scan of a ROS 2 topic with boxes, until SIGINT or SIGTERM.
 

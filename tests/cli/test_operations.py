@@ -17,7 +17,7 @@ from asca_pillars.scans.scan_reader import write_scan
 from tests.in_process import run_here
 
 DEPLOY = Path(__file__).parents[2] / "docs" / "guide" / "deploy.md"
-KINDS = {
+KINDS: dict[int, set[type[errors.AscaError]]] = {
     2: {errors.ConfigError, errors.OutputError},
     3: {errors.PartialError},
     4: {errors.ScanError, errors.DatasetError, errors.BundleError, errors.ExportError, errors.TrainingError},
@@ -40,7 +40,7 @@ def code_of(error: BaseException) -> int:
 
 def test_every_kind_of_error_has_its_exit_code() -> None:
     classes = [one for one in vars(errors).values() if isinstance(one, type) and issubclass(one, errors.AscaError)]
-    assert set().union(*KINDS.values()) == set(classes)
+    assert {kind for own in KINDS.values() for kind in own} == set(classes)
     for code, own in KINDS.items():
         assert {code_of(kind("said")) for kind in own} == {code}
         assert f"| {code} |" in DEPLOY.read_text()

@@ -54,6 +54,37 @@ def build_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build(Path(__file__).parent / "cpp" / "build_tables.cpp", tmp_path_factory.mktemp("cpp") / "build_tables")
 
 
+def test_cmake_takes_an_unpacked_release(tmp_path: Path) -> None:
+    """The folder as a release has it, made of the headers and the library that there are; it runs the default model."""
+    flags, cmake = include_flags(), shutil.which("cmake")
+    if COMPILER is None or flags is None or cmake is None or not LIBRARIES:
+        pytest.skip("needs cmake, a C++ compiler and the headers of onnxruntime and nlohmann-json (ASCA_ORT_INCLUDE)")
+    folders = [Path(flag.removeprefix("-I")) for flag in flags if flag.startswith("-I")] or [Path("/usr/include")]
+    headers = next(path.parent for folder in folders for path in folder.rglob("onnxruntime_cxx_api.h"))
+    json_folder = next(path.parents[1] for folder in folders for path in folder.rglob("nlohmann/json.hpp"))
+    release = tmp_path / "onnxruntime-linux-x64"
+    (release / "lib").mkdir(parents=True)
+    (release / "include").symlink_to(headers)
+    for name in ("libonnxruntime.so", "libonnxruntime.so.1"):
+        (release / "lib" / name).symlink_to(LIBRARIES[-1])
+    stated = (f"-DONNXRUNTIME_ROOT={release}", f"-DNLOHMANN_JSON_INCLUDE={json_folder}")
+    subprocess.run([cmake, "-S", EXAMPLE, "-B", tmp_path / "build", *stated], check=True, capture_output=True)
+    subprocess.run([cmake, "--build", tmp_path / "build"], check=True, capture_output=True)
+    command = [tmp_path / "build" / "detect", shipped_bundles()["asca_sim_int8"], sample_scan_path()]
+    found = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert "Car" in found
+
+
+def test_cmake_names_what_is_missing(tmp_path: Path) -> None:
+    cmake = shutil.which("cmake")
+    if COMPILER is None or cmake is None:
+        pytest.skip("needs cmake and a C++ compiler")
+    command: list[str | Path] = [cmake, "-S", EXAMPLE, "-B", tmp_path / "build", f"-DONNXRUNTIME_ROOT={tmp_path}"]
+    command += ["-DCMAKE_DISABLE_FIND_PACKAGE_onnxruntime=ON", "-DONNXRUNTIME_LIBRARY=ONNXRUNTIME_LIBRARY-NOTFOUND"]
+    done = subprocess.run([*command, "-DCMAKE_FIND_USE_CMAKE_SYSTEM_PATH=OFF"], capture_output=True, text=True)
+    assert done.returncode != 0 and "give -DONNXRUNTIME_ROOT=FOLDER" in " ".join(done.stderr.split())
+
+
 def build(source: Path, program: Path, *flags: str) -> Path:
     options = ("-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{EXAMPLE}")
     command = [str(COMPILER), *options, str(source), *flags, "-o", str(program)]
