@@ -5,20 +5,29 @@
     detections = Detector()(read_scan("scan.bin").points)
 
 The names below are the stable ones (docs/API.md). They are imported when they are first used, so that
-`import asca_pillars` costs nothing, and they never import PyTorch.
+`import asca_pillars` costs nothing. PyTorch is imported when `train` or `export` is
+called, or `evaluate` with a checkpoint.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from asca_pillars.base.telemetry import disable_telemetry
+from asca_pillars.base.installation import disable_telemetry
 
 if TYPE_CHECKING:
     from asca_deploy import Bundle, Detector, ScanDetections, ScanQueue, Tracker, Tracks, load_bundle
+    from asca_deploy.detect_scans import detect_scans
+    from asca_deploy.evaluate import evaluate
+    from asca_deploy.open_model import RuntimeOptions
+    from asca_deploy.recordings.detect_recording import detect_recording
+    from asca_export.export_checkpoint import export
     from asca_pillars.base.errors import AscaError
     from asca_pillars.detection.detections import Detection, Detections, FrameReport
     from asca_pillars.scans.mounting import Mounting
     from asca_pillars.scans.scan_reader import Scan, read_scan
+    from asca_pillars.scans.scan_settings import ScanSettings
+    from asca_pillars.sim.simulate import simulate
+    from asca_pillars.training.train import train
 
 __version__ = "0.1.0"
 
@@ -32,14 +41,22 @@ __all__ = [
     "Detector",
     "FrameReport",
     "Mounting",
+    "RuntimeOptions",
     "Scan",
     "ScanDetections",
     "ScanQueue",
+    "ScanSettings",
     "Tracker",
     "Tracks",
     "__version__",
+    "detect_recording",
+    "detect_scans",
+    "evaluate",
+    "export",
     "load_bundle",
     "read_scan",
+    "simulate",
+    "train",
 ]
 
 _HOMES = {
@@ -50,13 +67,21 @@ _HOMES = {
     "Detector": "asca_deploy",
     "FrameReport": "asca_pillars.detection.detections",
     "Mounting": "asca_pillars.scans.mounting",
+    "RuntimeOptions": "asca_deploy.open_model",
     "Scan": "asca_pillars.scans.scan_reader",
     "ScanDetections": "asca_deploy",
     "ScanQueue": "asca_deploy",
+    "ScanSettings": "asca_pillars.scans.scan_settings",
     "Tracker": "asca_deploy",
     "Tracks": "asca_deploy",
+    "detect_recording": "asca_deploy.recordings.detect_recording",
+    "detect_scans": "asca_deploy.detect_scans",
+    "evaluate": "asca_deploy.evaluate",
+    "export": "asca_export.export_checkpoint",
     "load_bundle": "asca_deploy",
     "read_scan": "asca_pillars.scans.scan_reader",
+    "simulate": "asca_pillars.sim.simulate",
+    "train": "asca_pillars.training.train",
 }
 
 

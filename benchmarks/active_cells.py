@@ -22,7 +22,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.targets import assign_targets
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.ops.pillar.grid import map_cells
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder, NeckRulebooks
 from asca_pillars.ops.pillar.spec import PillarSpec
 
 
@@ -43,7 +43,7 @@ def main(
     print(f"{cpu_model()}, {len(frames)} frames of {folder.name}, grid of {config}\n")
     rows = []
     for rule in get_args(MaskRule):
-        builder = NeckTableBuilder(*spec.grid.map_shape, rule)
+        builder = NeckRulebookBuilder(*spec.grid.map_shape, rule)
         counts = [_count(spec, builder, frame.points, frame.boxes, frame.labels) for frame in frames]
         positives, active, objects, lost, cells, time_ms = np.array([each[:6] for each in counts]).sum(axis=0)
         levels = np.mean([each[6] for each in counts], axis=0)
@@ -65,7 +65,7 @@ def main(
 
 def _count(
     spec: PillarSpec,
-    builder: NeckTableBuilder,
+    builder: NeckRulebookBuilder,
     points: NDArray[np.float32],
     boxes: NDArray[np.float32],
     labels: NDArray[np.int64],
@@ -85,7 +85,7 @@ def _count(
     return *counts, time_ms, shares
 
 
-def _timed(builder: NeckTableBuilder, cells: NDArray[np.int64]) -> tuple[NeckTables[NDArray[np.int32]], float]:
+def _timed(builder: NeckRulebookBuilder, cells: NDArray[np.int64]) -> tuple[NeckRulebooks[NDArray[np.int32]], float]:
     times_ms = []
     for _ in range(3):
         start = time.process_time()

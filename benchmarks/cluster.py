@@ -31,9 +31,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from asca_deploy.detect_archive import DetectShard, bundle_digest
+from asca_deploy.open_model import RuntimeOptions
 from asca_pillars.base.files import write_json
-from asca_pillars.cli.detect_archive import DetectShard, bundle_digest
-from asca_pillars.cli.options import RuntimeOptions
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.cluster.shards import cut
 from asca_pillars.scans.mounting import Mounting

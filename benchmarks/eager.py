@@ -63,7 +63,7 @@ def main(
 ) -> None:
     """Compare and print one table."""
     console = Console(markup=False, highlight=False)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # it may be any scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # it may be any scan
     threads = default_threads() if threads is None else threads
     torch.set_num_threads(threads)
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]

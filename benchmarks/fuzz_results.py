@@ -28,23 +28,23 @@ from rich.table import Table
 
 from asca_deploy import Detections, sample_scan_path, shipped_bundles
 from asca_deploy.browser_page import ORT_FILES, write_page
+from asca_deploy.recordings.foxglove_file import is_own_mcap
+from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult
+from asca_deploy.recordings.rerun_file import is_own_rrd
+from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import AscaError, OutputError
 from asca_pillars.base.own_files import page_end
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import describe_environment
-from asca_pillars.cli import eval_files
-from asca_pillars.cli.detect_files import ResultWriter
-from asca_pillars.cli.foxglove_file import is_own_mcap
-from asca_pillars.cli.recording_journal import JOURNAL_FILE, Journal, ScanResult
-from asca_pillars.cli.rerun_file import is_own_rrd
+from asca_pillars.base.writable_file import require_writable
 from asca_pillars.cli.run_command import run_command
-from asca_pillars.cli.writable_file import require_writable
 from asca_pillars.cluster.shards import Shard, ShardFolder
 from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_records import read_frame_file
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.importing.imported import MARKER, require_own_dataset
+from asca_pillars.evaluation import report_files as eval_files
 from asca_pillars.evaluation.boxes.box_predictions import read_box_predictions
 from asca_pillars.evaluation.tracking.tracking_report import tracking_report
 from asca_pillars.pictures.visualize import png_bytes

@@ -24,7 +24,7 @@ from asca_pillars.cli.run_command import run_command
 from asca_pillars.detection.decode import HeadMaps, rotated_nms
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.ops.pillar.grid import map_cells
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTableBuilder
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebookBuilder
 from asca_pillars.scans.input_check import check_input
 from asca_pillars.scans.scan_reader import read_scan
 
@@ -72,7 +72,7 @@ def host_path(points: NDArray[np.float32], bundle: PillarBundle) -> dict[str, Ca
         "decode": lambda: spec.decode(maps),
     }
     if rule is not None:
-        pooled, builder = map_cells(pillars.cells, spec.grid), NeckTableBuilder(*spec.grid.map_shape, rule)
+        pooled, builder = map_cells(pillars.cells, spec.grid), NeckRulebookBuilder(*spec.grid.map_shape, rule)
         cells = pillars.cells if pooled is None else pooled.cells
         stages["tables"] = lambda: builder.build(cells)
     return stages

@@ -48,7 +48,7 @@ def main(
     before_mib = peak_memory_mib() or math.nan
     start = time.perf_counter()
     edges = 20.0 * np.arange(bands + 1)
-    results = evaluate(truth, found, CLASS_NAMES, bands_m=list(pairwise(edges)), progress=True)
+    results = evaluate(truth, found, CLASS_NAMES, bands_m=list(pairwise(edges)))
     wall_s = time.perf_counter() - start
     peak_mib = peak_memory_mib() or math.nan
     console.print(f"evaluation: {wall_s:.1f} s; peak memory {peak_mib:.0f} MiB, {before_mib:.0f} MiB of it before")

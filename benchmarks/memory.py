@@ -49,7 +49,7 @@ def main(
 ) -> None:
     """Run, sample the resident memory along the way, print what is kept from cycle to cycle, and the slope of all."""
     console = Console(markup=False, highlight=False)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # crops are unlike any training scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # crops are unlike any training scan
     detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
     samples = [(done, _resident()) for done in _run(detector, scans, only, console)]
     counts, resident = np.array(samples).T

@@ -47,7 +47,7 @@ def main(
 ) -> None:
     """Print one row for each way to run the network with fewer digits."""
     console = Console(markup=False)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # it may be any scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # it may be any scan
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]
     expected = Detector(reference)
     table = Table("", title=f"{len(points)} scan(s), against {reference} on cpu in float32")

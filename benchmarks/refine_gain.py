@@ -37,9 +37,8 @@ from asca_pillars.evaluation.predictions import read_predictions, read_truth, wr
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.two_stage.first_stage import open_first_stage
-from asca_pillars.models.two_stage.network import RefineDetector
+from asca_pillars.models.two_stage.network import RefineDetector, refine_logits
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache
-from asca_pillars.models.two_stage.refined_detector import judge
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores
 
 Judged = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]
@@ -88,7 +87,7 @@ def _refined(path: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostPro
     found = {}
     for frame_id in frames.frame_ids:
         proposed, points = cache.files.read(frame_id), frames.points(frame_id, camera_view=True)
-        found[frame_id] = proposed.proposals, judge(detector.refiner, points, proposed, settings.neighbors)
+        found[frame_id] = proposed.proposals, refine_logits(detector.refiner, points, proposed, settings.neighbors)
     parameters = sum(weight.numel() for weight in detector.refiner.parameters())
     return found, checkpoint.config.model.spec.post, f"{parameters} parameters, {checkpoint.steps} steps"
 

@@ -50,7 +50,7 @@ def main(
 ) -> None:
     """Export both, in minutes, and print a table for each view."""
     console = Console(markup=False, highlight=False)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # it may be any scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # it may be any scan
     threads = default_threads() if threads is None else threads
     loaded = [read_scan(path).points for given in scans or [sample_scan_path()] for path in find_scans(given)]
     with tempfile.TemporaryDirectory() as work, console.status("Exporting") as status:

@@ -23,8 +23,8 @@ from asca_pillars.cli.run_command import run_command
 from asca_pillars.config.tree import load_config
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.models.build import build_model
-from asca_pillars.training.bfloat16 import settled
 from asca_pillars.training.dataset import open_dataset
+from asca_pillars.training.module import settled
 
 WARM_UP = 3
 

@@ -23,10 +23,10 @@ from asca_deploy import Detections, Detector
 from asca_pillars.base.errors import AscaError
 from asca_pillars.base.schema import parse
 from asca_pillars.cli.run_command import run_command
-from asca_pillars.cli.scan_input import ScanInput
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.scans.find_scans import find_scans
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.scans.scan_settings import ScanSettings
 

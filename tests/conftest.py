@@ -36,7 +36,7 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(autouse=True)
 def _runtime_log() -> Iterator[None]:
     """Commands silence the runtime's log for the rest of their process, which here goes on with other tests."""
-    log = logging.getLogger("asca_deploy")
+    log = logging.getLogger("asca_pillars")
     before = log.level
     yield
     log.setLevel(before)

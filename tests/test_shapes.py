@@ -11,9 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.geometry import boxes, overlap
-from asca_pillars.models.pillar.attention import ChannelAttention, PaperAttention, PointAttention
-from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
-from asca_pillars.models.pillar.head import SSDHead
+from asca_pillars.models.map_backbone import SSDHead
+from asca_pillars.models.pillar.encoder import (
+    ChannelAttention,
+    PaperAttention,
+    PillarEncoder,
+    PointAttention,
+    pillar_max,
+)
 from asca_pillars.models.pillar.neck import RPNNeck
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import PillarLimits

@@ -1,28 +1,60 @@
-"""Errors that are the user's to mend: one line that names the file, the value and the remedy."""
+"""Errors that are the user's to mend: one line that names the file, the value and the remedy.
+
+Exit codes of the command line are those of the errors' kinds; docs/guide/deploy.md lists them.
+"""
+
+from typing import ClassVar
+
+USAGE, PARTIAL, INPUT, ENVIRONMENT = 2, 3, 4, 5
+"""Exit codes: a wrong option or place, parts that could not be done, a file that cannot be used, what is missing here.
+
+0 is success and 1 the answer no (`asca doctor`, `asca bench --deadline`), or an error of the program.
+"""
 
 
 class AscaError(Exception):
-    """Base of every error that the command line prints as one line, without a traceback."""
+    """Base of every error that the command line prints as one line, without a traceback.
+
+    Raised itself where something is not installed.
+    """
+
+    exit_code: ClassVar[int] = ENVIRONMENT
 
 
 class ConfigError(AscaError):
     """A setting that cannot work: an unknown key, a wrong value, a grid that does not fit the network."""
 
+    exit_code = USAGE
+
 
 class ScanError(AscaError):
     """A scan file that cannot be read."""
+
+    exit_code = INPUT
+
+
+class PartialError(ScanError):
+    """Some of the input could not be read or written; results of the rest are there."""
+
+    exit_code = PARTIAL
 
 
 class DatasetError(AscaError):
     """A dataset folder, label or calibration file that is missing or damaged."""
 
+    exit_code = INPUT
+
 
 class BundleError(AscaError):
     """A model bundle that is missing, damaged or made for another version."""
 
+    exit_code = INPUT
+
 
 class OutputError(AscaError):
     """A place to write to that holds something which is not ours to replace."""
+
+    exit_code = USAGE
 
 
 class ProviderError(AscaError):
@@ -31,6 +63,8 @@ class ProviderError(AscaError):
 
 class ExportError(AscaError):
     """An export whose graphs do not reproduce the trained model."""
+
+    exit_code = INPUT
 
 
 class ClusterError(AscaError):
@@ -43,6 +77,8 @@ class WorkerError(AscaError):
 
 class TrainingError(AscaError):
     """A training run that cannot start or must not go on."""
+
+    exit_code = INPUT
 
 
 def printable(text: str, limit: int = 1000) -> str:

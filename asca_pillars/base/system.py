@@ -1,5 +1,6 @@
 """The computer, and what a result depends on beside its inputs: cores granted, versions, source revision."""
 
+import functools
 import importlib.metadata
 import math
 import os
@@ -112,6 +113,15 @@ def git_revision() -> str | None:
     except OSError:
         return None
     return run.stdout.strip() if run.returncode == 0 and (root / ".git").exists() else None
+
+
+@functools.cache
+def own_version() -> str:
+    """The version of asca-pillars; "unknown" where it is run without being installed."""
+    try:
+        return importlib.metadata.version("asca-pillars")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def package_versions() -> dict[str, str]:

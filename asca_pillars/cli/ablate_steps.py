@@ -139,7 +139,7 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
     """
     from asca_deploy.shipped import find_checkpoint
     from asca_export.proven_bundle import MIN_SCANS
-    from asca_pillars.training.initial_weights import initial_weights
+    from asca_pillars.training.checkpoints import initial_weights
 
     base = load_config(config, overrides)
     init = None if init is None else find_checkpoint(init)

@@ -15,10 +15,10 @@ from asca_pillars.cli.options import (
     PrecisionOption,
     ProviderOption,
     ReflectanceScaleOption,
-    RuntimeOptions,
     ScansArgument,
     SensorHeightOption,
     ThreadsOption,
+    scan_settings,
 )
 
 MOST_SCANS = 100  # they are held in memory, and every round goes over all of them
@@ -59,6 +59,16 @@ def bench(
         bool,
         typer.Option("--cold", help="New processes: seconds to the first boxes, and the peak memory of asca detect."),
     ] = False,
+    deadline: Annotated[
+        float | None,
+        typer.Option(
+            "--deadline", min=0.001, help="Milliseconds, such as 100: print the share of scans that take longer."
+        ),
+    ] = None,
+    late_share: Annotated[
+        float,
+        typer.Option("--late", min=0, max=1, help="With --deadline: exit with code 1 if a larger share takes longer."),
+    ] = 1.0,
     around: AroundOption = False,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
@@ -67,7 +77,7 @@ def bench(
     columns: ColumnsOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Time every stage from points to boxes: p50, p95, FPS, cold start, memory, and the machine it ran on.
+    """Time every stage from points to boxes: p50, p95, p99, FPS, cold start, memory, and the machine it ran on.
 
     Two lines say where to look for more speed: what is spent outside the graphs, and the roofline, the share of the
     machine's measured matrix multiplications per second that the backbone reaches. Of more than 100 scans some are
@@ -83,19 +93,19 @@ def bench(
 
     from asca_deploy import sample_scan_path
     from asca_deploy.manifest import load_bundle
+    from asca_deploy.open_model import RuntimeOptions, open_detector
     from asca_pillars.base.errors import ConfigError, ScanError
     from asca_pillars.base.files import write_json
     from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.base.writable_file import require_writable
     from asca_pillars.cli.bench_parts import Parts, measure_parts, named_bundles
-    from asca_pillars.cli.models import open_detector
-    from asca_pillars.cli.scan_input import ScanInput, scan_settings
-    from asca_pillars.cli.writable_file import require_writable
     from asca_pillars.scans.find_scans import name_scans
+    from asca_pillars.scans.scan_input import ScanInput
 
     # A pipe has no width, and the tables are wider than the 80 columns that rich takes then.
     piped = not sys.stdout.isatty() and "COLUMNS" not in os.environ
     console = Console(markup=False, highlight=False, width=120 if piped else None)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # `asca detect` warns of odd scans; here they are timed
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # `asca detect` warns of odd scans; here they are timed
     if around and (matrix or cold):
         raise ConfigError("--matrix and --cold time single passes: leave --around out, or them")
     settings = scan_settings(
@@ -118,8 +128,10 @@ def bench(
     require_writable(json, *report_json)
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     detector = open_detector(options, mounting=scan_input.mounting, around=around)
-    parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold)
+    parts = Parts(compare=bool(compare), matrix=matrix, scaling=scaling, stream=stream, cold=cold, deadline_ms=deadline)
     result = measure_parts(detector, points, rounds, parts, bundles, console)
     if json is not None:
         require_own_file(json, *report_json)
         write_json(json, result)
+    if deadline is not None and result["late_share"] > late_share:
+        raise typer.Exit(1)

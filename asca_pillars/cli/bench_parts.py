@@ -36,6 +36,7 @@ class Parts:
     scaling: bool = False
     stream: bool = False
     cold: bool = False
+    deadline_ms: float | None = None
 
 
 def measure_parts(
@@ -54,7 +55,7 @@ def measure_parts(
     def bar(count: int, what: str) -> Iterable[int]:
         return track(range(count), what, console=console, transient=True)
 
-    report = benchmark(detector, scans, rounds, track=bar)
+    report = benchmark(detector, scans, rounds, track=bar, deadline_ms=parts.deadline_ms)
     result = report.to_dict()
     lines = show.summary_lines(report)
     if not all(report.points_inside):

@@ -21,21 +21,25 @@ _BOXES = "boxes: largest difference from the first row's (boxes without a partne
 
 
 def stages_table(report: BenchmarkReport) -> Table:
-    """p50, p95 and min of every stage."""
+    """Percentiles of every stage."""
     points = f"{min(report.points)}" if len(set(report.points)) == 1 else f"{min(report.points)}-{max(report.points)}"
     title = f"{report.bundle}: {report.frames} warm frames, {report.scans} scan(s) of {points} points"
     if report.passes > 1:
         title += f", {report.passes} passes each"
-    table = _table(title, "stage", "p50 ms", "p95 ms", "min ms")
+    table = _table(title, "stage", "p50 ms", "p95 ms", "p99 ms", "max ms", "min ms")
     for name, times in [*report.stages_ms.items(), ("total", report.total_ms)]:
-        table.add_row(name, f"{times.p50:.2f}", f"{times.p95:.2f}", f"{times.min:.2f}")
+        table.add_row(name, *(f"{value:.2f}" for value in (times.p50, times.p95, times.p99, times.max, times.min)))
     return table
 
 
 def summary_lines(report: BenchmarkReport) -> list[str]:
-    """FPS, the share outside the graphs, start and memory."""
+    """Late frames, FPS, the share outside the graphs, start and memory."""
     memory = "" if report.peak_memory_mib is None else f", peak memory {report.peak_memory_mib:.0f} MiB"
+    late = []
+    if report.deadline_ms is not None and report.late_share is not None:
+        late = [f"later than {report.deadline_ms:g} ms: {report.late_share:.1%} of {report.frames} frames"]
     return [
+        *late,
         f"{report.fps:.1f} FPS; loaded in {report.load_s:.2f} s, first scan {report.cold_ms:.0f} ms{memory}",
         f"outside the graphs: {report.outside_ms.p50:.1f} ms (p95 {report.outside_ms.p95:.1f}), "
         f"{report.outside_share:.0%}",

@@ -1,11 +1,12 @@
 """`asca detect`: scans or a recording in, tables, pictures, KITTI text and tracks out."""
 
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.errors import ConfigError, PartialError
 from asca_pillars.cli.options import (
     AroundOption,
     AxesOption,
@@ -16,7 +17,6 @@ from asca_pillars.cli.options import (
     PrecisionOption,
     ProviderOption,
     ReflectanceScaleOption,
-    RuntimeOptions,
     ScansArgument,
     ScoreOption,
     SensorHeightOption,
@@ -24,7 +24,18 @@ from asca_pillars.cli.options import (
     VideoOption,
     VideoViewOption,
     read_scores,
+    scan_settings,
 )
+from asca_pillars.data.importing.formats import TOOLS
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from asca_deploy.detect_archive import ArchiveResult
+    from asca_deploy.detect_scans import DetectedScans
+    from asca_deploy.recordings.detect_recording import RecordingResult
+
+TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
 
 
 def detect(
@@ -72,6 +83,14 @@ def detect(
         Path | None,
         typer.Option("--calib", help="Of a recording: a KITTI calibration; also write KITTI's tracking text."),
     ] = None,
+    write: Annotated[
+        str | None,
+        typer.Option(
+            "--write",
+            metavar="FORMAT",
+            help=f"Also write the boxes as labels to correct, to OUT/FORMAT: {', '.join(TOOLS)} (docs/LABELLING.md).",
+        ),
+    ] = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
@@ -81,7 +100,7 @@ def detect(
     the scans (KITTI's label_2/, or a dataset.yaml above them) are drawn in white. OUT/index.html shows all pictures,
     sorted by scores and misses.
 
-    A scan that cannot be read is named and left out; the others are detected, and the exit code is 2.
+    A scan that cannot be read is named and left out; the others are detected, and the exit code is 3.
 
     A recording (.mcap, .db3, .bag, a rosbag2 folder) is detected scan by scan; OUT/detections.jsonl has a line for
     each, with its time. After a kill the same command goes on where it was.
@@ -107,25 +126,24 @@ def detect(
     from rich.console import Console
 
     from asca_deploy import sample_scan_path
-    from asca_deploy.auto import summary
-    from asca_pillars.cli.detect_files import ResultWriter
-    from asca_pillars.cli.detect_scans import detect_scans
-    from asca_pillars.cli.detect_video import video_options
-    from asca_pillars.cli.models import open_detector
-    from asca_pillars.cli.scan_input import ScanInput, scan_settings
-    from asca_pillars.data.boxes.detector_scope import detector_scope
-    from asca_pillars.scans.find_scans import name_scans
+    from asca_deploy.open_model import RuntimeOptions
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.scans.recordings.open_recording import is_recording
 
     console = Console(markup=False)
-    logging.getLogger("asca_deploy").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
     reading = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
-    view = video_options(video, video_view, [*(scans or ()), *([] if calib is None else [calib])])
     recordings = [path for path in scans or () if is_recording(path)]
+    if write is not None:
+        from asca_pillars.data.importing.tool_labels import require_unchanged
+
+        if recordings:
+            raise ConfigError(f"--write {write}: labels belong to scan files, and {recordings[0]} is a recording")
+        require_unchanged(out, write)
     if recordings:
         if cluster is not None or len(scans or ()) > 1:
             raise ConfigError(f"{recordings[0]}: is a recording; give one alone, without --cluster")
@@ -133,43 +151,132 @@ def detect(
             raise ConfigError("--pictures: scans of a recording are not drawn; leave it out, or give --rerun FILE")
         if columns is not None:
             raise ConfigError(f"--columns {columns}: is for .bin files, and a recording names its fields; leave it out")
-        from asca_pillars.cli.detect_recording import RecordingTask, detect_recording
+        from asca_deploy.recordings.detect_recording import detect_recording
 
-        task = RecordingTask(
-            path=recordings[0],
-            out=out,
-            score=scores,
-            around=around,
-            topic=topic,
-            track=track,
-            odometry=odometry,
-            calib=calib,
-            foxglove=foxglove,
-            rerun=rerun,
-            video=video,
-            video_view=view,
-        )
-        detect_recording(task, reading, options, console)
+        with Bars(console) as bars:
+            recorded = detect_recording(
+                recordings[0],
+                out,
+                topic=topic,
+                track=track,
+                odometry=odometry,
+                calib=calib,
+                foxglove=foxglove,
+                rerun=rerun,
+                video=video,
+                video_view=video_view,
+                options=options,
+                reading=reading,
+                score=scores,
+                around=around,
+                progress=bars,
+                remark=bars.remark,
+            )
+        _print_recording(recorded, console)
         return
     if topic or track or odometry or foxglove or rerun or calib:
         options_of_recordings = "--topic, --track, --odometry, --foxglove, --rerun and --calib"
         raise ConfigError(f"{options_of_recordings} need a recording (.mcap, .db3, .bag)")
-    named = name_scans(scans or [sample_scan_path()])
-    scan_input = ScanInput(reading, [path for path, _ in named])
     if cluster is not None:
-        from asca_pillars.cli.detect_archive import detect_archive
+        from asca_deploy.detect_archive import detect_archive
+        from asca_pillars.scans.find_scans import name_scans
 
         if video is not None:
             raise ConfigError(f"--video {video}: is not made with --cluster; leave one of them out")
         if pictures:
             raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
-        paths = [path for path, _ in named]
-        detect_archive(paths, scan_input, reading, options, out, score=scores, around=around, address=cluster)
+        paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
+        with Bars(console, transient=True) as bars:
+            archive = detect_archive(
+                paths,
+                out,
+                address=cluster,
+                options=options,
+                reading=reading,
+                score=scores,
+                around=around,
+                progress=bars,
+                remark=bars.remark,
+            )
+        _write_labels(out, write, console)
+        _print_archive(archive, out, console)
         return
-    detector = open_detector(options, scores, scan_input.mounting, around=around)
+    from asca_deploy.detect_scans import detect_scans
+
+    with Bars(console) as bars:
+        found = detect_scans(
+            scans or None,
+            out,
+            options=options,
+            reading=reading,
+            score=scores,
+            around=around,
+            pictures=pictures is not False,
+            video=video,
+            video_view=video_view,
+            progress=bars,
+            failed=lambda line: print(f"asca: {line}", file=sys.stderr),
+        )
+    _write_labels(out, write, console)
+    _print_scans(found, out, console)
+
+
+def _write_labels(out: Path, name: str | None, console: "Console") -> None:
+    """Write the boxes of the run that `out` holds as labels of a tool, if one was named."""
+    if name is not None:
+        from asca_deploy.result_files import RUN_FILE
+        from asca_pillars.data.importing.tool_labels import write_prelabels
+
+        console.print(f"Labels to correct: {write_prelabels(out / RUN_FILE, name, out)}/", soft_wrap=True)
+
+
+def _print_scans(found: "DetectedScans", out: Path, console: "Console") -> None:
+    """Print boxes or a line per scan, remarks and times; PartialError if some scans failed."""
+    from asca_deploy.auto import summary
+    from asca_pillars.cli import detect_tables as show
+
+    detector = found.detector
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
-    scope = detector_scope(detector.spec, around=around)
-    names = [name for _, name in named]
-    writer = ResultWriter(out, names, pictures=pictures is not False, scope=scope, video=video, video_view=view)
-    detect_scans(named, scan_input, detector, writer, console)
+    asked = len(found) + found.unreadable
+    one = asked == 1
+    console.print(show.boxes(found[0].path, found[0].detections) if one else show.scans(found, detector.spec))
+    for line in found.remarks:
+        show.remark(console, line)
+    reports = [scan.detections.report for scan in found]
+    while len(reports) < TIMED_FRAMES:
+        reports.append(detector(found.last_points).report)
+    console.print(show.timing(reports[1:], detector))
+    console.print(f"Results: {out}/")
+    if unwritten := len(found.failed) - found.unreadable:
+        raise PartialError(f"results of {unwritten} of {asked} scans could not be written; they are named above")
+    if found.unreadable:
+        raise PartialError(f"{found.unreadable} of {asked} scans could not be read; they are named above")
+
+
+def _print_recording(found: "RecordingResult", console: "Console") -> None:
+    """Print counts and files; PartialError if parts of the recording could not be read."""
+    boxes = ", ".join(f"{count} {name}" for name, count in found.boxes.items())
+    console.print(f"{found.scans} scans, in all {boxes}", highlight=False)
+    if found.cpu_ms_per_scan is not None:
+        console.print(f"{found.cpu_ms_per_scan:.1f} ms of CPU per scan")
+    console.print(f"Results: {', '.join(map(str, found.files))}", soft_wrap=True)
+    if found.problems:
+        raise PartialError("; ".join(found.problems))
+
+
+def _print_archive(found: "ArchiveResult", out: Path, console: "Console") -> None:
+    """Print counts; PartialError if some scans could not be read."""
+    from asca_deploy.result_files import RUN_FILE, UNREADABLE_FILE
+
+    detected, unreadable = found.counts
+    if found.done_before:
+        console.print(f"{found.done_before} scans were done by an earlier run", highlight=False)
+    if found.repeats:
+        console.print(f"{found.repeats} shards were begun again after their worker had died", highlight=False)
+    console.print(f"{detected} scans: {out / RUN_FILE}", highlight=False, soft_wrap=True)
+    if unreadable:
+        named = out / UNREADABLE_FILE
+        raise PartialError(
+            f"{unreadable} of {detected + unreadable} scans could not be read; they are named in {named}"
+        )

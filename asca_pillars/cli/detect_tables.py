@@ -1,31 +1,17 @@
-"""What `asca detect` prints: one scan's boxes or a line per scan, notes, and the time of every stage."""
+"""What `asca detect` prints: one scan's boxes or a line per scan, and the time of every stage."""
 
-import re
 import statistics
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from asca_deploy import Detector, FrameReport, ScanDetections
+from asca_deploy.detect_scans import DetectedScans
 from asca_pillars.base.errors import printable
-from asca_pillars.scans.scan_reader import ScanNotes
-
-_NUMBER = re.compile(r"\d[\d.,]*")
-
-
-class Result(NamedTuple):
-    """What is kept of a scan that has been detected: `labels` (N,) are class indices."""
-
-    path: Path
-    notes: ScanNotes
-    labels: NDArray[np.int64]
-    report: FrameReport
+from asca_pillars.detection.spec import DetectorSpec
 
 
 def remark(console: Console, text: str) -> None:
@@ -58,35 +44,18 @@ def _direction(bearing_deg: float) -> str:
     return "ahead" if angle == 0 else f"{angle}° {'left' if bearing_deg > 0 else 'right'}"
 
 
-def scans(results: Sequence[Result], class_names: Sequence[str]) -> Table:
+def scans(results: DetectedScans, spec: DetectorSpec) -> Table:
     """A line per scan: how many objects of each class."""
     table = Table(title=f"{len(results)} scans")
-    for column in ("scan", "points", *class_names, "time"):
+    for column in ("scan", "points", *spec.class_names, "time"):
         table.add_column(column, justify="left" if column == "scan" else "right")
-    for path, _, labels, report in results:
-        counts = np.bincount(labels, minlength=len(class_names))
+    for result in results:
+        report = result.detections.report
+        counts = map(str, np.bincount(result.detections.labels, minlength=len(spec.classes)))
         table.add_row(
-            path.name, str(report.counts.points // report.passes), *map(str, counts), f"{report.total_ms:.0f} ms"
+            result.path.name, str(report.counts.points // report.passes), *counts, f"{report.total_ms:.0f} ms"
         )
     return table
-
-
-def notes(results: Iterable[Result]) -> Iterator[str]:
-    """What was repaired, dropped or odd, each kind once, with the first scan that it concerns and how many others."""
-    names: dict[str, list[str]] = defaultdict(list)
-    for path, notes, _, report in results:
-        found = [*notes.remarks, *report.warnings]
-        if notes.dropped_points:  # when the file was read; what the detector dropped is among its warnings
-            found.append(f"{notes.dropped_points} points are not finite and were dropped")
-        if notes.clipped_reflectances:
-            found.append(
-                f"{notes.clipped_reflectances} reflectances lie outside 0..{notes.reflectance_scale:g} and were set "
-                "to the nearer end; if they are stored on another scale, state it (--reflectance-scale)"
-            )
-        for text in found:
-            names[_NUMBER.sub("#", text)].append(f"{path.name}: {text}")  # of one kind: alike but for the numbers
-    for lines in names.values():
-        yield lines[0] + (f" (and {len(lines) - 1} more scans alike)" if lines[1:] else "")
 
 
 def timing(reports: Sequence[FrameReport], detector: Detector) -> str:

@@ -3,44 +3,64 @@
 import platform
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from rich.console import Console
 
 from asca_deploy import Detector, default_bundle_path, openvino_session
 from asca_deploy.auto import summary
-from asca_deploy.providers import AUTO, PROVIDERS, require
+from asca_deploy.providers import AUTO, PROVIDERS
+from asca_deploy.providers import require as require_provider
 from asca_pillars.base.errors import AscaError
+from asca_pillars.base.extras import EXTRAS, missing_modules
 from asca_pillars.base.installation import install_command
-from asca_pillars.base.system import cpu_model, package_versions
-from asca_pillars.cli.extras import EXTRAS, missing_modules
+from asca_pillars.base.system import cpu_model, own_version, package_versions
 
 
-def print_checks(console: Console) -> None:
+def check_machine() -> dict[str, Any]:
+    """Versions and, for each provider, extra and the bundled model, whether it runs ("ok") and why or how ("says")."""
+    return {
+        "version": own_version(),
+        "python": platform.python_version(),
+        "cpu": cpu_model(),
+        "packages": package_versions(),
+        "providers": {name: _check(partial(_provider, name)) for name in PROVIDERS},
+        "extras": {extra: _extra(extra) for extra in EXTRAS},
+        "model": {"name": default_bundle_path().name} | _check(_bundled_model),
+    }
+
+
+def print_checks(checks: dict[str, Any], console: Console) -> None:
     """Print a line for each provider, extra and the bundled model."""
-    console.print(f"Python {platform.python_version()}, {cpu_model()}")
-    console.print(", ".join(f"{name} {version}" for name, version in package_versions().items()))
-    for name in PROVIDERS:
-        _check(console, f"provider {name}", partial(_provider, name))
-    for extra in EXTRAS:
-        missing = missing_modules(extra)
-        remedy = f"missing {', '.join(missing)}: {install_command(extra)}"
-        console.print(f"  extra {extra}: {remedy if missing else 'ok'}", highlight=False, soft_wrap=True)
-    _check(console, f"bundled model {default_bundle_path().name}", _bundled_model)
+    console.print(f"Python {checks['python']}, {checks['cpu']}")
+    console.print(", ".join(f"{name} {version}" for name, version in checks["packages"].items()))
+    named = {f"provider {name}": check for name, check in checks["providers"].items()}
+    named |= {f"extra {name}": check for name, check in checks["extras"].items()}
+    named[f"bundled model {checks['model']['name']}"] = checks["model"]
+    for name, check in named.items():
+        console.print(f"  {name}: {check['says']}", highlight=False, soft_wrap=True)
 
 
-def _provider(name: str) -> str:
-    require(name)
-    return f"ok, {openvino_session.describe()}" if name == "openvino" else "ok"
+def _provider(name: str) -> dict[str, Any]:
+    require_provider(name)
+    return {"says": f"ok, {openvino_session.describe()}" if name == "openvino" else "ok"}
 
 
-def _bundled_model() -> str:
+def _extra(name: str) -> dict[str, Any]:
+    missing = missing_modules(name)
+    return {
+        "ok": not missing,
+        "says": f"missing {', '.join(missing)}: {install_command(name)}" if missing else "ok",
+    }
+
+
+def _bundled_model() -> dict[str, Any]:
     detector = Detector(provider=AUTO)
-    return f"ok, {summary(detector.runs_on, detector.candidates)}"
+    return {"says": f"ok, {summary(detector.runs_on, detector.candidates)}", "made_by": detector.made_by}
 
 
-def _check(console: Console, name: str, attempt: Callable[[], str]) -> None:
+def _check(attempt: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     try:
-        found = attempt()
+        return {"ok": True} | attempt()
     except AscaError as error:
-        found = str(error)
-    console.print(f"  {name}: {found}", highlight=False, soft_wrap=True)
+        return {"ok": False, "says": str(error)}

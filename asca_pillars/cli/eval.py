@@ -6,11 +6,9 @@ from typing import Annotated, Literal
 import typer
 
 from asca_pillars.cli.options import (
-    MIN_SCORE,
     AroundOption,
     PrecisionOption,
     ProviderOption,
-    RuntimeOptions,
     ThreadsOption,
     read_scores,
 )
@@ -75,7 +73,7 @@ def evaluate(
         typer.Option(
             "--min-score", min=0, max=1, help="Lowest score that a model is run with: AP needs the weak detections too."
         ),
-    ] = MIN_SCORE,
+    ] = 0.05,
     protocol: Annotated[
         Literal["kitti", "waymo", "iou", "distance", "tracking"] | None,
         typer.Option(
@@ -121,66 +119,34 @@ def evaluate(
     """
     from rich.console import Console
 
-    from asca_pillars.cli import eval_steps as steps
-    from asca_pillars.cli.eval_arguments import EvalArguments, check_arguments, default_protocol
-    from asca_pillars.cli.eval_errors import prepare_errors, who_predicted
-    from asca_pillars.cli.eval_files import claim
-    from asca_pillars.cli.eval_gallery import draw_gallery
-    from asca_pillars.cli.models import open_model
-    from asca_pillars.data.kitti import KittiSplit
-    from asca_pillars.evaluation.predictions import read_predictions, read_truth
+    from asca_deploy.evaluate import evaluate as run
+    from asca_deploy.open_model import RuntimeOptions
+    from asca_pillars.cli.progress import Bars
 
     console = Console(markup=False)
-    protocol = protocol or default_protocol(data)
-    options = RuntimeOptions(bundle=model, provider=provider, precision=precision, threads=threads)
-    scores = read_scores(score)
-    sources = model, data, split, predictions, labels
-    given = EvalArguments(
-        protocol, *sources, out, gallery, compare, scores, min_score, around, errors, errors_by, beside
-    )
-    check_arguments(given, options)
-    split = "val" if split is None else split
-    if protocol == "tracking":
-        from asca_pillars.cli.eval_tracks import evaluate_tracks
-
-        assert data is not None and predictions is not None, "checked with the arguments"
-        evaluate_tracks(data, split, predictions, out, json, console)
-        return
-    if protocol in ("iou", "distance"):
-        from asca_pillars.cli.eval_boxes import BoxTask, evaluate_boxes
-
-        assert data is not None, "checked with the arguments"
-        box_task = BoxTask(protocol, data, split, out, json, scores, min_score, around, errors, errors_by, beside)
-        evaluate_boxes(box_task, options, predictions, console)
-        return
-    inputs = (model, data, labels, compare, *(beside or ()))
-    claim("report" if protocol == "kitti" else protocol, out, json, predictions, inputs)
-    frames_of = None if data is None else KittiSplit(data, split)
-    if labels is None:
-        assert frames_of is not None, "checked with the arguments"
-        labels = frames_of.folder / "label_2"
-    truth = read_truth(labels, None if frames_of is None else frames_of.frame_ids)
-    analysis = None
-    if predictions is not None:
-        if errors:
-            assert frames_of is not None, "checked with the arguments"
-            analysis = prepare_errors(who_predicted(predictions), frames_of, errors_by, beside)
-        task = steps.text_task(predictions, labels, frames_of, scores)
-    else:
-        assert frames_of is not None, "checked with the arguments"
-        opened = open_model(options, min_score)
-        if errors:
-            analysis = prepare_errors(opened.name, frames_of, errors_by, beside)
-        fixed = steps.kitti_scores(opened, scores, min_score) if protocol == "kitti" else {}
-        task = steps.run_model(opened, frames_of, labels, fixed, out, console)
-    frames = read_predictions(task.predictions, truth, labels, console=console)
-    steps.warn_of_degrees_in_text(console, frames)
-    if protocol == "waymo":
-        steps.report_waymo(task, frames, out, json, console)
-    else:
-        steps.check_classes(task, frames)
-        steps.report_kitti(task, frames, out, json, console)
-        draw_gallery(task, frames, out, gallery, compare, console)
-        if analysis is not None:
-            steps.analyze_errors(analysis, task, frames, out, console)
+    with Bars(console) as bars:
+        done = run(
+            model,
+            data,
+            out,
+            split=split,
+            protocol=protocol,
+            predictions=predictions,
+            labels=labels,
+            score=read_scores(score),
+            min_score=min_score,
+            around=around,
+            gallery=gallery,
+            compare=compare,
+            errors=errors,
+            errors_by=errors_by,
+            beside=beside or (),
+            json=json,
+            options=RuntimeOptions(provider=provider, precision=precision, threads=threads),
+            progress=bars,
+            remark=bars.remark,
+        )
+    done.page.print(console)
+    if done.errors is not None:
+        done.errors.print(console)
     console.print(f"Written to {out}/", highlight=False)

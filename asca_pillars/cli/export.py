@@ -1,12 +1,17 @@
 """`asca export`: a checkpoint in, a bundle out that was compared with it; or from a bundle what other runtimes need."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from asca_pillars.cli.extras import require
 from asca_pillars.cli.options import ScoreOption, read_scores
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from asca_deploy.bundle import Quantization
 
 
 def export(
@@ -98,8 +103,6 @@ def export(
     asca export my_bundle --golden -o golden
     """
     if golden or browser or ort_web is not None:
-        from asca_pillars.cli.export_runtime import export_for_runtime
-
         of_a_checkpoint = {
             "--trained-on": trained_on,
             "--score": score,
@@ -109,73 +112,32 @@ def export(
             "--dense-neck": dense_neck,
             "--with-weights": with_weights,
         }
-        export_for_runtime(checkpoint, out, scans, of_a_checkpoint, golden=golden, browser=browser, ort_web=ort_web)
+        _export_for_runtime(checkpoint, out, scans, of_a_checkpoint, golden=golden, browser=browser, ort_web=ort_web)
         return
-    require("train")
-    from dataclasses import replace
-
     import numpy as np
     from rich.console import Console
 
-    from asca_deploy.bundle import BUNDLE_FOLDER
-    from asca_export.export import export_bundle
-    from asca_export.pillar.export import require_maskable
-    from asca_export.proven_bundle import ExportOptions
-    from asca_pillars.base.errors import ConfigError
-    from asca_pillars.base.own_files import require_not_input, require_replaceable
-    from asca_pillars.cli.export_steps import (
-        CALIBRATION_SCANS,
-        CALIBRATION_SEED,
-        PARITY_SCANS,
-        PARITY_SEED,
-        View,
-        open_source,
-        print_quantization,
-        read_or_simulate,
-        with_ranges,
-    )
+    from asca_export.export_checkpoint import export as run
+    from asca_pillars.cli.progress import Bars
 
     console = Console(markup=False)
-    require_replaceable(out, *BUNDLE_FOLDER)  # before minutes of work
-    require_not_input(out, (scans, calibrate))
-    source = open_source(checkpoint)
-    loaded = source.checkpoint
-    spec = loaded.config.model.spec.with_score_threshold(source.score_thresholds)
-    if (scores := read_scores(score)) is not None:
-        spec = spec.with_score_threshold(scores)
-    if range_m is not None:
-        spec = with_ranges(spec, range_m)
-    model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
-    loaded = loaded.with_model(model)
-    if calibrate is not None and not int8:
-        raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
-    require_not_input(out, (getattr(model, "first_stage", None),))
-    if dense_neck:
-        require_maskable(loaded.config.model, int8=int8)
-    if loaded.expected_input is None and scans is None:
-        raise ConfigError(
-            f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
-            "give some of them with --scans"
-        )
-    points = read_or_simulate(scans, console, PARITY_SCANS, PARITY_SEED)
-    # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
-    view: View = "camera" if loaded.config.data.camera_view else "full"
-    calibration = read_or_simulate(calibrate, console, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
-    # A bundle that is written anew from its own weights keeps them: they may be the only ones.
-    keeps = with_weights or source.path.parent.resolve() == out.resolve()
-    weights = source.path if keeps else None
-    with console.status("Exporting") as status:
-        options = ExportOptions(
-            trained_on=trained_on or source.trained_on,
-            command=source.command,
-            calibration=calibration,
+    with Bars(console, transient=True) as bars:
+        bundle = run(
+            checkpoint,
+            out,
+            scans=scans,
+            trained_on=trained_on,
+            score=read_scores(score),
+            range_m=range_m,
+            int8=int8,
+            calibrate=calibrate,
             dense_neck=dense_neck,
-            weights=weights,
-            progress=status.update,
+            with_weights=with_weights,
+            progress=bars,
+            step=bars.step,
         )
-        bundle = export_bundle(loaded, out, points, options)
     parity = bundle.parity
-    assert parity is not None, "export_bundle proves it"
+    assert parity is not None, "export proves it"
     console.print(
         f"{out}: parity on {parity.scans} scans: head maps within {parity.head_maps_max_abs_error:.2g}, "
         f"boxes within {parity.box_max_error_m:.2g} m and {np.rad2deg(parity.yaw_max_error_rad):.2g} degrees"
@@ -183,4 +145,76 @@ def export(
     if bundle.expected_input_from == "export":
         console.print("The checkpoint does not describe its training scans: expected_input is measured on --scans")
     if bundle.quantization is not None:
-        print_quantization(bundle.quantization, console)
+        _print_quantization(bundle.quantization, console)
+
+
+def _print_quantization(report: "Quantization", console: "Console") -> None:
+    """A line per layer, and what the boxes say."""
+    from rich.table import Table
+
+    table = Table(title=f"In 8 bits, calibrated on {report.calibration_scans} scans")
+    if report.dropped_scans:
+        console.print(f"{report.dropped_scans} calibration scans left out: parity is proven on the same ones")
+    table.add_column("layer")
+    table.add_column("logit error if it alone stays float", justify="right")
+    table.add_column("kept float")
+    for layer in report.layers:
+        table.add_row(layer.layer, f"{layer.logit_rms_error:.4f}", "yes" if layer.kept_float else "")
+    console.print(table)
+    console.print(
+        f"Logit error {report.logit_rms_error:.4f}; of {report.boxes} boxes on {report.compared_scans} scans "
+        f"{report.boxes_matched} are there again, {report.boxes_added} are new. "
+        "What that costs in AP says `asca eval` on both bundles"
+    )
+
+
+def _export_for_runtime(
+    bundle: Path,
+    out: Path,
+    scans: Path | None,
+    of_a_checkpoint: Mapping[str, object],
+    *,
+    golden: bool,
+    browser: bool,
+    ort_web: Path | None,
+) -> None:
+    """`asca export --golden` and `asca export --browser`.
+
+    Args:
+        bundle: folder, or name of one that ships.
+        out: folder to be written.
+        scans: the scan, or a folder of which the first is taken; None for the one that comes with the package.
+        of_a_checkpoint: options, by name, that a bundle has no use for.
+        golden, browser: which of the two; one of them.
+        ort_web: npm's package onnxruntime-web, for `browser`.
+
+    Raises:
+        ConfigError: options that do not go together.
+    """
+    from rich.console import Console
+
+    from asca_deploy import find_bundle, sample_scan_path
+    from asca_deploy.browser_page import START, find_ort_web, write_page
+    from asca_deploy.golden import GOLDEN, write_golden
+    from asca_pillars.base.errors import ConfigError
+    from asca_pillars.scans.find_scans import find_scans
+
+    if golden == browser or (ort_web is not None and not browser):
+        raise ConfigError("give one of --golden and --browser; --ort-web goes with --browser")
+    if given := [name for name, value in of_a_checkpoint.items() if value]:
+        raise ConfigError(f"{given[0]} is for a checkpoint, and --golden and --browser read a bundle; leave it out")
+    folder = find_bundle(bundle)
+    scan = sample_scan_path() if scans is None else find_scans(scans)[0]
+    console = Console(markup=False)
+    if browser:
+        size_bytes = write_page(out, folder, scan, find_ort_web(ort_web))
+        console.print(f"{out}: {size_bytes / 1e6:.0f} MB. {START.format(out=out)}", soft_wrap=True)
+        return
+    stages = write_golden(out, folder, scan)
+    arrays = [array for named in stages.values() for array in named.values()]
+    size_bytes = sum(array.nbytes for array in arrays)
+    boxes = len(stages["suppress"]["boxes"])
+    console.print(
+        f"{out}: {len(arrays)} arrays, {size_bytes / 1e6:.0f} MB, {boxes} boxes of {scan.name}; {GOLDEN} names them",
+        soft_wrap=True,
+    )

@@ -1,7 +1,7 @@
 """`asca import`: labels of other datasets as a dataset with boxes in the LiDAR frame; scans stay where they are."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -11,7 +11,9 @@ from asca_pillars.cli.options import (
     PoseOption,
     ReflectanceScaleOption,
     SensorHeightOption,
+    scan_settings,
 )
+from asca_pillars.data.importing.formats import FORMATS
 
 
 def import_dataset(
@@ -19,16 +21,16 @@ def import_dataset(
     out: Annotated[Path, typer.Argument(help="Folder for dataset.yaml, labels.jsonl and ImageSets/.")],
     *,
     source_format: Annotated[
-        Literal["boxes", "argoverse2", "nuscenes", "waymo", "kitti-raw", "kitti-tracking"],
+        str,
         typer.Option(
             "--from",
-            help="boxes: .csv or .jsonl for all scans, or a folder with a .csv or .json for each (docs/DATA.md). "
-            "argoverse2: a folder of logs. nuscenes: the folder with samples/ and v1.0-*/. waymo: the folder with "
-            "lidar/, lidar_box/ and lidar_calibration/ (parquet). kitti-raw: a folder of drives with their tracklets. "
-            "kitti-tracking: the folder with training/.",
+            metavar="FORMAT",
+            help=" ".join(f"{name}: {form.help}." for name, form in FORMATS.items()),
         ),
     ] = "boxes",
-    scans: Annotated[Path | None, typer.Option("--scans", help="Folder of the scans; with --from boxes.")] = None,
+    scans: Annotated[
+        Path | None, typer.Option("--scans", help="Folder of the scans; with boxes and labels of tools.")
+    ] = None,
     rename: Annotated[
         list[str] | None,
         typer.Option("--rename", help="OLD=NEW, a class by another name; several may get one name. Repeatable."),
@@ -53,48 +55,35 @@ def import_dataset(
     asca import boxes.csv data/own --scans recordings/
 
     asca import results/detections.jsonl data/own --scans sweeps/ --axes y-forward --sensor-height auto
+
+    asca import labels/ data/own --from labelcloud --scans recordings/
     """
     from rich.console import Console
 
     from asca_pillars.base.errors import ConfigError, printable
-    from asca_pillars.cli.extras import require
-    from asca_pillars.cli.scan_input import scan_settings
-    from asca_pillars.data.importing.argoverse2 import read_argoverse2
-    from asca_pillars.data.importing.box_files import read_box_files
-    from asca_pillars.data.importing.imported import Importer, renamed, require_own_dataset, usable, write_imported
-    from asca_pillars.data.importing.kitti_raw import read_kitti_raw
-    from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
-    from asca_pillars.data.importing.nuscenes import read_nuscenes
-    from asca_pillars.data.importing.waymo_parquet import read_waymo
+    from asca_pillars.base.extras import require
+    from asca_pillars.data.importing.imported import renamed, require_own_dataset, usable, write_imported
     from asca_pillars.scans.scan_settings import ScanSettings
 
-    if (scans is not None) != (source_format == "boxes"):
-        raise ConfigError("--scans FOLDER goes with --from boxes, and only with it: other formats say where scans are")
+    if source_format not in FORMATS:
+        raise ConfigError(f"--from {source_format}: no such format; there are {', '.join(FORMATS)}")
+    form = FORMATS[source_format]
+    if (scans is not None) != form.scans_elsewhere:
+        those = ", ".join(name for name, one in FORMATS.items() if one.scans_elsewhere)
+        raise ConfigError(f"--scans FOLDER goes with --from {those}, and only with them: others say where scans are")
     if not source.exists():
         raise ConfigError(f"{source}: no such file or folder; check the path")
     if wrong := [text for text in rename or () if not all(text.partition("="))]:
         raise ConfigError(f"--rename {wrong[0]}: write OLD=NEW, such as --rename REGULAR_VEHICLE=Car")
     require_own_dataset(out, source)
-    if source_format == "argoverse2":
-        require("import")
-    importers: dict[str, Importer] = {
-        "argoverse2": read_argoverse2,
-        "nuscenes": read_nuscenes,
-        "kitti-raw": read_kitti_raw,
-        "kitti-tracking": read_kitti_tracking,
-    }
+    if form.extra is not None:
+        require(form.extra)
     settings = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
-    if scans is not None:
-        imported = read_box_files(source, scans, settings)
-    elif settings != ScanSettings():
+    if scans is None and settings != ScanSettings():
         raise ConfigError(f"--from {source_format} knows how its scans lie: leave --axes, --columns and the like out")
-    elif source_format == "waymo":
-        require("import")
-        imported = read_waymo(source, out)
-    else:
-        imported = importers[source_format](source)
+    imported = form.read(source, out=out, scans=scans, settings=settings)
     names = dict(text.split("=", 1) for text in rename or ())
     imported = renamed(usable(imported), names)
     counts = write_imported(out, imported, val_share)

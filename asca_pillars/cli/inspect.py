@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.cli.extras import require
+from asca_pillars.base.extras import require
 from asca_pillars.cli.options import JsonOption
 
 
@@ -44,7 +44,7 @@ def inspect(
 ) -> None:
     """Look at a dataset before training: objects, points, sizes and positives per class, ranges, scans.
 
-    Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 2.
+    Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 4.
 
     Examples:
 
@@ -59,15 +59,15 @@ def inspect(
     from asca_pillars.base.errors import ConfigError, DatasetError
     from asca_pillars.base.files import write_json
     from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.base.writable_file import require_writable
     from asca_pillars.cli import inspect_tables as show
-    from asca_pillars.cli.inspect_pictures import draw_frames, require_replaceable_pictures
-    from asca_pillars.cli.propose_config import propose_config
-    from asca_pillars.cli.writable_file import require_writable
     from asca_pillars.config.tree import load_config
     from asca_pillars.data.inspection.findings import findings
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
     from asca_pillars.data.inspection.measurements import input_cells
+    from asca_pillars.data.inspection.proposal import propose_config
     from asca_pillars.data.open_split import open_split
+    from asca_pillars.pictures.training_pictures import draw_frames, require_replaceable_pictures
 
     report_json = "asca inspect --json", json_object("config", "frames_in_split", "states_mounting", "findings")
     require_writable(json, *report_json)
@@ -87,7 +87,10 @@ def inspect(
 
         settings = dataclasses.replace(settings, model=with_first_stage(settings.model))
     if propose is not None:
-        settings = propose_config(frames_of, settings, propose, frames, console)
+        settings, text = propose_config(frames_of, settings, propose, frames)
+        console.print(text, soft_wrap=True)
+        next_step = f"asca train {propose} --data {frames_of.root} --out runs/own"
+        console.print(f"Written to {propose}. Next: {next_step}", soft_wrap=True)
     spec, min_points = settings.model.spec, settings.data.min_points
     view = settings.data.camera_view and frames_of.has_camera
     assigner = settings.model.loss.assigner if settings.model.kind == "pillar" else "overlap"
@@ -109,7 +112,7 @@ def inspect(
     console.print(show.conventions(inspection))
     console.print(show.matching(inspection), show.scans(inspection, input_cells(spec), view), sep="\n")
     if draw is not None:
-        draw_frames(data, frames_of.name, settings, draw, pictures, console)
+        console.print("\n".join(draw_frames(data, frames_of.name, settings, draw, pictures)), soft_wrap=True)
     errors = [finding for finding in found if finding.level == "error"]
     for finding in found:
         if finding not in errors[:1]:  # the first one is what the command fails with, below all of them

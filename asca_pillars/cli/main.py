@@ -7,6 +7,7 @@ import typer
 from asca_pillars import __version__
 from asca_pillars.cli.ablate import ablate
 from asca_pillars.cli.bench import bench
+from asca_pillars.cli.bundle import app as bundle
 from asca_pillars.cli.detect import detect
 from asca_pillars.cli.doctor import doctor
 from asca_pillars.cli.eval import evaluate
@@ -15,6 +16,7 @@ from asca_pillars.cli.import_dataset import import_dataset
 from asca_pillars.cli.import_weights import import_weights
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.cli.prepare import prepare
+from asca_pillars.cli.ros2 import ros2
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.cli.simulate import simulate
 from asca_pillars.cli.train import train
@@ -35,12 +37,14 @@ app.command()(train)
 app.command("eval")(evaluate)
 app.command()(export)
 app.command("import-weights")(import_weights)
+app.add_typer(bundle, name="bundle")
 app.command()(ablate)
+app.command()(ros2)
 app.command()(doctor)
 
 
 def main() -> None:
-    """Run the command; what the user can mend is one line on stderr and exit code 2."""
+    """Run the command; what the user can mend is one line on stderr and the exit code of its kind."""
     run_command(app, "asca")
 
 

@@ -1,13 +1,15 @@
 """Options that several commands share, declared once. Nothing heavy is imported here: `asca --help` is instant."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from asca_pillars.base.errors import ConfigError
+
+if TYPE_CHECKING:
+    from asca_pillars.scans.scan_settings import ScanSettings
 
 ScansArgument = Annotated[
     list[Path] | None,
@@ -34,9 +36,6 @@ ScoreOption = Annotated[
         "classes. Default: the model's, per class.",
     ),
 ]
-Scores: TypeAlias = float | Mapping[str, float]
-"""What `--score` says: one score for every class, or scores of some classes by name."""
-MIN_SCORE = 0.05  # of `asca eval --min-score`
 
 ProviderOption = Annotated[
     str, typer.Option("--provider", help="Where the network runs: cpu, auto, cuda, tensorrt, openvino.")
@@ -131,7 +130,7 @@ ClusterOption = Annotated[
 ]
 
 
-def read_scores(texts: Sequence[str] | None) -> Scores | None:
+def read_scores(texts: Sequence[str] | None) -> float | dict[str, float] | None:
     """`--score` as typed; None if it was not given.
 
     Raises:
@@ -153,24 +152,29 @@ def read_scores(texts: Sequence[str] | None) -> Scores | None:
     return scores[""]
 
 
-def scores_by_class(stated: Scores | None, defaults: Mapping[str, float]) -> dict[str, float]:
-    """The score of each class of `defaults`: as stated, else that one.
+def scan_settings(
+    *, sensor_height: str | None, axes: str, pose: Path | None, reflectance_scale: str, columns: int | None
+) -> "ScanSettings":
+    """The options of that name, as typed.
 
     Raises:
-        ConfigError: a stated class is none of them.
+        ConfigError: one cannot be used.
     """
-    if not isinstance(stated, Mapping):
-        return dict(defaults) if stated is None else dict.fromkeys(defaults, stated)
-    if unknown := [name for name in stated if name not in defaults]:
-        raise ConfigError(f"--score {unknown[0]}: no such class; there are {', '.join(defaults)}")
-    return dict(defaults) | dict(stated)
+    from asca_pillars.scans.scan_settings import ScanSettings
+
+    return ScanSettings(
+        sensor_height=None if sensor_height is None else _number(sensor_height, "--sensor-height"),
+        axes=axes,
+        pose=None if pose is None else str(pose),
+        reflectance_scale=_number(reflectance_scale, "--reflectance-scale"),
+        columns=columns,
+    )
 
 
-@dataclass(frozen=True, kw_only=True)
-class RuntimeOptions:
-    """Which model runs, and how. The arguments of `asca_deploy.Detector` by the same names."""
-
-    bundle: Path | None = None
-    provider: str = "cpu"
-    precision: str | None = None
-    threads: int | None = None
+def _number(text: str, option: str) -> Literal["auto"] | float:
+    if text == "auto":
+        return "auto"
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"{option} {text[:40]}: give a number or auto") from None

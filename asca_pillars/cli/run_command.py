@@ -1,4 +1,4 @@
-"""How a command ends: what the user can mend is one line on stderr and exit code 2."""
+"""How a command ends: what the user can mend is one line on stderr and the exit code of its kind."""
 
 import io
 import sys
@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import typer
 
-from asca_pillars.base.errors import AscaError, printable
+from asca_pillars.base.errors import ENVIRONMENT, INPUT, AscaError, printable
 
 
 def run_command(command: Callable[..., object], name: str | None = None) -> None:
@@ -24,18 +24,19 @@ def run_command(command: Callable[..., object], name: str | None = None) -> None
     try:
         command() if isinstance(command, typer.Typer) else typer.run(command)
     except AscaError as error:
-        _fail(name, str(error))
+        _fail(name, str(error), error.exit_code)
     except OSError as error:
         reason = str(error.strerror or error)
-        _fail(name, f"{error.filename}: {reason}" if error.filename else reason)
+        missing = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError)
+        message = f"{error.filename}: {reason}" if error.filename else reason
+        _fail(name, message, INPUT if missing else ENVIRONMENT)
     except MemoryError as error:
-        _fail(
-            name, f"not enough memory ({str(error) or 'no more is to be had'}); give it smaller input, or more memory"
-        )
+        reason = str(error) or "no more is to be had"
+        _fail(name, f"not enough memory ({reason}); give it smaller input, or more memory", ENVIRONMENT)
     except RecursionError:
-        _fail(name, "the input is nested too deeply to be read; simplify the file or the option")
+        _fail(name, "the input is nested too deeply to be read; simplify the file or the option", INPUT)
 
 
-def _fail(name: str, message: str) -> NoReturn:
+def _fail(name: str, message: str, code: int) -> NoReturn:
     print(f"{name}: {printable(message)}", file=sys.stderr)
-    sys.exit(2)
+    sys.exit(code)

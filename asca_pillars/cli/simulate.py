@@ -1,12 +1,15 @@
 """`asca simulate`: a folder of labelled street scans or of short drives, and how like real ones the scans are."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from asca_pillars.cli.extras import require
+from asca_pillars.base.extras import require
 from asca_pillars.cli.options import ClusterOption
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 FRAMES, LENGTH = 100, 100
 
@@ -104,50 +107,95 @@ def simulate(
     require("sim")
     if report or like is not None:
         require("eval")
-    if cluster is not None:
-        require("cluster")
     from rich.console import Console
 
     from asca_pillars.base.errors import ConfigError
-    from asca_pillars.cli.models import open_model
-    from asca_pillars.cli.options import RuntimeOptions
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.data.kitti import KittiSplit
-    from asca_pillars.sim.simulation import load_simulation_config, require_own_frames
-    from asca_pillars.sim.simulation import simulate as write_frames
+    from asca_pillars.sim.simulate import simulate as run
 
     if bundle is not None and like is None:
         raise ConfigError(f"--bundle {bundle} scores the objects of a real folder: give --like FOLDER, too")
-    if length is not None and sequences is None:
-        raise ConfigError(f"--length {length} is for drives: give --sequences N, too, or --frames N for single scans")
+    if sequences is not None and (frames is not None or report or like is not None or cluster is not None):
+        raise ConfigError("--sequences: leave --frames, --report, --like and --cluster out; they are for single scans")
     if like is not None:
         KittiSplit(like).frame_ids  # noqa: B018 - a wrong folder is named before the work
     if bundle is not None:
+        from asca_deploy.open_model import RuntimeOptions, open_model
+
         open_model(RuntimeOptions(bundle=bundle), 0.0)  # and so is a wrong bundle
     console = Console(markup=False)
-    settings = load_simulation_config(config, view)
-    if sequences is not None:
-        if frames is not None or report or like is not None or cluster is not None:
-            raise ConfigError(
-                "--sequences: leave --frames, --report, --like and --cluster out; they are for single scans"
-            )
-        from asca_pillars.sim.sequences.sequence_files import require_own_sequences, simulate_sequences
-
-        length = length or LENGTH
-        require_own_sequences(out)
-        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share)
-        console.print(f"{sequences} sequences of {length} scans below {out}; look at one: asca detect {out}/scans/0000")
-        return
     there = any((out / "training" / "velodyne").glob("*.bin"))
-    if frames is not None or not (there and (report or like is not None)):
-        frames = frames or FRAMES
-        require_own_frames(out)
-        write_frames(out, frames, seed, workers, settings, val_share, cluster=cluster)
-        console.print(f"{frames} frames below {out}; look at one: asca detect {out}/training/velodyne/000000.bin")
+    if sequences is not None or frames is not None or not (there and (report or like is not None)):
+        with Bars(console) as bars:
+            done = run(
+                out,
+                frames,
+                sequences=sequences,
+                length=length,
+                seed=seed,
+                workers=workers,
+                config=config,
+                view=view,  # type: ignore[arg-type]  # it is checked with the config
+                val_share=val_share,
+                cluster=cluster,
+                progress=bars,
+            )
+        if sequences is None:
+            console.print(f"{done.frames} frames below {out}; look at one: asca detect {done.scans}/000000.bin")
+        else:
+            what = f"{sequences} sequences of {done.frames // sequences} scans"
+            console.print(f"{what} below {out}; look at one: asca detect {out}/scans/0000")
     if report:
-        from asca_pillars.cli.simulate_reports import report_statistics
-
-        report_statistics(out, console)
+        _report_statistics(out, console)
     if like is not None:
-        from asca_pillars.cli.simulate_reports import report_like_for_like
+        _report_like_for_like(out, like, bundle, console)
 
-        report_like_for_like(out, like, bundle, console)
+
+def _report_statistics(out: Path, console: "Console") -> None:
+    """Compare the frames below `out` with KITTI; print the tables and write them, and the plots, to out/report/."""
+    from asca_pillars.sim.report.comparison import compare, measure
+    from asca_pillars.sim.report.plots import write_plots
+    from asca_pillars.sim.report.reference import kitti_reference
+    from asca_pillars.sim.report.tables import print_comparison, write_report
+
+    folder = _claimed(out)
+    reference = kitti_reference()
+    measured = measure(out)
+    comparison = compare(measured, reference.statistics)
+    print_comparison(comparison, console)
+    write_report(folder, comparison, write_plots(folder, comparison, measured, reference.sensor))
+    console.print(f"All rows and plots: {folder}/report.md; all numbers: {folder}/report.json", soft_wrap=True)
+
+
+def _report_like_for_like(out: Path, like: Path, bundle: Path | None, console: "Console") -> None:
+    """Compare the objects below `out` with those of a real folder; print the tables and write them to out/report/."""
+    from asca_deploy.open_model import RuntimeOptions, open_model
+    from asca_pillars.sim.report.like_for_like import MIN_SCORE, compare_like_for_like
+    from asca_pillars.sim.report.like_tables import print_like, write_like
+
+    folder = _claimed(out)
+    detect = None if bundle is None else open_model(RuntimeOptions(bundle=bundle), MIN_SCORE).detect
+    result = compare_like_for_like(like, out, detect, None if bundle is None else str(bundle))
+    print_like(result, console)
+    write_like(folder, result)
+    console.print(f"Written: {folder}/like_for_like.md, .json and .png", soft_wrap=True)
+
+
+def _claimed(out: Path) -> Path:
+    """The folder of the reports, in which nothing but earlier ones is replaced; OutputError names anything else."""
+    from asca_pillars.base.own_files import ending_with, is_own_picture, json_object, require_no_link, require_own
+    from asca_pillars.sim.report.tables import PAGE_END
+
+    folder = out / "report"
+    pictures = ("reflectance", "cars", "scans", "labels", "like_for_like")
+    products = {
+        "report.json": json_object("rows", "skipped", "simulated", "real"),
+        "like_for_like.json": json_object("real", "simulated", "detector", "rows", "firing"),
+        "report.md": ending_with(PAGE_END),
+        "like_for_like.md": ending_with(PAGE_END),
+        **{f"{name}.png": is_own_picture for name in pictures},
+    }
+    require_no_link(folder)
+    require_own(folder, "asca simulate", products)
+    return folder

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.cli.extras import require
+from asca_pillars.base.extras import require
 from asca_pillars.cli.options import ConfigArgument, DataOption, InitOption, OverridesOption
 
 INTERRUPTED = 130  # what a shell says of a command that Ctrl-C ended
@@ -42,9 +42,9 @@ def train(
     init = None if init is None else find_checkpoint(init)
     with console.status("Loading PyTorch"):
         from asca_pillars.training.callbacks import TrainingInterruptedError
-        from asca_pillars.training.loop import train as run_training
+        from asca_pillars.training.train import train as run_training
     try:
-        last = run_training(settings, data, out, devices=devices, num_nodes=num_nodes, init=init)
+        last = run_training(settings, data, out, devices=devices, num_nodes=num_nodes, init=init, bar=True)
     except TrainingInterruptedError as stop:
         console.print(str(stop))
         raise typer.Exit(INTERRUPTED) from None

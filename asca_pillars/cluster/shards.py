@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 from asca_pillars.base.errors import OutputError
-from asca_pillars.base.files import atomic_path, write_json
-from asca_pillars.base.sealed_lines import sealed, unsealed
+from asca_pillars.base.files import atomic_path, sealed, unsealed, write_json
 
 RUN_SETTINGS = "run.json"
 _SUFFIX = ".jsonl"

@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from asca_pillars.base.bounds import require_bounds
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.strict import Strict
+from asca_pillars.base.strict import Strict, require_bounds
 from asca_pillars.detection.targets import Assigner
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule
 from asca_pillars.ops.pillar.spec import PillarSpec

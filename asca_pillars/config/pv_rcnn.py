@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from asca_pillars.base.bounds import require_bounds
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.strict import Strict
+from asca_pillars.base.strict import Strict, require_bounds
 from asca_pillars.detection.proposals import AnchorProposals
 from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec

@@ -12,10 +12,9 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Discriminator, Tag
 
-from asca_pillars.base.bounds import require_bounds
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.settings import read_settings, shipped_configs
-from asca_pillars.base.strict import Strict
+from asca_pillars.base.strict import Strict, require_bounds
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.two_stage import RefineModel

@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from asca_pillars.base.bounds import require_bounds
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.strict import Strict
+from asca_pillars.base.strict import Strict, require_bounds
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.two_stage.decode import Scores
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings

@@ -32,7 +32,7 @@ class _Labels:
     one_with_points: bool = False
 
 
-def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> list[str]:
+def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: bool = True) -> list[str]:
     """Make sure that a list has boxes of the classes that are to be learnt; a line for whatever else looks wrong.
 
     That is a class without a box, and yaws that look like degrees. Frames are read only until every class was found.
@@ -42,6 +42,7 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> lis
         config: classes, ranges, and how many points a box needs.
         training: whether it is refused if there is no box at all. A validation list is refused only if its labels spell
             the classes in another way.
+        bar: show a progress bar on the terminal.
 
     Raises:
         DatasetError: there is no box of any class that could be learnt; a file is missing or cannot be read.
@@ -50,7 +51,7 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool) -> lis
     names = config.model.spec.class_names
     labels = _Labels()
     order = np.random.default_rng(0).permutation(len(split.frame_ids)).tolist()
-    for number in track(order, "Looking for boxes of each class", transient=True):
+    for number in track(order, "Looking for boxes of each class", transient=True, disable=not bar):
         _add(labels, split, split.frame_ids[number], config)
         complete = labels.one_with_points and all(labels.in_ranges[name] for name in names)
         if complete and len(labels.yaws) >= FEWEST_FRAMES:

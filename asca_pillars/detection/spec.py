@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from asca_pillars.detection.decode import HeadMaps, PostProcess, decode
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
 from asca_pillars.geometry.ranges import Ranges
+
+ScoreThresholds: TypeAlias = float | Mapping[str, float]
+"""One score for every class, or scores of some classes by name."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class DetectorSpec(Strict, ABC):
         anchors.flags.writeable = False
         return anchors
 
-    def with_score_threshold(self, score: float | Mapping[str, float]) -> Self:
+    def with_score_threshold(self, score: ScoreThresholds) -> Self:
         """The same detector that reports detections from `score` on: of every class, or of those named, by name.
 
         Raises:

@@ -10,11 +10,10 @@ from pathlib import Path, PurePath
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from asca_pillars.base.files import portable_name, write_text
 from asca_pillars.base.own_files import page_end
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image, read_labels
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
 from asca_pillars.geometry.ranges import Ranges
@@ -104,7 +103,7 @@ def write_gallery(
     labels: str | Path,
     ranges: Ranges,
     *,
-    console: Console | None = None,
+    reporter: Reporter = SILENT,
 ) -> None:
     """Draw frames: RANK_FRAME.png each, and index.html that shows them.
 
@@ -115,7 +114,7 @@ def write_gallery(
         split: the scans, calibrations and images.
         labels: the folder of KITTI text that they were judged by.
         ranges: what the pictures show.
-        console: shows the progress.
+        reporter: of the progress.
 
     Raises:
         DatasetError, ScanError: a frame's scan, calibration or text cannot be read.
@@ -129,7 +128,7 @@ def write_gallery(
         words, kinds = _DIFFERENT, [(f"missed, {one.name}", f"false, {one.name}") for one in detectors]
     title = " and ".join(one.name for one in detectors)
     cards = []
-    bar = track(chosen, "Drawing", console=console, disable=console is None)
+    bar = reporter.track(chosen, "Drawing")
     for rank, matches in enumerate(bar, start=1):
         frame_id = matches[0].frame_id
         name = f"{portable_name(f'{rank:03d}_{frame_id}')}.png"

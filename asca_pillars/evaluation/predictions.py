@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.input_files import read_text
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import KittiSplit, in_image, objects_from_boxes, read_labels, write_labels
 from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
@@ -92,7 +91,7 @@ def read_truth(folder: str | Path, frame_ids: Sequence[str] | None = None) -> li
 
 
 def read_predictions(
-    folder: str | Path, truth: Sequence[FrameObjects], labels: str | Path, *, console: Console | None = None
+    folder: str | Path, truth: Sequence[FrameObjects], labels: str | Path, *, reporter: Reporter = SILENT
 ) -> ScoredFrames:
     """Pair the labels with the predictions of a folder of KITTI text, one file per frame.
 
@@ -102,7 +101,7 @@ def read_predictions(
         folder: with NAME.txt of 16 fields per line.
         truth: labels of the frames to be evaluated.
         labels: the folder that they are from.
-        console: shows the progress.
+        reporter: of the progress.
 
     Raises:
         DatasetError: as `read_truth`; a line without a score; a prediction without labels.
@@ -123,8 +122,7 @@ def read_predictions(
             f"({len(unlabeled)} such); remove it or add the labels"
         )
     detections = tuple(
-        _read_frame(folder, frame.frame_id, scored=True)
-        for frame in track(pairs, "Reading predictions", console=console, disable=console is None)
+        _read_frame(folder, frame.frame_id, scored=True) for frame in reporter.track(pairs, "Reading predictions")
     )
     missing = tuple(frame.frame_id for frame in truth if frame.frame_id not in there)
     return ScoredFrames(tuple(pairs), detections, missing)
@@ -136,7 +134,7 @@ def write_predictions(
     detect: Callable[[NDArray[np.float32]], Detections],
     *,
     camera_view: bool = True,
-    console: Console | None = None,
+    reporter: Reporter = SILENT,
 ) -> None:
     """Run a detector over a split and write what the camera sees as KITTI text, one file per frame.
 
@@ -147,12 +145,12 @@ def write_predictions(
         split: the frames; their scans and calibrations are read, their labels are not.
         detect: (N, 4) points -> detections, for instance `asca_deploy.Detector` or `models.scan_detector.ScanDetector`.
         camera_view: give the detector only the points in the image, as it has seen in training.
-        console: shows the progress.
+        reporter: of the progress.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
     """
-    for frame_id in track(split.frame_ids, "Detecting", console=console, disable=console is None):
+    for frame_id in reporter.track(split.frame_ids, "Detecting"):
         calibration, image_size_wh = split.calibration(frame_id), split.image_size_wh(frame_id)
         points = read_scan(split.scan_path(frame_id)).points
         if camera_view:

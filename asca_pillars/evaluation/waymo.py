@@ -36,10 +36,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.targets import UNMATCHED, best_assignments
@@ -116,7 +115,7 @@ def waymo_detection(
     detections: Sequence[Detections],
     *,
     no_label: Sequence[NDArray[np.bool_]] | None = None,
-    console: Console | None = None,
+    reporter: Reporter = SILENT,
 ) -> list[WaymoScore]:
     """AP and APH for every class of the detections, level and range, in that order.
 
@@ -125,7 +124,7 @@ def waymo_detection(
         detections: of the same frames, in the same order and frame of reference, scores within [0, 1]. A frame in
             which nothing was found has an empty one.
         no_label: (D,) of each frame, which detections lie in a no-label zone. None without such zones.
-        console: shows the progress.
+        reporter: of the progress.
 
     Raises:
         ValueError: the sequences are empty or of different length, frames have different class names, or a score
@@ -135,7 +134,7 @@ def waymo_detection(
     tallies = {(index, span): _Tally() for index in range(len(class_names)) for span in RANGES_M}
     zones = [np.zeros(len(found), dtype=bool) for found in detections] if no_label is None else no_label
     frames = list(zip(truth, detections, zones, strict=True))
-    for labelled, found, zone in track(frames, "Evaluating", console=console, disable=console is None):
+    for labelled, found, zone in reporter.track(frames, "Evaluating"):
         for index, name in enumerate(class_names):
             own = (labelled.labels == index) & (labelled.levels > 0)
             detected = found.labels == index
@@ -303,7 +302,7 @@ def evaluated_classes(frames: ScoredFrames) -> tuple[str, ...]:
 
 
 def waymo_frames(
-    frames: ScoredFrames, class_names: Sequence[str], split: KittiSplit | None, *, console: Console | None = None
+    frames: ScoredFrames, class_names: Sequence[str], split: KittiSplit | None, *, reporter: Reporter = SILENT
 ) -> WaymoFrames:
     """Labels and detections of KITTI text in one upright frame, with levels and no-label zones.
 
@@ -311,14 +310,14 @@ def waymo_frames(
         frames: labels and predictions.
         class_names: what is evaluated.
         split: where the scans and calibrations are; None if there are none.
-        console: shows the progress.
+        reporter: of the progress.
 
     Raises:
         DatasetError, ScanError: a score outside [0, 1]; a scan or calibration that cannot be read.
     """
     result = WaymoFrames([], [], [])
     pairs = list(zip(frames.truth, frames.detections, strict=True))
-    for truth, found in track(pairs, "Points in boxes", console=console, disable=console is None or split is None):
+    for truth, found in reporter.track(pairs, "Points in boxes"):
         detections, no_label = _detections(truth, found, tuple(class_names))
         result.truth.append(_truth(truth, class_names, split))
         result.detections.append(detections)

@@ -77,7 +77,7 @@ def read_checkpoint(path: str | Path) -> CheckpointFile:
 
 
 def _damaged(path: Path, error: Exception) -> TrainingError:
-    return TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({unread(error)})")
+    return TrainingError(f"{path}: not a checkpoint of `asca train`, or damaged ({read_failure(error)})")
 
 
 def read_plain(path: Path) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def _library_of(content: Mapping[str, Any]) -> str | None:
     return "mmdetection3d" if "meta" in content and "state_dict" in content else None
 
 
-def unread(error: Exception) -> str:
+def read_failure(error: Exception) -> str:
     """Why a file of weights was not read, in one line.
 
     The words of torch.load for a pickle that it does not take are left out: they advise to execute what is in it.

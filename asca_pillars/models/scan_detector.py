@@ -1,16 +1,22 @@
 """A trained detector on single scans in PyTorch, behind the same interface as `asca_deploy.Detector`."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.trainable import Trainable
+from asca_pillars.scans.mounting import Mounting
 
 
 class ScanDetector:
@@ -40,3 +46,48 @@ class ScanDetector:
         if self._to_model is not None:
             found = replace(found, boxes=self._to_model.inverse.boxes(found.boxes))
         return found
+
+
+class OpenedCheckpoint(NamedTuple):
+    """A checkpoint that detects, its configuration, and what a report says about it."""
+
+    detector: ScanDetector
+    config: Config
+    about: dict[str, Any]
+
+
+def open_checkpoint(
+    path: Path, min_score: float, mounting: Mounting, *, device: str = "cpu", threads: int | None = None
+) -> OpenedCheckpoint:
+    """Open a checkpoint for detection in PyTorch.
+
+    Args:
+        path: of the file.
+        min_score: lowest score of what it reports.
+        mounting: of the scans.
+        device: cpu, cuda, or auto for cuda where there is one.
+        threads: of the CPU; None: as PyTorch chooses.
+
+    Raises:
+        TrainingError: the checkpoint is missing or damaged.
+        ConfigError: there is no CUDA device.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("provider cuda: PyTorch finds no CUDA device here; choose cpu")
+    device = "cpu" if device == "cpu" or not torch.cuda.is_available() else "cuda"
+    if threads is not None:
+        torch.set_num_threads(threads)
+    loaded = load_checkpoint(path)
+    config = loaded.config
+    about = {
+        "name": config.name,
+        "checkpoint": str(path),
+        "steps": loaded.steps,
+        "provider": f"torch {device}",
+        "threads": torch.get_num_threads(),
+        "min_score": min_score,
+    }
+    expected = loaded.expected_input
+    to_model = mounting.to_model(None if expected is None else expected.sensor_height_m)
+    spec = config.model.spec.with_score_threshold(min_score)
+    return OpenedCheckpoint(ScanDetector(loaded.detector.to(device), spec, to_model), config, about)

@@ -1,4 +1,4 @@
-"""What training, evaluation in PyTorch and checkpoints need of a family of detectors, whatever is inside it."""
+"""What a family of detectors is to training, evaluation and checkpoints."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -1,15 +1,22 @@
 """Training frames as pictures: what a network is shown, with the boxes that it is to find."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from asca_pillars.base.files import portable_name
+from asca_pillars.base.files import atomic_directory, portable_name, write_json
+from asca_pillars.base.own_files import json_object, require_replaceable
+from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledFrame, Motion, within_ranges
-from asca_pillars.data.training_frames import TrainingFrames
+from asca_pillars.data.training_frames import TrainingFrames, open_frames
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.pictures.drawing import BoxLayer, Image
 from asca_pillars.pictures.visualize import class_color, draw_layers, write_png
+
+MADE_BY = "inspection.json"
+PICTURES_FOLDER = ("asca inspect --draw", MADE_BY, json_object("data", "split", "config", "files"))
+"""Command, marker and its recognizer, as `atomic_directory` takes them."""
 
 _IGNORED_COLOR = (150, 150, 150)
 
@@ -55,3 +62,24 @@ def _moved(motion: Motion) -> str:
     if motion.shift_z_m:
         changes.append(f"raised by {motion.shift_z_m:.2f} m")
     return f"; {', '.join(changes)}" if changes else ""
+
+
+def require_replaceable_pictures(out: Path) -> None:
+    """OutputError where `out` holds something else than pictures of an earlier run."""
+    require_replaceable(out, *PICTURES_FOLDER)
+
+
+def draw_frames(data: Path, split: str, config: Config, count: int, out: Path) -> list[str]:
+    """Write pictures of `count` frames of the list `split` to `out`, in place of an earlier run's; a line for each.
+
+    Raises:
+        OutputError: `out` holds something else.
+        DatasetError, ScanError: a frame cannot be read.
+    """
+    config = replace(config, data=replace(config.data, train_set=split))
+    frames = open_frames(data, config, training=True)
+    with atomic_directory(out, *PICTURES_FOLDER) as folder:
+        said = draw_training_frames(folder, frames, count)
+        about = {"data": str(data), "split": split, "config": config.name}
+        write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
+    return [line.replace(str(folder), str(out)) for line in said]

@@ -10,6 +10,7 @@ from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import write_text
 from asca_pillars.base.own_files import json_object, require_no_link, require_own, require_own_file
 from asca_pillars.base.processes import in_processes
+from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 
 COMMAND = "asca simulate"
@@ -31,9 +32,10 @@ def held_out(count: int, share: float) -> int:
     return min(max(wanted, 1), count - 1) if 0 < share < 1 and count > 1 else wanted
 
 
-def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool) -> None:
+def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool | Progress) -> None:
     """Do a job for each item, in `workers` processes; the job has to be one that can be sent to a process."""
-    for _ in in_processes(job, todo, workers, "Simulating", progress=progress):
+    done = in_processes(job, todo, workers, "Simulating", progress=progress is True)
+    for _ in done if isinstance(progress, bool) else Reporter(progress).track(done, "Simulating", len(todo)):
         pass
 
 

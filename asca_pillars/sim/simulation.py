@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from asca_pillars.base.progress import Progress
 from asca_pillars.base.schema import parse
 from asca_pillars.base.settings import read_settings, shipped_configs
 from asca_pillars.base.strict import Strict
@@ -158,7 +159,7 @@ def simulate(
     workers: int = 1,
     config: SimulationConfig | None = None,
     val_share: float = 0.1,
-    progress: bool = True,
+    progress: bool | Progress = True,
     *,
     cluster: str | None = None,
 ) -> Path:
@@ -176,7 +177,7 @@ def simulate(
         workers: processes, without a cluster.
         config: what to simulate.
         val_share: 0..1.
-        progress: whether it is shown.
+        progress: whether it is shown, or what is called after each frame.
         cluster: address of a Ray cluster that does the work, `local` for one on this machine; None: processes.
 
     Raises:
@@ -200,7 +201,7 @@ def simulate(
             seen=root / SIMULATION_FILE,
             folders=[split.folder / name for name in ("velodyne", "label_2", "calib")],
             title="Simulating",
-            progress=progress,
+            progress=progress is True,
         )
     else:
         for_each(job, todo, workers, progress=progress)

@@ -8,10 +8,12 @@ from typing import Any
 
 import lightning as L  # noqa: N812  (Lightning's own convention)
 from lightning.pytorch.callbacks import Checkpoint, ProgressBar, WeightAveraging
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich import progress as bars
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 
 from asca_pillars.base.errors import TrainingError
+from asca_pillars.base.progress import Progress, Remark
 from asca_pillars.training.checkpoints import LastCheckpoint
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C; what `kill`, systemd and batch systems send
@@ -78,7 +80,7 @@ class RunProgress(ProgressBar):
     def __init__(self) -> None:
         super().__init__()
         self._enabled = True
-        self._bar = Progress(
+        self._bar = bars.Progress(
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
@@ -148,6 +150,51 @@ class RunProgress(ProgressBar):
         if self._enabled:
             self._bar.update(self._task, description=what)
             self._bar.start()
+
+
+class StepProgress(ProgressBar):
+    """Calls `progress` after each step of the run, and draws nothing.
+
+    Args:
+        progress: None for none.
+        remark: called with the line of each validation.
+    """
+
+    def __init__(self, progress: Progress | None, remark: Remark) -> None:
+        super().__init__()
+        self._progress, self._remark, self._total = progress, remark, 0
+        self._enabled = True
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether this rank tells."""
+        return self._enabled
+
+    def disable(self) -> None:
+        """Of the ranks that do not tell."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Of the rank that tells."""
+        self._enabled = True
+
+    def print(self, *args: Any, **_: Any) -> None:
+        """Pass a line on."""
+        if self._enabled:
+            self._remark(" ".join(map(str, args)))
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Know the length of the run."""
+        self._total = (trainer.max_epochs or 0) * pl_module.steps_per_epoch()  # type: ignore[operator]
+        self._tell(trainer)
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """One step more."""
+        self._tell(trainer)
+
+    def _tell(self, trainer: L.Trainer) -> None:
+        if self._progress is not None and self._enabled:
+            self._progress("Training", trainer.global_step, self._total)
 
 
 def weight_average(decay: float) -> WeightAveraging:

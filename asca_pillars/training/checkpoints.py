@@ -15,9 +15,11 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import require_content
-from asca_pillars.config.tree import ModelConfig
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import Config, ModelConfig
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint_file import read_plain, unread
+from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.checkpoint_file import read_failure, read_plain
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
@@ -139,7 +141,7 @@ def _why_unusable(path: Path, model: ModelConfig) -> str | None:
     try:
         content = read_plain(path)
     except _UNREADABLE as error:
-        return f"is damaged ({unread(error)})"
+        return f"is damaged ({read_failure(error)})"
     if "state_dict" not in content:
         return "is no checkpoint of a run (no 'state_dict')"
     if any(name not in content for name in _OF_A_RUN):
@@ -159,3 +161,41 @@ def steps_of(checkpoint: Path | None) -> int:
     if checkpoint is None:
         return 0
     return int(read_plain(checkpoint)["global_step"])
+
+
+_FIRST_STAGE = tuple(f"network.{part}." for part in PvRcnnModel.FIRST_STAGE)
+
+
+def initial_weights(config: Config, init: Path | None) -> dict[str, Any]:
+    """What a new run of `config` takes from `init`, by the names of `state_dict`; the rest starts at random.
+
+    All weights, but where `model.train_first_stage` is false, those of the first stage alone.
+
+    Args:
+        config: of the run.
+        init: a checkpoint; None for none.
+
+    Raises:
+        TrainingError: they are not of this configuration's network, or none are given to a first stage that is not
+            trained.
+    """
+    alone = isinstance(config.model, PvRcnnModel) and not config.model.train_first_stage
+    if init is None:
+        if alone:
+            raise TrainingError(
+                "model.train_first_stage = false: a first stage that is not trained has to come from somewhere; give "
+                "the checkpoint or bundle of a trained one with --init"
+            )
+        return {}
+    theirs, ours = (
+        {name: array for name, array in weights.items() if not alone or name.startswith(_FIRST_STAGE)}
+        for weights in (load_checkpoint(init).detector.state_dict(), build_model(config.model).state_dict())
+    )
+    for name in ours | theirs:
+        found, wanted = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
+        if found != wanted:
+            raise TrainingError(
+                f"{init}: weights of another network: {name} is {found} there and {wanted} in this configuration; "
+                "model.spec and model.network have to be like those that it was trained with"
+            )
+    return theirs

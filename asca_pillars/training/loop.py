@@ -12,13 +12,14 @@ import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.fabric.utilities.warnings import PossibleUserWarning
-from lightning.pytorch.callbacks import Checkpoint, LearningRateMonitor
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.base.locks import only_writer, recover
+from asca_pillars.base.progress import Remark
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, ModelConfig, TrainConfig
 from asca_pillars.config.two_stage import RefineModel
@@ -26,7 +27,6 @@ from asca_pillars.data.open_split import open_split
 from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.models.two_stage.first_stage import with_first_stage
-from asca_pillars.training.bfloat16 import has_bfloat16, settled
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (
     LAST,
@@ -34,11 +34,11 @@ from asca_pillars.training.checkpoints import (
     BestCheckpoint,
     LastCheckpoint,
     checkpoint_to_resume,
+    initial_weights,
     steps_of,
 )
-from asca_pillars.training.initial_weights import initial_weights
 from asca_pillars.training.loaders import DetectionData
-from asca_pillars.training.module import DetectionModule
+from asca_pillars.training.module import DetectionModule, has_bfloat16, settled
 from asca_pillars.training.run_files import COMMAND
 from asca_pillars.training.run_folder import Seen, claim, measure_input, recorded_precision
 
@@ -53,6 +53,8 @@ def train(
     devices: str = "auto",
     num_nodes: int = 1,
     init: Path | None = None,
+    bar: ProgressBar | None = None,
+    remark: Remark | None = None,
 ) -> Path:
     """Train `config` on a dataset, or go on where an interrupted run in `out` stopped.
 
@@ -70,6 +72,8 @@ def train(
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
         init: checkpoint that a new run starts from, see `initial_weights`; a run that goes on must have started from
             them.
+        bar: shows or tells the progress; None: on the terminal.
+        remark: called with what is odd about the run; None: it is printed.
 
     Returns:
         The last checkpoint.
@@ -85,10 +89,20 @@ def train(
     """
     # The processes of one run share its folder: the first holds it.
     with only_writer(out, COMMAND) if getattr(rank_zero_only, "rank", 0) == 0 else nullcontext():
-        return _train(config, data_root, Path(out), devices, num_nodes, init)
+        return _train(config, data_root, Path(out), devices, num_nodes, init, bar=bar or RunProgress(), remark=remark)
 
 
-def _train(config: Config, data_root: str | Path, out: Path, devices: str, num_nodes: int, init: Path | None) -> Path:
+def _train(
+    config: Config,
+    data_root: str | Path,
+    out: Path,
+    devices: str,
+    num_nodes: int,
+    init: Path | None,
+    *,
+    bar: ProgressBar,
+    remark: Remark | None,
+) -> Path:
     if isinstance(config.model, RefineModel):
         config = replace(config, model=with_first_stage(config.model))
     checkpoints = out / "checkpoints"
@@ -105,13 +119,14 @@ def _train(config: Config, data_root: str | Path, out: Path, devices: str, num_n
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
-    trainer = _trainer(config, out, files, [last, interrupt], int(devices) if devices.isdigit() else devices, num_nodes)
-    say = rank_zero_only(Console(markup=False, highlight=False).print)
+    callbacks = [bar, last, interrupt]
+    trainer = _trainer(config, out, files, callbacks, int(devices) if devices.isdigit() else devices, num_nodes)
+    say = rank_zero_only(remark or _print)
     for name, training in ((config.data.train_set, True), (config.data.val_set, False)):
         split = open_split(data_root, name)
         split.require_files()
-        for warning in require_boxes(split, config, training=training):
-            say(warning, style="yellow", soft_wrap=True)
+        for warning in require_boxes(split, config, training=training, bar=remark is None):
+            say(warning)
     data = DetectionData(config, data_root)
     claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights), steps_of(resumed))
     if damage is not None and goes_on:
@@ -121,7 +136,7 @@ def _train(config: Config, data_root: str | Path, out: Path, devices: str, num_n
         say(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
     keep = goes_on or not trainer.is_global_zero  # else it may be of scans that were there before
-    module = DetectionModule(config, measure_input(out, data.training_set.frames, keep=keep))
+    module = DetectionModule(config, measure_input(out, data.training_set.frames, keep=keep, bar=remark is None))
     if weights and not goes_on:
         module.detector.load_state_dict(module.detector.state_dict() | weights)
     with warnings.catch_warnings(), interrupt.listening():
@@ -140,6 +155,10 @@ def _train(config: Config, data_root: str | Path, out: Path, devices: str, num_n
             if trainer.is_global_zero and (checkpoints / LAST).is_file():
                 save_weights(checkpoints / LAST, checkpoints / WEIGHTS_FILE)
     return checkpoints / LAST
+
+
+def _print(text: str) -> None:
+    Console(markup=False, highlight=False).print(text, style="yellow", soft_wrap=True)
 
 
 def syncs_statistics(model: ModelConfig) -> bool:
@@ -162,15 +181,14 @@ def _trainer(
     config: Config,
     out: Path,
     files: AtomicCheckpointIO,
-    saving: list[Checkpoint],
+    own: list[Callback],
     devices: int | str,
     num_nodes: int,
 ) -> L.Trainer:
     recipe, checkpoints = config.train, out / "checkpoints"
     callbacks: list[Any] = [
-        RunProgress(),
         LearningRateMonitor("step"),
-        *saving,
+        *own,
         BestCheckpoint(checkpoints),
     ]
     if recipe.ema:

@@ -1,6 +1,7 @@
 """What one step of training and of validation does, whatever the family of detectors."""
 
 import functools
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,15 +9,16 @@ import lightning as L  # noqa: N812  (Lightning's own convention)
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, OneCycleLR, StepLR
 
 from asca_pillars.base.errors import AscaError, TrainingError
 from asca_pillars.base.schema import to_dict
-from asca_pillars.config.tree import Config
+from asca_pillars.config.tree import Config, Precision, TrainConfig
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.models.build import build_model
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.training.dataset import Batch
-from asca_pillars.training.schedules import make_schedule, steps_per_epoch
 
 
 class DetectionModule(L.LightningModule):
@@ -118,3 +120,57 @@ def _total(terms: Mapping[str, Tensor]) -> Tensor:
 def _named(terms: Mapping[str, Tensor], stage: str) -> dict[str, Tensor]:
     named = {f"{stage}/{name}": value.detach() for name, value in terms.items()}
     return {f"{stage}/loss": _total(terms).detach()} | named
+
+
+def make_schedule(optimizer: Optimizer, recipe: TrainConfig, epoch_steps: int) -> Any:
+    """The schedule that `recipe` names, stepped once for each optimizer step, of which an epoch has `epoch_steps`."""
+    if recipe.schedule == "step":
+        # Counted in steps, so that a checkpoint taken just before the end of an epoch holds all of its state.
+        return StepLR(optimizer, recipe.decay_epochs * epoch_steps, recipe.decay)
+    total_steps = recipe.epochs * epoch_steps
+    if recipe.schedule == "warmup_stable_decay":
+        return LambdaLR(optimizer, functools.partial(warmup_stable_decay, recipe, total_steps))
+    return OneCycleLR(
+        optimizer,
+        max_lr=recipe.learning_rate,
+        total_steps=total_steps,
+        pct_start=0.3,  # of fast.ai's one cycle, torch's default, stated because it is the recipe
+        div_factor=10,  # as OpenPCDet starts it
+    )
+
+
+def warmup_stable_decay(recipe: TrainConfig, total_steps: int, step: int) -> float:
+    """Factor of the learning rate at `step` of `total_steps`: a linear rise, then 1, then a linear fall.
+
+    It is more than 0 at every step from 0 to `total_steps` - 1 (Hu et al., MiniCPM, arXiv 2404.06395).
+    """
+    rise = (step + 1) / (recipe.warmup_steps + 1)
+    fall = (total_steps - step) / (total_steps - cooldown_start(recipe, total_steps) + 1)
+    return max(0.0, min(1.0, rise, fall))
+
+
+def cooldown_start(recipe: TrainConfig, total_steps: int) -> int:
+    """First step of `warmup_stable_decay` whose rate depends on how long the run is."""
+    return math.ceil((1 - recipe.cooldown) * total_steps)
+
+
+def steps_per_epoch(recipe: TrainConfig, frames: int, processes: int) -> int:
+    """Optimizer steps of one epoch: whole batches of every process."""
+    return frames // (recipe.batch_size * processes)
+
+
+def has_bfloat16(device: str | None = None) -> bool:
+    """Whether a device multiplies in bfloat16 itself. None is the one that Lightning takes: a GPU if there is one.
+
+    One that does not still computes it, number by number: twenty times slower than float32 on a CPU with AVX2 alone.
+    """
+    if device != "cpu" and torch.cuda.is_available():
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())  # oneDNN's own answer, which has no public name
+
+
+def settled(precision: Precision, device: str | None = None) -> Precision:
+    """`auto` as what suits a device, others as they are, see `has_bfloat16`."""
+    if precision != "auto":
+        return precision
+    return "bf16" if has_bfloat16(device) else "fp32"

@@ -12,7 +12,7 @@ from asca_pillars.base.own_files import (
     starting_with,
     written_by,
 )
-from asca_pillars.base.yaml_text import parse_yaml
+from asca_pillars.base.settings import parse_yaml
 
 COMMAND = "asca train"
 CONFIG_FILE = "config.yaml"

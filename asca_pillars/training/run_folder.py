@@ -22,6 +22,7 @@ from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.models.checkpoint_file import weights_sha256
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.measure_input import measure_expected_input
+from asca_pillars.training.module import cooldown_start, steps_per_epoch
 from asca_pillars.training.run_files import (
     COMMAND,
     CONFIG_FILE,
@@ -32,7 +33,6 @@ from asca_pillars.training.run_files import (
     is_own_config,
     is_own_expected_input,
 )
-from asca_pillars.training.schedules import cooldown_start, steps_per_epoch
 
 EXPECTED_INPUT_FRAMES = 200
 # Settings that change where and how fast samples are made, not what is in them, and how often a run is saved.
@@ -105,8 +105,10 @@ def recorded_precision(out: Path) -> Precision:
     return load_config(path).train.precision if path.exists() else "auto"
 
 
-def measure_input(out: Path, frames: TrainingFrames, *, keep: bool) -> ExpectedInput:
+def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, bar: bool = True) -> ExpectedInput:
     """What up to EXPECTED_INPUT_FRAMES evenly spaced training scans look like; with `keep` as `out` has it already.
+
+    `bar` shows a progress bar on the terminal.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
@@ -118,7 +120,8 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool) -> ExpectedI
         return read_settings(ExpectedInput, path, (), {})
     ids = frames.frame_ids
     count = min(len(ids), EXPECTED_INPUT_FRAMES)
-    chosen = track([ids[i * len(ids) // count] for i in range(count)], "Measuring training scans", transient=True)
+    spaced = [ids[i * len(ids) // count] for i in range(count)]
+    chosen = track(spaced, "Measuring training scans", transient=True, disable=not bar)
     scans = (read_frame(frames.split, one, (), camera_view=frames.camera_view).points for one in chosen)
     try:
         measured = measure_expected_input(scans, frames.camera_view)

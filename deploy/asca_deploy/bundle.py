@@ -7,6 +7,7 @@
 docs/BUNDLE.md describes the files for readers in other languages; `manifest` reads, verifies and writes bundle.json.
 """
 
+import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -295,6 +296,12 @@ class PvRcnnBundle(Bundle):
         """With DEFORM where keypoints are shifted."""
         shifts = (DEFORM,) if self.pv_rcnn.settings.deformed else ()
         return (*GRAPHS[self.kind], *shifts)
+
+
+def weights_digest(bundle: Bundle) -> str:
+    """The SHA-256 of the trained arrays, the same in every export; of a bundle that lacks it, that of its graphs'."""
+    graphs = "".join(bundle.graphs[name].sha256 for name in sorted(bundle.graphs))
+    return bundle.provenance.weights_sha256 or hashlib.sha256(graphs.encode()).hexdigest()
 
 
 def _require_sha256(text: str | None, of: str) -> None:

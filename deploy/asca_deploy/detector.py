@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widened
-from asca_deploy.bundle import Bundle
+from asca_deploy.bundle import Bundle, weights_digest
 from asca_deploy.manifest import load_bundle
 from asca_deploy.open_pipeline import open_pipeline
 from asca_deploy.ort_session import check_onnxruntime
@@ -23,14 +23,14 @@ from asca_deploy.shipped import find_bundle
 from asca_deploy.stream import overlapped
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.kernels import load_kernels
-from asca_pillars.base.system import check_threads
+from asca_pillars.base.system import check_threads, own_version
 from asca_pillars.detection import decode
 from asca_pillars.detection.detections import FrameReport, ScanCounts, summed
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.input_check import InputWarning, check_input
 from asca_pillars.scans.mounting import Mounting
 
-_log = logging.getLogger("asca_deploy")
+_log = logging.getLogger("asca_pillars")
 
 
 View: TypeAlias = Literal["ahead", "around"]
@@ -142,6 +142,40 @@ class Detector:
     def runs_on(self) -> str:
         """Provider and arithmetic of the slowest network in words, such as "cpu int8"."""
         return f"{self.provider} {providers.arithmetic(self.bundle.precision, self.precision)}"
+
+    @property
+    def made_by(self) -> dict[str, str]:
+        """What its results name: the model, the SHA-256 of its weights, and the version of this package."""
+        return {
+            "model": self.bundle.name,
+            "weights_sha256": weights_digest(self.bundle),
+            "version": own_version(),
+        }
+
+    def warm_up(self, points: int = 100_000, scans: int = 2) -> float:
+        """Detect in made-up scans, so that the first real one takes no longer than the others.
+
+        Compiles what is not compiled yet, and lets the runtime allocate for scans of this size. Nothing of it is
+        logged or warned of.
+
+        Args:
+            points: of each scan.
+            scans: how many.
+
+        Returns:
+            Milliseconds of the last one.
+        """
+        bounds = np.array([self.spec.ranges.x_m, self.spec.ranges.y_m, self.spec.ranges.z_m])
+        drawn = np.random.default_rng(0).random((points, 4), np.float32)
+        drawn[:, :3] = bounds[:, 0] + drawn[:, :3] * (bounds[:, 1] - bounds[:, 0])
+        took_ms = 0.0
+        for _ in range(scans):
+            start, laps = perf_counter(), [("input", perf_counter())]
+            for turn in self._turns:
+                prepared = self.pipeline.prepare(turn.points(drawn), laps)
+                self.pipeline.finish(self.pipeline.infer(prepared, laps), laps)
+            took_ms = (perf_counter() - start) * 1e3
+        return took_ms
 
     @property
     def passes(self) -> int:
@@ -264,6 +298,7 @@ class Detector:
             ranges=self._ranges,
             level=self._level,
             source=source,
+            made_by=self.made_by,
         )
 
 

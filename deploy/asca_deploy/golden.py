@@ -25,7 +25,7 @@ from asca_pillars.base.own_files import json_object, require_not_input, require_
 from asca_pillars.base.system import cpu_model, package_versions
 from asca_pillars.detection.decode import HeadMaps, decode_candidates, sigmoid, suppress
 from asca_pillars.detection.detections import Detections
-from asca_pillars.ops.pillar.neck_rulebooks import table_inputs
+from asca_pillars.ops.pillar.neck_rulebooks import rulebook_inputs
 from asca_pillars.ops.two_stage.decode import reported_detections
 from asca_pillars.ops.two_stage.first_stage import FirstPass, proposed_from
 from asca_pillars.ops.two_stage.prepare import refine_scan
@@ -132,7 +132,7 @@ def _placed(placed: Any) -> dict[str, NDArray[Any]]:
     if isinstance(placed, Canvas):
         values = placed.image.reshape(-1, placed.image.shape[-1])[placed.occupied]
         return {"rows": placed.occupied.copy(), "values": values}
-    return {"pillar_features": placed.features, **table_inputs(placed.tables)}
+    return {"pillar_features": placed.features, **rulebook_inputs(placed.tables)}
 
 
 def _answered(answer: HeadAnswer) -> dict[str, NDArray[Any]]:

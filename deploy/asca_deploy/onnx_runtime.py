@@ -1,12 +1,12 @@
 """onnxruntime, which is imported here and nowhere else: its reports to its maker are off by then."""
 
-from asca_pillars.base import telemetry
+from asca_pillars.base.installation import disable_telemetry, onnxruntime_may_report
 
-telemetry.disable_telemetry()
+disable_telemetry()
 
 import onnxruntime  # noqa: E402  (it reads the environment when it is imported)
 
 __all__ = ["onnxruntime"]
 
-if not telemetry.onnxruntime_may_report():
+if not onnxruntime_may_report():
     onnxruntime.disable_telemetry_events()  # for the case that the caller had imported it before

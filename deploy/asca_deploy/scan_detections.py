@@ -2,7 +2,7 @@
 
 import base64
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -27,6 +27,8 @@ class ScanDetections(Detections):
     """From the frame of the boxes to a level one, x forward, y left, z up; None: it is such a one."""
     source: Callable[[], NDArray[Any] | None] | None = field(default=None, kw_only=True)
     """Weak reference to the points (N, >=3) that the boxes were found in."""
+    made_by: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    """The model, its weights' digest and the version, `Detector.made_by`."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Copied or sent to another process, they come without the points."""

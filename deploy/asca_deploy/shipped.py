@@ -3,8 +3,9 @@
 import hashlib
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
-from asca_deploy.bundle import MANIFEST
+from asca_deploy.bundle import MANIFEST, weights_digest
 from asca_deploy.manifest import load_bundle
 from asca_deploy.manifest_file import refuse_run_folder
 from asca_pillars.base.errors import BundleError
@@ -78,3 +79,26 @@ def find_checkpoint(source: str | Path) -> Path:
 def sample_scan_path() -> Path:
     """The simulated scan that comes with the package, KITTI .bin."""
     return Path(str(resources.files("asca_deploy") / "samples" / "street.bin"))
+
+
+def about_bundle(folder: Path) -> dict[str, Any]:
+    """What a bundle is, as plain values; its graphs are compared with their digests.
+
+    Raises:
+        BundleError: it is missing, damaged or made for another version.
+    """
+    bundle = load_bundle(folder)
+    provenance = bundle.provenance
+    return {
+        "name": bundle.name,
+        "folder": str(folder),
+        "kind": bundle.kind,
+        "precision": bundle.precision,
+        "classes": list(bundle.spec.class_names),
+        "weights_sha256": weights_digest(bundle),
+        "schema_version": bundle.schema_version,
+        "created": provenance.created,
+        "trained_on": provenance.trained_on,
+        "license": bundle.license,
+        "size_bytes": sum(path.stat().st_size for path in folder.iterdir() if path.is_file()),
+    }

@@ -31,6 +31,8 @@ GATE = 9.21  # squared distance over its variance: 99 % of a track's own detecti
 FADE_PER_S = 1.0  # of a track's score that nothing confirms
 MAX_SCORE = 0.98  # so that the best tracks end, too
 MAX_SCAN_GAP_S = 2.0  # between two scans of one drive
+WEAK_SHARE = 0.7
+"""Detections from this share of the lowest threshold on carry tracks on that better ones began."""
 MAX_UNLOOKED_FADE_S = 0.2  # of the time until the first scan after a detection, in which nobody looked
 
 

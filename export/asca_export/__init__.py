@@ -1,3 +1,3 @@
 """From a checkpoint to a bundle: ONNX graphs, parity with PyTorch, 8 bits."""
 
-import asca_deploy.onnx_runtime  # noqa: F401  (`qdq` imports onnxruntime's own tools after it)
+import asca_deploy.onnx_runtime  # noqa: F401  (`rounded_backbones` imports its tools after it)

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
+from asca_pillars.models.map_backbone import SSDHead
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
-from asca_pillars.models.pillar.head import SSDHead
 
 # What one step of an 8-bit tensor counts for in the graph: any number would do but one, which OpenVINO leaves out and
 # then takes the tensor for a float.

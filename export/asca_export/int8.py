@@ -14,10 +14,10 @@ from asca_deploy.bundle import BACKBONE, ENCODER, Bundle, CanvasFormat, LayerQua
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import write_bundle_manifest
 from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
-from asca_export import graphs, qdq
+from asca_export import graphs
 from asca_export.parity import COMPARED_ANCHORS, by_class
 from asca_export.quantize import canvas_steps
-from asca_export.rounded_backbones import Encoded, round_backbone
+from asca_export.rounded_backbones import Encoded, quantize_encoder, round_backbone
 from asca_pillars.base.errors import ExportError
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
@@ -135,7 +135,7 @@ def quantize_bundle(
         found = sweep(rounded.layers, error_of, progress)
         eight_bit = [layer for layer in rounded.layers if layer not in found.kept_float]
         rounded.write(graphs.graph_path(folder, BACKBONE), eight_bit)
-    qdq.quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
+    quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
     return write_quantized(folder, eight_bit_form, found.report(own, len(scans)), boxes, scans)
 
 

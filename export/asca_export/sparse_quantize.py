@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
 from asca_export.quantize import HEAD, PLACES, STEPS, TINY, round_together
 from asca_export.sparse_forms import SparseBackbone
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 
 BEST_CELLS = 32  # of each scan and anchor, that the head is rounded for
 OTHER_CELLS = 64  # of each scan beside them, so that background stays background
@@ -26,7 +26,7 @@ class SparseSample(NamedTuple):
 
     features: Tensor
     """(P, C) pillar features."""
-    tables: NeckTables[Tensor]
+    tables: NeckRulebooks[Tensor]
 
     def in_steps(self, steps: CanvasSteps) -> "SparseSample":
         """With STEP_VALUE times the whole steps of its features."""

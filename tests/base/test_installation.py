@@ -7,8 +7,8 @@ import tomllib
 from pathlib import Path
 
 from asca_pillars.base import installation
+from asca_pillars.base.extras import EXTRAS
 from asca_pillars.base.installation import install_command, source_tree, upgrade_advice
-from asca_pillars.cli.extras import EXTRAS
 
 ROOT = Path(__file__).parents[2]
 

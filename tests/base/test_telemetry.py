@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from asca_deploy import sample_scan_path
+from asca_pillars.base.installation import disable_telemetry, onnxruntime_may_report
 from asca_pillars.base.schema import to_dict
-from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
 from tests.socket_filter import NOT_HERE
 from tests.test_layout import PACKAGES, ROOT, imports
 
@@ -28,7 +28,7 @@ CACHES = (".cache/numba", ".cache/matplotlib", ".config/matplotlib")
 """Below the home folder: compiled functions where the package's own folder cannot be written, and a list of fonts."""
 IMPORTERS = {
     "asca_deploy/onnx_runtime.py": "onnxruntime",
-    "asca_export/qdq.py": "onnxruntime.quantization",  # its package has imported the former
+    "asca_export/rounded_backbones.py": "onnxruntime.quantization",  # its package has imported the former
 }
 
 
@@ -81,7 +81,7 @@ importlib.import_module(sys.argv[1])
 """
 
 
-@pytest.mark.parametrize("module", ["asca_deploy", "asca_export.qdq", "asca_pillars.training.loop"])
+@pytest.mark.parametrize("module", ["asca_deploy", "asca_export.rounded_backbones", "asca_pillars.training.loop"])
 def test_it_is_off_before_anybody_imports_onnxruntime(module: str) -> None:
     result = run([sys.executable, "-c", FIRST_IMPORT, module])
     assert result.returncode == 0 and "seen" in result.stdout, result.stderr

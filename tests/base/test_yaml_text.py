@@ -7,8 +7,7 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.settings import read_settings
-from asca_pillars.base.yaml_text import MAX_CHARACTERS, parse_yaml
+from asca_pillars.base.settings import MAX_CHARACTERS, parse_yaml, read_settings
 from asca_pillars.config.tree import load_config
 from asca_pillars.sim.simulation import SimulationConfig
 

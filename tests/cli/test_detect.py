@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from asca_deploy import sample_scan_path
+from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import OutputError, ScanError
 from asca_pillars.cli.detect import detect
-from asca_pillars.cli.detect_files import ResultWriter
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.scenes import write_dataset

@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
+from asca_deploy import detect_archive as archive
+from asca_deploy.result_files import UNREADABLE_FILE
+from asca_pillars.base import extras
 from asca_pillars.base.errors import AscaError, BundleError, ClusterError, ConfigError, OutputError, ScanError
 from asca_pillars.base.installation import install_command
-from asca_pillars.cli import detect_archive as archive
-from asca_pillars.cli import extras
 from asca_pillars.cli.detect import detect
-from asca_pillars.cli.detect_files import UNREADABLE_FILE
 from asca_pillars.cluster.shards import Outcome, Shard
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.deploy.conftest import make_scan, write_bundle

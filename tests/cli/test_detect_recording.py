@@ -19,12 +19,12 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_deploy import find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
+from asca_deploy.recordings import detect_recording as steps
+from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult
+from asca_pillars.base import extras
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
 from asca_pillars.base.installation import install_command
-from asca_pillars.cli import detect_recording as steps
-from asca_pillars.cli import extras
 from asca_pillars.cli.detect import detect
-from asca_pillars.cli.recording_journal import JOURNAL_FILE, Journal, ScanResult
 from asca_pillars.data.boxes.box_records import read_frames
 from asca_pillars.data.kitti import KittiSplit
 from benchmarks.made_recordings import write_recording
@@ -282,7 +282,7 @@ def test_what_tells_of_a_recording_does_not_stay_beside_other_scans(drive: Path,
 HELD_UP = """
 import time
 from asca_pillars.cli.main import main
-from asca_pillars.cli.recording_journal import Journal
+from asca_deploy.recordings.journal import Journal
 add = Journal.add
 def add_and_wait(self, result):
     add(self, result)

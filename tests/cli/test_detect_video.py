@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from asca_deploy import result_files
+from asca_deploy.recordings import video as video_module
+from asca_deploy.recordings.video import recording_rate_hz, video_options
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError
-from asca_pillars.cli import detect_files, detect_video
 from asca_pillars.cli.detect import detect
-from asca_pillars.cli.detect_video import recording_rate_hz, video_options
 from asca_pillars.pictures.video import is_own_video
 from asca_pillars.scans.scan_reader import write_scan
 from tests.cli.short_drive import POINTS, SCANS
@@ -52,7 +53,7 @@ def test_a_recording_becomes_a_video_of_tracks(drive: Path, tmp_path: Path) -> N
 def test_what_cannot_be_a_video_is_refused_before_the_work(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(detect_video, "find_encoder", lambda: "ffmpeg")
+    monkeypatch.setattr(video_module, "find_encoder", lambda: "ffmpeg")
     (tmp_path / "mine.mp4").write_bytes(b"\0\0\0\x20ftypisom of mine")
     cases: list[tuple[dict[str, Any], type[AscaError], str]] = [
         ({"video": tmp_path / "mine.mp4"}, OutputError, "mine.mp4: `asca detect` did not write it"),
@@ -101,7 +102,7 @@ def test_misses_are_counted_where_there_are_labels(tmp_path: Path, monkeypatch: 
     keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
     labels = np.array([[found[key] for key in keys]] * 3, np.float32)
     labels[1:, :2] = (40, 25), (-20, 0)
-    monkeypatch.setattr(detect_files, "labels_beside", lambda path: labels)
+    monkeypatch.setattr(result_files, "labels_beside", lambda path: labels)
     detect([tmp_path / "scans"], out=tmp_path / "out", threads=1)
     (values,) = cards((tmp_path / "out" / "index.html").read_text()).values()
     assert values["missed"] == 1

@@ -15,11 +15,11 @@ import torch
 from numpy.testing import assert_allclose
 
 from asca_deploy import default_bundle_path
+from asca_deploy.evaluate import Protocol
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import AscaError
 from asca_pillars.base.installation import install_command
 from asca_pillars.cli import eval as command
-from asca_pillars.cli.eval_steps import Protocol
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint
@@ -262,7 +262,9 @@ def test_a_json_that_cannot_be_written_is_told_before_the_work(
     tmp_path: Path, texts: dict[str, Any], protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "folder").mkdir()
-    monkeypatch.setattr(f"asca_pillars.cli.eval_steps.report_{protocol}", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr(
+        f"asca_pillars.evaluation.kitti_evaluation.report_{protocol}", lambda *_: pytest.fail("too late")
+    )
     message = refusal(tmp_path, **texts, protocol=protocol, json_path=tmp_path / "folder")
     assert message == "folder: is a folder; choose a file's name"
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector, sample_scan_path
 from asca_pillars.base.errors import AscaError
-from asca_pillars.cli.models import Model
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.evaluation.model import Model
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
@@ -147,7 +147,7 @@ def test_a_model_gets_the_points_that_it_was_trained_on(
         return sample(points)
 
     model = Model("any", detect, sample.spec, camera_view, {})
-    monkeypatch.setattr("asca_pillars.cli.eval_boxes.open_model", lambda *_, **__: model)
+    monkeypatch.setattr("asca_deploy.evaluate.open_model", lambda *_, **__: model)
     invoke("eval", "--data", root, "--out", tmp_path / "out", "--protocol", "distance")
     split = KittiSplit(root, "val")
     assert given == [len(split.points(one, camera_view=camera_view)) for one in split.frame_ids]

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from asca_deploy.evaluate import Protocol
 from asca_pillars.base.errors import OutputError
-from asca_pillars.cli.eval_steps import Protocol
 from tests.cli.test_eval import evaluate, refusal
 from tests.earlier_evaluation import earlier_predictions
 

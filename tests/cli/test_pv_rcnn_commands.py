@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.cli import detect_archive
+from asca_deploy import detect_archive
 from asca_pillars.cli.detect import detect
 from asca_pillars.scans.scan_reader import write_scan
 from tests.cli.test_detect_archive import Here

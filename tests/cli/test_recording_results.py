@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from asca_deploy import Detections
+from asca_deploy.recordings.journal import Journal, ScanResult
+from asca_deploy.recordings.results import said_of_stamps, tracked, tracking_order
 from asca_deploy.tracker import Tracker
-from asca_pillars.cli.recording_journal import Journal, ScanResult
-from asca_pillars.cli.recording_results import said_of_stamps, tracked, tracking_order
 
 SECOND = 10**9
 REGULAR = [1000 * SECOND + index * SECOND // 10 for index in range(12)]

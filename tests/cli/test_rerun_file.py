@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
+from asca_deploy.recordings import detect_recording as steps
+from asca_deploy.recordings.journal import JOURNAL_FILE
+from asca_deploy.recordings.rerun_file import is_own_rrd
 from asca_pillars.base.errors import ConfigError, OutputError
-from asca_pillars.cli import detect_recording as steps
-from asca_pillars.cli.recording_journal import JOURNAL_FILE
-from asca_pillars.cli.rerun_file import is_own_rrd
 from asca_pillars.pictures.colors import class_rgb
 from tests.cli.short_drive import SCANS
 from tests.cli.test_detect_recording import run

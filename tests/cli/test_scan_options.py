@@ -12,8 +12,9 @@ from typer.testing import CliRunner, Result
 from asca_deploy import sample_scan_path
 from asca_pillars.base.errors import AscaError, ConfigError, ScanError
 from asca_pillars.cli.main import app
-from asca_pillars.cli.scan_input import ScanInput, scan_settings
+from asca_pillars.cli.options import scan_settings
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
 

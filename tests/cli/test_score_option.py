@@ -8,7 +8,8 @@ import pytest
 
 from asca_deploy import Detector, sample_scan_path
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.cli.options import read_scores, scores_by_class
+from asca_pillars.cli.options import read_scores
+from asca_pillars.evaluation.model import scores_by_class
 from asca_pillars.scans.scan_reader import read_scan
 from tests.in_process import run_here
 
@@ -77,7 +78,7 @@ def test_detect_and_the_detector_agree(tmp_path: Path) -> None:
 )
 def test_mistakes_are_one_line(tmp_path: Path, score: str, message: str) -> None:
     result = run_here("detect", "-b", BUNDLE, "-o", tmp_path / "out", "--score", score)
-    assert result.returncode == 2 and result.stderr.count("\n") == 1
+    assert result.returncode > 1 and result.stderr.count("\n") == 1
     assert message in result.stderr
     assert not (tmp_path / "out").exists()
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from asca_pillars.base import extras
 from asca_pillars.base.errors import AscaError, ConfigError, DatasetError, OutputError
-from asca_pillars.cli import extras
 from asca_pillars.cli import simulate as command
 from tests.sim.report.made_up import write_set
 

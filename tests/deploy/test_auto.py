@@ -202,7 +202,7 @@ def test_a_graph_that_the_reference_cannot_run_is_an_error() -> None:
 
 
 def test_the_detector_says_what_auto_took(tiny_bundle: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO, "asca_deploy"):
+    with caplog.at_level(logging.INFO, "asca_pillars"):
         detector = Detector(tiny_bundle, provider="auto")
     assert caplog.messages == [auto.summary(detector.runs_on, detector.candidates)]
     assert (detector.provider, detector.precision) in {(c.provider, c.precision) for c in detector.candidates}

@@ -21,7 +21,7 @@ Points = NDArray[np.float32]
 def _fast_machine_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
     monkeypatch.setenv("COLUMNS", "120")
-    logger = logging.getLogger("asca_deploy")
+    logger = logging.getLogger("asca_pillars")
     level = logger.level
     yield
     logger.setLevel(level)  # the command silences it for the rest of its process

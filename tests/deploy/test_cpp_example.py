@@ -13,7 +13,7 @@ import pytest
 
 from asca_deploy import sample_scan_path, shipped_bundles
 from asca_deploy.golden import write_golden
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, table_inputs
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder, rulebook_inputs
 from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
 
@@ -73,8 +73,8 @@ def test_tables_are_those_of_python(build_tables: Path, rule: MaskRule) -> None:
     answer = subprocess.run([build_tables, str(ny), str(nx), rule], input=given, check=True, capture_output=True)
     values = np.frombuffer(answer.stdout, np.int32)
     for cells in scans:
-        tables = NeckTableBuilder(ny, nx, rule).build(cells)
-        expected = {**table_inputs(tables), "head_cells": tables.head_cells}
+        tables = NeckRulebookBuilder(ny, nx, rule).build(cells)
+        expected = {**rulebook_inputs(tables), "head_cells": tables.head_cells}
         for name, table in expected.items():
             if name.startswith("first") and (rule, name) != ("fine", "first_0"):
                 table = table[:0]  # where nothing grows a graph reads `same`

@@ -197,7 +197,7 @@ def test_odd_scans_are_reported_each_time_and_logged_once(
     detector(scan)
     assert not caplog.records
     scan[:, 3] *= 255
-    with caplog.at_level(logging.WARNING, logger="asca_deploy"):  # `asca detect` silences it
+    with caplog.at_level(logging.WARNING, logger="asca_pillars"):  # `asca detect` silences it
         for _ in range(2):
             warning, repair = detector(scan).report.warnings
             assert "divide it by 255" in warning and "set to the nearer end" in repair

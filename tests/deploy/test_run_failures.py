@@ -81,7 +81,7 @@ def test_of_a_command_it_is_one_line(bundle_copy: Path, tmp_path: Path, graph: s
         ("export", bundle, "--golden", "-o", tmp_path / "golden", "--scans", scan),
     ):
         done = run_here(*arguments)
-        assert done.returncode == 2 and done.stderr.startswith("asca: "), done.stderr
+        assert done.returncode > 1 and done.stderr.startswith("asca: "), done.stderr
         assert done.stderr.count("\n") == 1 and graph in done.stderr and str(bundle) in done.stderr
         assert not (tmp_path / "golden").exists()
 

@@ -14,8 +14,7 @@ from asca_deploy.ort_session import OrtSession
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.fast_forms import CanvasSteps
 from asca_export.quantize import HEAD, STEPS, canvas_steps
-from asca_export.sparse_forms import SparseBackbone
-from asca_export.sparse_graphs import export_sparse_backbone
+from asca_export.sparse_forms import SparseBackbone, export_sparse_backbone
 from asca_export.sparse_quantize import (
     BEST_CELLS,
     OTHER_CELLS,
@@ -29,7 +28,7 @@ from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
 from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.preparation import Placement, batch_pillars
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables, table_inputs
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder, NeckRulebooks, rulebook_inputs
 from asca_pillars.ops.pillar.prepare import Pillars
 from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
 from tests.scenes import SPEC
@@ -50,8 +49,8 @@ def sparse_detector(rule: MaskRule) -> PillarDetector:
     return detector
 
 
-def tables_of(pillars: Pillars, rule: MaskRule) -> NeckTables[np.ndarray]:
-    return NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule).build(pillars.cells)
+def tables_of(pillars: Pillars, rule: MaskRule) -> NeckRulebooks[np.ndarray]:
+    return NeckRulebookBuilder(SPEC.grid.ny, SPEC.grid.nx, rule).build(pillars.cells)
 
 
 def sample_of(detector: PillarDetector, pillars: Pillars) -> SparseSample:
@@ -74,12 +73,12 @@ class OpenGraph:
     def __init__(self, path: Path, threads: int) -> None:
         self.session = OrtSession(path, "cpu", "float32", threads)
 
-    def run(self, features: np.ndarray, tables: NeckTables[np.ndarray]) -> HeadMaps[np.ndarray]:
-        given = {PILLAR_FEATURES: features, **table_inputs(tables)}
+    def run(self, features: np.ndarray, tables: NeckRulebooks[np.ndarray]) -> HeadMaps[np.ndarray]:
+        given = {PILLAR_FEATURES: features, **rulebook_inputs(tables)}
         return HeadMaps(*self.session.run(HeadMaps._fields, {name: given[name] for name in self.session.inputs}))
 
 
-def arrays(tables: NeckTables[torch.Tensor]) -> NeckTables[np.ndarray]:
+def arrays(tables: NeckRulebooks[torch.Tensor]) -> NeckRulebooks[np.ndarray]:
     return tree_map_only(torch.Tensor, lambda tensor: tensor.numpy(), tables)
 
 
@@ -114,7 +113,7 @@ def test_a_scan_with_a_single_pillar(tmp_path: Path) -> None:
     detector = sparse_detector("fine")
     export_sparse_backbone(SparseBackbone(detector), tmp_path / "backbone.onnx")
     graph = OpenGraph(tmp_path / "backbone.onnx", 1)
-    tables = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, "fine").build(np.array([37]))
+    tables = NeckRulebookBuilder(SPEC.grid.ny, SPEC.grid.nx, "fine").build(np.array([37]))
     one = graph.run(np.ones((1, NETWORK.pillar_channels), np.float32), tables)
     assert one.scores.shape == (len(tables.head_cells), 6) and np.isfinite(one.scores).all()
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from asca_pillars.models.map_layers import as_map
+from asca_pillars.models.map_backbone import as_map
 
 
 @pytest.mark.parametrize(("capability", "copied"), [("AVX2", True), ("AVX512", False), ("DEFAULT", False)])

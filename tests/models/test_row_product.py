@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.row_product import linear_rows, pad_rows, rounded_rows
+from asca_pillars.models.sparse_conv import linear_rows, pad_rows, rounded_rows
 
 
 @given(st.integers(0, 1 << 22))

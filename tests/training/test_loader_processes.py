@@ -5,7 +5,7 @@ import signal
 import sys
 from multiprocessing.connection import Connection
 
-from asca_pillars.training.loader_processes import leave_interrupts_to_the_loop, loader_context
+from asca_pillars.training.shared_batches import leave_interrupts_to_the_loop, loader_context
 
 
 def tell(connection: Connection) -> None:

@@ -19,9 +19,8 @@ from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
-from asca_pillars.models.two_stage.network import RefineDetector
+from asca_pillars.models.two_stage.network import RefineDetector, refine
 from asca_pillars.models.two_stage.preparation import LabeledProposals, move_proposed
-from asca_pillars.models.two_stage.refined_detector import refine
 from asca_pillars.ops.two_stage.first_stage import propose_on
 from asca_pillars.ops.two_stage.rois import match_proposals
 from asca_pillars.training.dataset import Batch, Collate, open_dataset

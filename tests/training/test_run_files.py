@@ -31,7 +31,7 @@ def test_a_configuration_of_the_user_is_not_replaced(tmp_path: Path, content: st
     (tmp_path / "link.yaml").symlink_to(path)
     (tmp_path / "other.yaml").write_text("name: other\n")
     refused = run_here("train", tmp_path / given, "--data", tmp_path, "--out", path.parent)
-    assert refused.returncode == 2 and "holds config.yaml and nothing that `asca train` wrote" in refused.stderr
+    assert refused.returncode > 1 and "holds config.yaml and nothing that `asca train` wrote" in refused.stderr
     assert path.read_text() == USERS[content] and len(list(path.parent.iterdir())) == 1
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from asca_pillars.base.errors import TrainingError
-from asca_pillars.training.sampler import EpochSampler
+from asca_pillars.training.loaders import EpochSampler
 
 
 def test_sampler_goes_on_where_the_steps_stopped() -> None:

@@ -12,8 +12,7 @@ from torch.optim import Optimizer
 
 from asca_pillars.config.tree import TrainConfig
 from asca_pillars.training.callbacks import weight_average
-from asca_pillars.training.module import DetectionModule
-from asca_pillars.training.schedules import cooldown_start, warmup_stable_decay
+from asca_pillars.training.module import DetectionModule, cooldown_start, warmup_stable_decay
 from tests.training.test_loop import with_train
 
 EPOCHS, RANKS, FRAMES = 5, 3, 29

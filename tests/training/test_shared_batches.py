@@ -16,8 +16,7 @@ from asca_pillars.base.errors import DatasetError, WorkerError
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
-from asca_pillars.training.loader_processes import loader_context
-from asca_pillars.training.shared_batches import ShareCollated, SharedInputs
+from asca_pillars.training.shared_batches import ShareCollated, SharedInputs, loader_context
 from tests.models.pv_rcnn.tiny_pv_rcnn import tiny_config
 from tests.models.two_stage.tiny_refine import opened_config, write_first_stage
 from tests.scenes import SPEC, write_dataset

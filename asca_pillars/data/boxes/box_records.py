@@ -180,16 +180,14 @@ def _json_records(content: Any, place: str) -> BoxRecords:
 
 
 def _of_other_tool(content: Any) -> str | None:
-    """What to convert in a file of a labelling tool that is known; None if it is of none."""
-    record = f'write {{"boxes": [...]}} with `class`, {_listed()} for each'
+    """What to do with a file of a labelling tool that is known; None if it is of none."""
     if isinstance(content, dict) and "boxes" not in content and isinstance(content.get("objects"), list):
-        return f"labels of labelCloud (`objects`); {record}: the center is `centroid`, yaw_rad `rotations.z` * pi / 180"
-    if isinstance(content, list) and content and all(isinstance(item, dict) and "psr" in item for item in content):
-        return (
-            f"labels of SUSTechPOINTS (`psr`); {record}: the center is `position`, length, width and height are "
-            "`scale` x, y and z, yaw_rad is `rotation.z`"
-        )
-    return None
+        tool = ("Supervisely", "supervisely") if "figures" in content else ("labelCloud", "labelcloud")
+    elif isinstance(content, list) and content and all(isinstance(item, dict) and "psr" in item for item in content):
+        tool = ("SUSTechPOINTS", "sustechpoints")
+    else:
+        return None
+    return f"labels of {tool[0]}; read them with `asca import LABELS OUT --from {tool[1]} --scans SCANS`"
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:

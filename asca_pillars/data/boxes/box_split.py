@@ -130,9 +130,8 @@ def _frames_of_folder(labels: Path, scans: Path) -> dict[str, BoxFrame]:
         advice = "write one for each scan"
         if texts := visible_files(labels, "*.txt"):
             advice = (
-                f"{texts[0].name} is text, as KITTI's or OpenPCDet's labels: write a .csv for each scan, a line of "
-                "names (class,x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad) and below it the values, separated by "
-                "commas"
+                f"{texts[0].name} is text: read OpenPCDet's labels with `asca import --from openpcdet`, and KITTI's "
+                "without a calibration with `--from kitti-no-camera`"
             )
         raise DatasetError(f"{labels}: no <frame>.json or <frame>.csv there; {advice}")
     return frames

@@ -23,11 +23,21 @@ def read_box_files(labels: Path, scans: Path, settings: ScanSettings) -> Importe
         ConfigError: the pose cannot be read.
         DatasetError: as `find_frames`.
     """
-    settings.stated_mounting()
-    scans = scans.resolve()
+    dataset = dataset_settings(scans, settings)
+    scans = Path(dataset.scans)
     frames = [
         ImportedFrame(frame.scan, frame.records, frame.scan.parent.relative_to(scans).as_posix(), frame.time_s)
         for frame in find_frames(labels, scans).values()
     ]
+    return Imported(dataset, frames, LeftOut())
+
+
+def dataset_settings(scans: Path, settings: ScanSettings) -> BoxDataset:
+    """The dataset of scans that lie as stated, by their absolute path.
+
+    Raises:
+        ConfigError: the pose cannot be read.
+    """
+    settings.stated_mounting()
     stated = to_dict(settings) | {"pose": None if settings.pose is None else str(Path(settings.pose).resolve())}
-    return Imported(parse(BoxDataset, stated | {"scans": str(scans)}, "import"), frames, LeftOut())
+    return parse(BoxDataset, stated | {"scans": str(scans.resolve())}, "import")

@@ -5,7 +5,7 @@ Nothing is copied that can be referred to.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,10 +46,6 @@ class Imported(NamedTuple):
     settings: BoxDataset
     frames: Sequence[ImportedFrame]
     left_out: LeftOut
-
-
-Importer = Callable[[Path], Imported]
-"""From the source's folder."""
 
 
 class ImportCounts(NamedTuple):

@@ -3,13 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import is_dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.errors import DatasetError, OutputError
+from asca_pillars.base.files import write_text
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config
 from asca_pillars.data.inspection.findings import FEWEST_BOXES
@@ -181,3 +184,23 @@ def _best_overlaps(boxes: _Floats, size_m: Sequence[float], spec: InspectedSpec)
         anchors = np.array([[*near, *size_m, yaw] for yaw in ANCHOR_YAWS_RAD])
         best[row] = aligned_bev_iou(anchors, box[None]).max()
     return best
+
+
+def propose_config(split: LabeledSplit, config: Config, path: Path, frames: int) -> tuple[Config, str]:
+    """Measure and write to `path`; gives the configuration that was written, and its text.
+
+    Raises:
+        DatasetError: as `propose`.
+        OutputError: there is a file already.
+    """
+    if path.exists():
+        raise OutputError(f"{path}: is there already and may have been edited; choose another name, or remove it")
+    proposal = propose(split, config, frames=frames, progress=True)
+    boxes = ", ".join(f"{name} {count}" for name, count in proposal.boxes.items())
+    notes = [f"Measured on {split.root}, {split.name}: {boxes} boxes."]
+    if proposal.rare:
+        rare = ", ".join(f"{name} {count}" for name, count in proposal.rare.items())
+        notes.append(f"No classes, for fewer than {FEWEST_BOXES} boxes with points: {rare}.")
+    text = "".join(f"# {note}\n" for note in notes) + yaml.safe_dump(differences(proposal.config), sort_keys=False)
+    write_text(path, text)
+    return proposal.config, text

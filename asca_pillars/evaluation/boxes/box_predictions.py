@@ -10,10 +10,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import NamedRecords, json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
@@ -138,7 +137,7 @@ def write_box_predictions(
     *,
     scope: DetectorScope,
     camera_view: bool,
-    console: Console | None = None,
+    reporter: Reporter = SILENT,
 ) -> None:
     """Run a detector over a split and write a line for each frame (`data.boxes.box_records`), in the scan's own frame.
 
@@ -149,14 +148,14 @@ def write_box_predictions(
     """
     level = split.mounting.level
     with path.open("w", encoding="utf-8") as file:
-        for frame_id in track(split.frame_ids, "Detecting", console=console, disable=console is None):
+        for frame_id in reporter.track(split.frame_ids, "Detecting"):
             found = detect(split.points(frame_id, camera_view=camera_view))
             boxes = found.boxes if level.is_identity else level.inverse.boxes(found.boxes)
             records = records_from(boxes, found.names, found.scores)
             file.write(json_line(f"{frame_id}{split.scan_path(frame_id).suffix}", records, detector=scope))
 
 
-def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | None = None) -> BoxFrames:
+def read_box_predictions(path: Path, split: LabeledSplit, *, reporter: Reporter = SILENT) -> BoxFrames:
     """Pair the labels of a split with the predictions of a *.jsonl or *.csv file.
 
     Boxes are in the scan's own frame, as labels are. `predictions_by_frame` says which frame a line belongs to; lines
@@ -165,7 +164,7 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
     Args:
         path: the file, or a folder that `asca detect` wrote.
         split: the labels.
-        console: shows the progress.
+        reporter: of the progress.
 
     Raises:
         DatasetError: as `predictions_by_frame`; a prediction without a score.
@@ -175,7 +174,7 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, console: Console | 
     _require_scores(predictions.values())
     level = split.mounting.level
     frames = []
-    for frame_id in track(sorted(predictions), "Points in boxes", console=console, disable=console is None):
+    for frame_id in reporter.track(sorted(predictions), "Points in boxes"):
         objects, types = split.labeled_boxes(frame_id)
         points = split.points(frame_id, camera_view=False)
         visible = np.asarray(points_in_boxes(points, objects).any(axis=0))

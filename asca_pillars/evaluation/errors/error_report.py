@@ -7,11 +7,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import Recognizer, ending_with, json_object, page_end, require_own_file
+from asca_pillars.base.progress import Reporter
 from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.base.strict import Strict
 from asca_pillars.data.kitti.kitti_split import read_image_set
@@ -264,9 +263,9 @@ def write_errors(
     beside: Sequence[ErrorReport],
     about: dict[str, Any],
     out: Path,
-    console: Console,
-) -> None:
-    """Analyze the errors of an evaluation; print the main table and write JSON, Markdown and page below `out`.
+    reporter: Reporter,
+) -> ReportPage:
+    """Analyze the errors of an evaluation; write JSON, Markdown and page below `out`, and return the main table.
 
     Args:
         frames: labels and predictions.
@@ -277,23 +276,24 @@ def write_errors(
         beside: reports of other evaluations, whose datasets stand in the same tables.
         about: for the JSON.
         out: folder of the evaluation.
-        console: to print on.
+        reporter: of the progress.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
         OutputError, OSError: a file cannot be written.
     """
-    matches = match_frames(frames, scores, console=console)
-    own = summarize(matches, name, parts, console=console)
+    matches = match_frames(frames, scores, reporter=reporter)
+    own = summarize(matches, name, parts, reporter=reporter)
     datasets = [*own, *(data for report in beside for data in report.datasets)]
     sections = worst_cases(matches)
-    pictured = draw_cases(frames, matches, sections, console=console)
+    pictured = draw_cases(frames, matches, sections, reporter=reporter)
     notes, tables, more = error_notes(datasets), error_tables(datasets), group_tables(datasets)
     title = f"{subject}: errors"
-    ReportPage(title, tables, notes[:PRINTED_NOTES]).print(console)
+    page = ReportPage(title, tables, notes[:PRINTED_NOTES])
     write_json(out / JSON, to_dict(ErrorReport(subject, tuple(own), about)))
     write_text(out / MARKDOWN, ReportPage(title, [*tables, *more], notes).markdown() + _END)
     write_text(out / PAGE, error_page(title, tables, more, notes, pictured) + _END)
+    return page
 
 
 def remove_errors(out: Path) -> None:

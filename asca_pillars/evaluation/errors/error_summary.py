@@ -8,9 +8,8 @@ from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.base.strict import Strict
 from asca_pillars.data.insertion.ground_fit import fit_ground
 from asca_pillars.evaluation.errors.box_errors import (
@@ -228,19 +227,19 @@ class Matches:
     surroundings: list[Surroundings | None] = field(default_factory=list)
 
 
-def match_frames(frames: ErrorFrames, scores: Mapping[str, float], *, console: Console | None = None) -> Matches:
+def match_frames(frames: ErrorFrames, scores: Mapping[str, float], *, reporter: Reporter = SILENT) -> Matches:
     """Match every frame.
 
     Args:
         frames: to be read one by one.
         scores: for each class to evaluate, from which on detections count.
-        console: shows the progress.
+        reporter: of the progress.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
     """
     matches = Matches(tuple(frames.frame_ids), scores)
-    bar = track(matches.frame_ids, "Errors", console=console, disable=console is None)
+    bar = reporter.track(matches.frame_ids, "Errors")
     for index, frame_id in enumerate(bar):
         frame = frames.read(frame_id)
         for name, score in scores.items():
@@ -257,7 +256,7 @@ def match_frames(frames: ErrorFrames, scores: Mapping[str, float], *, console: C
 
 
 def summarize(
-    matches: Matches, name: str, parts: Mapping[str, Sequence[str]], *, console: Console | None = None
+    matches: Matches, name: str, parts: Mapping[str, Sequence[str]], *, reporter: Reporter = SILENT
 ) -> list[DatasetErrors]:
     """Numbers about all frames, named `name`, then about each part of them.
 
@@ -265,7 +264,7 @@ def summarize(
         matches: of all frames.
         name: of the whole.
         parts: frame ids of each part, by its name; they need not hold all frames.
-        console: shows the progress.
+        reporter: of the progress.
     """
     index = {frame_id: number for number, frame_id in enumerate(matches.frame_ids)}
     indices = {part: np.array(sorted(index[one] for one in ids if one in index)) for part, ids in parts.items()}
@@ -274,7 +273,7 @@ def summarize(
     left = np.setdiff1d(everything, np.concatenate([*indices.values(), np.zeros(0, np.int64)]))
     drawn = {name: [*indices.values(), left]} | {part: [numbers] for part, numbers in indices.items()}
     sets = []
-    for title, groups in track(drawn.items(), "Intervals", console=console, disable=console is None):
+    for title, groups in reporter.track(drawn.items(), "Intervals"):
         chosen = np.unique(np.concatenate(groups).astype(np.int64))
         view = _Part(matches, np.isin(everything, chosen), resamples(groups, len(everything)))
         sets.append(DatasetErrors(title, len(chosen), tuple(view.class_errors(one) for one in matches.scores)))

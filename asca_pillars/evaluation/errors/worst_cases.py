@@ -7,9 +7,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.insertion.ground_fit import Ground, fit_ground
 from asca_pillars.evaluation.errors.box_errors import RESIDUALS, DetectionMatch, ObjectMatch, box_residuals
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
@@ -238,7 +237,7 @@ def worst_cases(matches: Matches) -> list[CaseSection]:
 
 
 def draw_cases(
-    frames: ErrorFrames, matches: Matches, sections: Sequence[CaseSection], *, console: Console | None = None
+    frames: ErrorFrames, matches: Matches, sections: Sequence[CaseSection], *, reporter: Reporter = SILENT
 ) -> list[CaseSection]:
     """The same sections with a picture (`crops.crop_svg`) of each case; every frame is read once.
 
@@ -248,7 +247,7 @@ def draw_cases(
     places = [(row, column) for row, section in enumerate(sections) for column in range(len(section.cases))]
     places.sort(key=lambda place: sections[place[0]].cases[place[1]].frame)
     drawn = [list(section.cases) for section in sections]
-    bar = track(places, "Drawing errors", console=console, disable=console is None)
+    bar = reporter.track(places, "Drawing errors")
     for index, group in groupby(bar, lambda place: sections[place[0]].cases[place[1]].frame):
         frame = frames.read(matches.frame_ids[index])
         ground = fit_ground(frame.points)

@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.evaluation.kitti.matching import ClassStates, Counts, count
 from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
@@ -160,7 +160,7 @@ def evaluate(
     class_names: Sequence[str] = CLASS_NAMES,
     *,
     bands_m: Sequence[_Band] = (),
-    progress: bool = False,
+    reporter: Reporter = SILENT,
 ) -> KittiEvaluation:
     """Evaluate detections by the protocol above.
 
@@ -174,7 +174,7 @@ def evaluate(
             frame in which nothing was detected has an empty one.
         class_names: compared without case.
         bands_m: distance bands (low, high) in metres to evaluate besides.
-        progress: show bars.
+        reporter: of the progress.
 
     Raises:
         ValueError: the two are not of the same frames, in the same order.
@@ -184,13 +184,13 @@ def evaluate(
     frames = Frames.join(truth, detections)
     related = [is_type(frames.truth, name) | is_neighbor(frames.truth, name) for name in class_names]
     lowest = min((min_overlap(name) for name in class_names), default=OTHER_MIN_OVERLAP)
-    pairs = overlapping_pairs(frames, np.any(related, axis=0), lowest, progress=progress)
+    pairs = overlapping_pairs(frames, np.any(related, axis=0), lowest, reporter=reporter)
     dont_care = dont_care_shares(frames)
 
     bands: list[_Band | None] = [None, *bands_m]
     curves: dict[_Band | None, dict[tuple[str, str, str], Curve]] = {band: {} for band in bands}
     steps = list(product(zip(class_names, related, strict=True), DIFFICULTIES))
-    for (name, mine), difficulty in track(steps, "Matching", disable=not progress):
+    for (name, mine), difficulty in reporter.track(steps, "Matching"):
         own_pairs = pairs.where(mine[pairs.truth])
         for band in bands:
             found = _curves(frames, own_pairs, dont_care, name, difficulty, band)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.evaluation.kitti.objects import FrameObjects, stacked
 from asca_pillars.evaluation.kitti.states import is_type
 from asca_pillars.geometry.overlap import paired_bev_intersection
@@ -66,16 +66,16 @@ class Pairs:
         return Pairs(self.truth[keep], self.detection[keep], self.frame[keep], overlaps)
 
 
-def overlapping_pairs(frames: Frames, wanted: NDArray[np.bool_], above: float, *, progress: bool = False) -> Pairs:
+def overlapping_pairs(frames: Frames, wanted: NDArray[np.bool_], above: float, *, reporter: Reporter = SILENT) -> Pairs:
     """The pairs whose boxes overlap by more than `above` in the image, from above or in 3D.
 
     Args:
         wanted: (N,) which ground truth to pair.
-        progress: show a bar.
+        reporter: of the progress.
     """
     truth_boxes, detection_boxes = _upright_boxes(frames.truth), _upright_boxes(frames.detections)
     found = []
-    for truths in track(list(_blocks(frames, wanted)), "Overlaps", disable=not progress):
+    for truths in reporter.track(list(_blocks(frames, wanted)), "Overlaps"):
         pairs = _all_pairs(frames, truths)
         image = _image_iou(frames.detections.bbox[pairs.detection], frames.truth.bbox[pairs.truth])
         bev, solid = _ground_iou(detection_boxes[pairs.detection], truth_boxes[pairs.truth])

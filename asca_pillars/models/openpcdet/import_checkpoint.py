@@ -16,12 +16,11 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint_file import unread
+from asca_pillars.models.checkpoint_file import read_failure, read_plain
 from asca_pillars.models.openpcdet.links import Link, convert_state
 from asca_pillars.models.openpcdet.mmdetection3d_links import FIRST_LINEAR, FUSION, mmdetection3d_links
 from asca_pillars.models.openpcdet.pointpillars_links import pointpillars_links
 from asca_pillars.models.openpcdet.pv_rcnn_links import FIRST_CONVOLUTION, pv_rcnn_links
-from asca_pillars.models.openpcdet.weights_alone import load_weights_alone
 
 CONFIG_OF = {
     "vfe.pfn_layers.0.linear.weight": "openpcdet_pointpillars_kitti",
@@ -64,8 +63,9 @@ def read_foreign(path: str | Path) -> ForeignWeights:
         content = load_weights_alone(path)
     except Exception as error:  # torch.load raises whatever the damaged bytes happen to trigger
         raise TrainingError(
-            f"{path}: damaged, or holds more than weights, which is not read ({unread(error)}); where the library that "
-            "wrote it is installed, write a file with `model_state` (OpenPCDet) or `state_dict` (mmdetection3d) alone"
+            f"{path}: damaged, or holds more than weights, which is not read ({read_failure(error)}); "
+            "where the library that wrote it is installed, write a file with `model_state` (OpenPCDet) or `state_dict` "
+            "(mmdetection3d) alone"
         ) from error
     if "hyper_parameters" in content:
         raise TrainingError(f"{path}: a checkpoint of `asca train`, which needs no import; give it to `asca export`")
@@ -166,3 +166,34 @@ def _links(weights: ForeignWeights, model: PillarModel | PvRcnnModel, wanted: Ma
     if isinstance(model, PillarModel):
         return list(pointpillars_links(model, weights.state))
     return list(pv_rcnn_links(model, weights.state, wanted))
+
+
+class _Omitted:
+    """Stands for an object whose class is not known here: it takes what a pickle gives it, and keeps none of it."""
+
+    def __new__(cls, *_: Any, **__: Any) -> "_Omitted":
+        return super().__new__(cls)
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def __setstate__(self, _: Any) -> None:
+        pass
+
+
+def load_weights_alone(path: Path) -> dict[str, Any]:
+    """The dictionary that a file of `torch.save` holds, weights only: nothing in it is executed.
+
+    Training logs and settings beside the weights are often objects of NumPy or mmengine, which PyTorch refuses as it
+    refuses code. Each name in the file that it does not know stands for `_Omitted`, so that the arrays can be read and
+    no other class or function is ever called.
+
+    Raises:
+        Exception: as `read_plain`.
+    """
+    try:
+        unknown = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+    except ValueError:  # a format from before PyTorch 1.6, in which names cannot be listed
+        unknown = []
+    with torch.serialization.safe_globals([(_Omitted, name) for name in unknown]):
+        return read_plain(path)

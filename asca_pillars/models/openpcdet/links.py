@@ -1,6 +1,6 @@
 """Which of OpenPCDet's arrays becomes which of ours, and that none is left over on either side."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from torch import Tensor
@@ -80,3 +80,50 @@ def _some(names: Iterable[str]) -> str:
     names = sorted(names)
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return f"{', '.join(names[:_NAMED])}{more}"
+
+
+_HEADS = {"scores": "conv_cls", "boxes": "conv_box", "directions": "conv_dir_cls"}
+
+
+def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as_it_is) -> Iterator[Link]:
+    """Links of `backbone_2d` and `dense_head`.
+
+    Args:
+        block_convs: convolutions of each block after its first.
+        first: conversion of the very first convolution's unitless weight (out, in, 3, 3), whose input channels may
+            stand in another order.
+    """
+    for block, convs in enumerate(block_convs):
+        there, here = f"backbone_2d.blocks.{block}", f"neck.blocks.{block}"
+        for layer in range(0, 3 * (convs + 1), 3):  # convolution, normalization, ReLU; theirs begins with a padding
+            convert = first if block == layer == 0 else as_it_is
+            yield Link(f"{there}.{layer + 1}.weight", f"{here}.{layer}.weight", convert)
+            yield from norm_links(f"{there}.{layer + 2}", f"{here}.{layer + 1}")
+        there, here = f"backbone_2d.deblocks.{block}", f"neck.deblocks.{block}"
+        yield Link(f"{there}.0.weight", f"{here}.0.weight")
+        yield from norm_links(f"{there}.1", f"{here}.1")
+    for here, there in _HEADS.items():
+        for part in ("weight", "bias"):
+            yield Link(f"dense_head.{there}.{part}", f"head.{here}.{part}")
+
+
+_LAYOUTS = (
+    (4, 3, 0, 1, 2),  # kernel, inputs, outputs: 1.x
+    (0, 4, 1, 2, 3),  # outputs, kernel, inputs: 2.x
+    (3, 4, 0, 1, 2),  # kernel, outputs, inputs: 2.x, weights of its native algorithm
+)
+"""Where each layout has the axes (out, in, z, y, x) of a dense convolution."""
+
+
+def dense_order(pairs: Sequence[tuple[Tensor, Tensor]]) -> Callable[[Tensor], Tensor]:
+    """The conversion of a network's unitless sparse weights to (out, in, z, y, x): the layout that fits all of them.
+
+    Layers with as many inputs as outputs fit two of the layouts; all layers of a file have the same.
+
+    Args:
+        pairs: of each layer theirs, and ours.
+    """
+    for axes in _LAYOUTS:
+        if all(theirs.ndim == len(axes) and theirs.permute(axes).shape == ours.shape for theirs, ours in pairs):
+            return lambda weight: weight.permute(axes)
+    return lambda weight: weight

@@ -12,8 +12,7 @@ from torch import Tensor
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.models.openpcdet.links import Link
-from asca_pillars.models.openpcdet.map_links import map_links
+from asca_pillars.models.openpcdet.links import Link, map_links
 from asca_pillars.models.openpcdet.pointpillars_links import encoder_links
 from asca_pillars.models.openpcdet.pv_rcnn_links import pv_rcnn_links
 

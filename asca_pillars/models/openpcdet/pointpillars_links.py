@@ -13,8 +13,7 @@ from torch import Tensor
 
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.config.pillar import PillarModel
-from asca_pillars.models.openpcdet.links import Link, norm_links
-from asca_pillars.models.openpcdet.map_links import map_links
+from asca_pillars.models.openpcdet.links import Link, map_links, norm_links
 from asca_pillars.ops.pillar.prepare import FEATURES
 
 _Z = FEATURES.index("z")

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.models.openpcdet.links import Link, norm_links, without_singletons
-from asca_pillars.models.openpcdet.map_links import map_links
-from asca_pillars.models.openpcdet.sparse_layout import dense_order
+from asca_pillars.models.openpcdet.links import Link, dense_order, map_links, norm_links, without_singletons
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
 
 FIRST_CONVOLUTION = "backbone_3d.conv_input.0.weight"

@@ -1,15 +1,166 @@
-"""Feature encoding network: points of pillars -> one feature vector per pillar (section 3.2 of the paper)."""
+"""Feature encoding network: points of pillars -> one feature vector per pillar (section 3.2 of the paper).
+
+Correlative point attention (CPA, eq. 6-11) is here in the readings that the paper's text allows. Letters: P pillars of
+one frame, M points, C channels, d attention width, N points of one pillar at most. Each reading ends with the residual
+connection of eq. (11), and so does the control without attention.
+"""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.config.pillar import CpaReading
-from asca_pillars.models.map_layers import NORM_EPS, NORM_MOMENTUM
-from asca_pillars.models.pillar.attention import ChannelAttention, ChannelLinear, PaperAttention, PointAttention
-from asca_pillars.models.row_product import linear_rows
+from asca_pillars.models.map_backbone import NORM_EPS, NORM_MOMENTUM
+from asca_pillars.models.sparse_conv import linear_rows
 from asca_pillars.ops.pillar.prepare import FEATURES, PillarLimits
+
+
+class PaperAttention(nn.Module):
+    """Eq. (6)-(11) as printed: the MLPs mix the *pillar* axis, attention runs among the C channels.
+
+    The matrices are laid out for `max_pillars` pillars in flat-index order. A frame with fewer uses the first rows
+    and columns, which is exactly what zero-padding the frame to `max_pillars` would compute.
+    """
+
+    def __init__(self, channels: int, max_pillars: int, width: int = 64) -> None:
+        super().__init__()
+        bound = max_pillars**-0.5
+        self.scale = width**-0.5
+        self.query = nn.Parameter(torch.empty(max_pillars, width).uniform_(-bound, bound))
+        self.key = nn.Parameter(torch.empty(max_pillars, width).uniform_(-bound, bound))
+        self.value = nn.Parameter(torch.empty(max_pillars, channels).uniform_(-bound, bound))
+        self.bias = nn.ParameterDict(
+            {
+                "query": nn.Parameter(torch.zeros(width)),
+                "key": nn.Parameter(torch.zeros(width)),
+                "value": nn.Parameter(torch.zeros(channels)),
+                "restore": nn.Parameter(torch.zeros(max_pillars)),
+            }
+        )
+        bound = channels**-0.5
+        self.restore = nn.Parameter(torch.empty(channels, max_pillars).uniform_(-bound, bound))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Unitless features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
+        pillars = features.shape[0]
+        by_channel = features.T  # F of the paper, (C, P)
+        query = by_channel @ self.query[:pillars] + self.bias["query"]  # (C, d)
+        key = by_channel @ self.key[:pillars] + self.bias["key"]  # (C, d)
+        value = by_channel @ self.value[:pillars] + self.bias["value"]  # (C, C)
+        attention = torch.softmax(query @ key.T * self.scale, dim=-1) @ value  # A, (C, C)
+        restored = attention @ self.restore[:, :pillars] + self.bias["restore"][:pillars]  # F', (C, P)
+        return features + restored.T
+
+
+class _ChannelMixing(nn.Module):
+    """Features mixed by a C x C matrix and added to themselves; `restore` has the bias."""
+
+    restore: nn.Linear
+
+    def mixing(self, features: Tensor) -> Tensor:
+        """(C, C) of the pillars (P, C) of one frame, unitless."""
+        raise NotImplementedError
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Unitless features (P, C) -> (P, C) for the pillars of one frame."""
+        device = features.device.type
+        if torch.is_autocast_enabled(device):  # differences of large sums: bfloat16 would leave little of them
+            with torch.autocast(device, enabled=False):
+                return self(features.float())
+        mixing = self.mixing(features)
+        residual = torch.eye(len(mixing), device=mixing.device)  # as part of the product it takes no pass of its own
+        return F.linear(features, mixing + residual, self.restore.bias)
+
+
+class ChannelLinear(_ChannelMixing):
+    """No attention, but the layer that `ChannelAttention` would be if it were the same for every frame.
+
+    It tells what of the attention's effect is that of one more linear layer. Training starts at the identity, near
+    which channel attention starts, too.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.restore = nn.Linear(channels, channels)
+        nn.init.zeros_(self.restore.weight)
+        nn.init.zeros_(self.restore.bias)
+
+    def mixing(self, features: Tensor) -> Tensor:
+        """(C, C), unitless, whatever the features (P, C)."""
+        return self.restore.weight
+
+
+class ChannelAttention(_ChannelMixing):
+    """The same C x C attention with projections per pillar, so that order and number of pillars do not matter.
+
+    Queries and keys are normalised along the pillars (cross-covariance attention, XCiT, arXiv 2106.09681), which
+    keeps the logits' scale the same for a frame of ten pillars and one of ten thousand.
+
+    Every product of queries and keys is one of pairs of channels summed over the pillars, so the channels' Gram matrix
+    holds all that the attention needs to know of the frame, and the projections act on it instead of on P pillars: two
+    products with the pillars where the textbook form has six.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.query = nn.Linear(channels, channels, bias=False)
+        self.key = nn.Linear(channels, channels, bias=False)
+        self.value = nn.Linear(channels, channels, bias=False)
+        self.restore = nn.Linear(channels, channels)
+        self.temperature = nn.Parameter(torch.ones(1))
+
+    def mixing(self, features: Tensor) -> Tensor:
+        """(C, C) of the pillars (P, C) of one frame, unitless."""
+        gram = features.T @ features  # (C, C)
+        query, key = self.query.weight, self.key.weight
+        products = query @ gram @ key.T  # of queries and keys, summed over the pillars
+        query_norm = _norm((query @ gram * query).sum(dim=1))
+        key_norm = _norm((key @ gram * key).sum(dim=1))
+        logits = products / (query_norm[:, None] * key_norm[None, :]) * self.temperature
+        attention = torch.softmax(logits, dim=-1)  # (C, C)
+        return self.restore.weight @ attention @ self.value.weight
+
+
+def _norm(squared: Tensor) -> Tensor:
+    return torch.sqrt(squared.clamp_min(1e-24))  # rounding may leave less than nothing
+
+
+class PointAttention(nn.Module):
+    """Self-attention among the points of one pillar, before the max: "associations among points within a pillar"."""
+
+    def __init__(self, channels: int, max_points: int) -> None:
+        super().__init__()
+        self.max_points = max_points
+        self.scale = channels**-0.5
+        self.query = nn.Linear(channels, channels, bias=False)
+        self.key = nn.Linear(channels, channels, bias=False)
+        self.value = nn.Linear(channels, channels, bias=False)
+        self.restore = nn.Linear(channels, channels)
+
+    def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+        """(M, C) point features -> (M, C); points attend to the points of their own pillar only.
+
+        Args:
+            features: (M, C), unitless, rows of one pillar adjacent.
+            pillar_index: (M,) index of each row's pillar, ascending.
+            point_counts: (P,) rows of each pillar.
+        """
+        pillars, channels = point_counts.shape[0], features.shape[1]
+        starts = torch.cumsum(point_counts, 0) - point_counts
+        rows = torch.arange(features.shape[0], device=features.device)
+        slot = pillar_index * self.max_points + rows - starts[pillar_index]  # row of the padded (P * N) table
+
+        def padded(flat: Tensor) -> Tensor:
+            table = flat.new_zeros(pillars * self.max_points, channels)
+            return table.index_put((slot,), flat).view(pillars, self.max_points, channels)
+
+        query, key, value = (padded(layer(features)) for layer in (self.query, self.key, self.value))
+        empty = torch.arange(self.max_points, device=features.device) >= point_counts[:, None]  # (P, N)
+        logits = (query @ key.transpose(1, 2) * self.scale).masked_fill(empty[:, None, :], float("-inf"))
+        attended = (torch.softmax(logits, dim=-1) @ value).view(-1, channels)[slot]  # back to (M, C)
+        return features + self.restore(attended)
 
 
 @torch.library.custom_op("asca::pillar_max", mutates_args=())

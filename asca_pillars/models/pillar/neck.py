@@ -1,59 +1,30 @@
 """Detection neck: the region proposal network of Table 1."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.map_layers import convolution_block, joined_maps, upsampling
-from asca_pillars.models.row_product import linear_rows
-from asca_pillars.models.table_conv import at_active_cells, table_conv
+from asca_pillars.models.map_backbone import MapBackbone
+from asca_pillars.models.sparse_conv import at_active_cells, linear_rows, rulebook_conv
 from asca_pillars.ops.pillar.grid import HEAD_STRIDE, NECK_STRIDE
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebooks
+
+_STRIDES = (2, 2, 2)
+assert math.prod(_STRIDES) == NECK_STRIDE, "what the grid is made for"
 
 
-class RPNLayers(nn.Module):
-    """Three blocks that halve the map, three deblocks that bring it back to the head's resolution.
+class RPNNeck(MapBackbone):
+    """The neck of Table 1, everywhere on the map: three blocks that halve it, 384 channels with Table 1's widths."""
 
-    Args:
-        in_channels: channels of the pseudo-image.
-        block_channels: output channels of Block1..3.
-        block_convs: stride-1 convolutions after each block's strided one.
-        upsample_channels: output channels of each deblock.
-    """
-
-    def __init__(
-        self,
-        in_channels: int,
-        block_channels: Sequence[int],
-        block_convs: Sequence[int],
-        upsample_channels: int,
-    ) -> None:
-        super().__init__()
-        self.blocks = nn.ModuleList()
-        self.deblocks = nn.ModuleList()
-        stride = 1
-        for channels, convs in zip(block_channels, block_convs, strict=True):
-            stride *= 2
-            self.blocks.append(convolution_block(in_channels, channels, convs))
-            self.deblocks.append(upsampling(channels, upsample_channels, stride // HEAD_STRIDE))
-            in_channels = channels
-        if stride != NECK_STRIDE:
-            raise ValueError(f"{len(block_channels)} blocks end at stride {stride}, the grid is made for {NECK_STRIDE}")
-        self.out_channels = upsample_channels * len(self.blocks)
+    def __init__(self, *widths: Any) -> None:
+        super().__init__(*widths, strides=_STRIDES, head_stride=HEAD_STRIDE)
 
 
-class RPNNeck(RPNLayers):
-    """The neck of Table 1, everywhere on the map; its three levels are concatenated."""
-
-    def forward(self, canvas: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> (B, out_channels, H / 2, W / 2); 384 channels with Table 1's widths."""
-        return joined_maps(canvas, self.blocks, self.deblocks)
-
-
-class SparseRPNNeck(RPNLayers):
+class SparseRPNNeck(MapBackbone):
     """The same neck, computed at active cells alone; its weights have the names and shapes of `RPNNeck`'s.
 
     Batch normalization is over active cells. A convolution's missing inputs are zero, and so are the upsampled values
@@ -61,16 +32,16 @@ class SparseRPNNeck(RPNLayers):
 
     Args:
         rule: which cells are active, see `ops.pillar.neck_rulebooks`.
-        widths: as for `RPNLayers`.
+        widths: the first arguments of `MapBackbone`.
     """
 
     def __init__(self, *widths: Any, rule: MaskRule) -> None:
-        super().__init__(*widths)
+        super().__init__(*widths, strides=_STRIDES, head_stride=HEAD_STRIDE)
         self.rule: MaskRule = rule
         # A tap's channels lie side by side in memory, as gathered rows do: products read the weights without a copy.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, pillars: Tensor, tables: NeckTables[Tensor]) -> Tensor:
+    def forward(self, pillars: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:  # type: ignore[override]
         """Unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
@@ -80,11 +51,11 @@ class SparseRPNNeck(RPNLayers):
                     (level.first, level.first_back),
                     (level.same, None),
                 )[min(number, 2)]
-                pillars = torch.relu(at_active_cells(norm, table_conv(pillars, convolution.weight, table, back)))
+                pillars = torch.relu(at_active_cells(norm, rulebook_conv(pillars, convolution.weight, table, back)))
             maps.append(_upsampled(deblock, pillars, level.places))
         return torch.cat(maps, dim=1)
 
-    def forward_dense(self, canvas: Tensor, tables: NeckTables[Tensor]) -> Tensor:
+    def forward_dense(self, canvas: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:
         """The same function by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):

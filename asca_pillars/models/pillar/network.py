@@ -12,14 +12,13 @@ from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.models.map_layers import as_map
+from asca_pillars.models.map_backbone import SSDHead, as_map
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
-from asca_pillars.models.pillar.head import SSDHead
 from asca_pillars.models.pillar.loss import detection_loss, targets_at
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, PillarPreparation
 from asca_pillars.models.trainable import Trainable
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 from asca_pillars.ops.pillar.spec import PillarSpec
 
 
@@ -32,7 +31,7 @@ class PillarOutputs(NamedTuple):
     """
 
     maps: HeadMaps[Tensor]
-    neck: NeckTables[Tensor] | None
+    neck: NeckRulebooks[Tensor] | None
 
 
 class PillarDetector(Trainable):

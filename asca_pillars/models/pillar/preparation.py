@@ -14,7 +14,7 @@ from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.detection.targets import Assigner, Targets, assign_targets
 from asca_pillars.models.pillar.loss import TargetBatch
 from asca_pillars.ops.pillar.grid import MapCells, map_cells
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables, stack_neck_tables
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder, NeckRulebooks, stack_neck_rulebooks
 from asca_pillars.ops.pillar.prepare import Pillars
 from asca_pillars.ops.pillar.spec import PillarSpec
 
@@ -28,7 +28,7 @@ class Placement(NamedTuple):
     """
 
     pooling: MapCells[NDArray[np.int64]] | None
-    tables: NeckTables[NDArray[np.int32]] | None
+    tables: NeckRulebooks[NDArray[np.int32]] | None
 
 
 class TargetedPillars(NamedTuple):
@@ -59,7 +59,7 @@ class PillarBatch(NamedTuple):
     point_counts: Tensor
     cells: Tensor
     frame_pillars: Sequence[int]
-    neck: NeckTables[Tensor] | None = None
+    neck: NeckRulebooks[Tensor] | None = None
     pooling: MapCells[Tensor] | None = None
     frame_cells: Sequence[int] = ()
 
@@ -113,7 +113,7 @@ class PillarPreparation:
         pooling = map_cells(pillars.cells, grid)
         if self.active_cells is None:
             return Placement(pooling, None)
-        builder = NeckTableBuilder(*grid.map_shape, self.active_cells, training=True)
+        builder = NeckRulebookBuilder(*grid.map_shape, self.active_cells, training=True)
         return Placement(pooling, builder.build(pillars.cells if pooling is None else pooling.cells))
 
 
@@ -137,18 +137,20 @@ def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = (
         point_counts=torch.from_numpy(np.concatenate([frame.point_counts for frame in frames])),
         cells=torch.from_numpy(np.concatenate([frame.cells for frame in frames])),
         frame_pillars=frame_pillars,
-        neck=_batch_tables(tables, frame_cells),
+        neck=_batch_rulebooks(tables, frame_cells),
         pooling=_batch_poolings(poolings, starts),
         frame_cells=frame_cells,
     )
 
 
-def _batch_tables(
-    tables: Sequence[NeckTables[NDArray[np.int32]]], frame_cells: Sequence[int]
-) -> NeckTables[Tensor] | None:
+def _batch_rulebooks(
+    tables: Sequence[NeckRulebooks[NDArray[np.int32]]], frame_cells: Sequence[int]
+) -> NeckRulebooks[Tensor] | None:
     if not tables:
         return None
-    batch: NeckTables[Tensor] = tree_map_only(np.ndarray, torch.from_numpy, stack_neck_tables(tables, frame_cells))
+    batch: NeckRulebooks[Tensor] = tree_map_only(
+        np.ndarray, torch.from_numpy, stack_neck_rulebooks(tables, frame_cells)
+    )
     return batch
 
 

@@ -6,57 +6,123 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.config.pv_rcnn import Attention, PvRcnnModel
+from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.models.map_layers import as_map, convolution_block, joined_maps, upsampling
-from asca_pillars.models.pillar.head import SSDHead
-from asca_pillars.models.pv_rcnn.adaptive_scales import AdaptiveScales
-from asca_pillars.models.pv_rcnn.batch import VoxelBatch, deformed_balls
-from asca_pillars.models.pv_rcnn.deformation import AuthorsDeformation, PaperDeformation, Surroundings
-from asca_pillars.models.pv_rcnn.dual_attention import DualAttention
-from asca_pillars.models.pv_rcnn.voxel_backbone import VoxelBackbone
-from asca_pillars.models.two_stage.keypoint_encoder import BallSource, KeypointEncoder, SourceRows
-from asca_pillars.models.two_stage.roi_head import RoiHead
-from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
-from asca_pillars.models.two_stage.vector_pool import VectorPool
+from asca_pillars.models.map_backbone import (
+    NORM_EPS,
+    NORM_MOMENTUM,
+    MapBackbone,
+    SSDHead,
+    as_map,
+)
+from asca_pillars.models.pv_rcnn.keypoints import AdaptiveScales, AuthorsDeformation, PaperDeformation, Surroundings
+from asca_pillars.models.pv_rcnn.preparation import VoxelBatch, deformed_balls
+from asca_pillars.models.sparse_conv import rulebook_conv
+from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, RoiHead, SourceRows
+from asca_pillars.models.two_stage.sets import SetAbstraction, VectorPool
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, Source, VoxelSetSettings
+from asca_pillars.ops.pv_rcnn.rulebooks import SUBMANIFOLD, VoxelLevel
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
+from asca_pillars.ops.sparse.rulebooks import Convolution
+
+_RESIDUAL_WEIGHT = 0.1  # epsilon of eq. (5)
+
+
+class DualAttention(nn.Module):
+    """Eq. (1)-(5) with the widths of polarized self-attention (arXiv 2107.00782).
+
+    Args:
+        channels: C of the map.
+        residual: X + 0.1 O_s (eq. 5); without it O_s alone, the paper's Table 5 compares the two.
+    """
+
+    def __init__(self, channels: int, *, residual: bool) -> None:
+        super().__init__()
+        half = max(channels // 2, 1)
+        self.residual = residual
+        self.channel_value = nn.Conv2d(channels, half, 1)
+        self.channel_query = nn.Conv2d(channels, 1, 1, bias=False)  # the softmax over places would not see a bias
+        self.channel_out = nn.Linear(half, channels)
+        self.channel_norm = nn.LayerNorm(channels)
+        self.place_value = nn.Conv2d(channels, half, 1)
+        self.place_query = nn.Conv2d(channels, half, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Unitless (B, C, H, W) -> the same shape."""
+        attended = self.by_place(self.by_channel(features))
+        return features + _RESIDUAL_WEIGHT * attended if self.residual else attended
+
+    def by_channel(self, features: Tensor) -> Tensor:
+        """Eq. (1) and (2): a weight in (0, 1) for each channel of unitless (B, C, H, W)."""
+        values = self.channel_value(features).flatten(2)  # (B, C / 2, HW)
+        shares = torch.softmax(self.channel_query(features).flatten(2), dim=2)  # (B, 1, HW)
+        pooled = (values @ shares.transpose(1, 2))[:, :, 0]
+        weights = torch.sigmoid(self.channel_norm(self.channel_out(pooled)))
+        return features * weights[:, :, None, None]
+
+    def by_place(self, features: Tensor) -> Tensor:
+        """Eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
+        values = self.place_value(features)  # (B, C / 2, H, W)
+        shares = torch.softmax(self.place_query(features).mean(dim=(2, 3)), dim=1)  # (B, C / 2)
+        return features * torch.sigmoid((values * shares[:, :, None, None]).sum(dim=1, keepdim=True))
+
+
+_CONVS = 2  # submanifold convolutions of each level but the last
+
+
+class SparseConvBlock(nn.Module):
+    """A convolution by table, BatchNorm over active cells, ReLU; its weight has the shape of a dense convolution's."""
+
+    def __init__(self, in_channels: int, channels: int, convolution: Convolution) -> None:
+        super().__init__()
+        self.convolution = nn.Conv3d(in_channels, channels, convolution.kernel, bias=False)
+        self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
+
+    def forward(self, features: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
+        """Unitless (N, in_channels) -> (M, channels), see `rulebook_conv`."""
+        return torch.relu(self.norm(rulebook_conv(features, self.convolution.weight, table, back)))
+
+
+class VoxelBackbone(nn.Module):
+    """conv1 to conv4 and conv_out: each level halves the lattice before it.
+
+    Args:
+        in_channels: of a voxel.
+        channels: output channels of the levels.
+        strided: the convolutions that lead from level to level.
+    """
+
+    def __init__(self, in_channels: int, channels: Sequence[int], strided: Sequence[Convolution]) -> None:
+        super().__init__()
+        *inner, out = channels
+        self.down = nn.ModuleList(
+            SparseConvBlock(before, after, convolution)
+            for before, after, convolution in zip(channels[:-1], channels[1:], strided, strict=True)
+        )
+        reads = [in_channels, *inner[1:]]
+        self.same = nn.ModuleList(
+            nn.ModuleList(
+                SparseConvBlock(read if number == 0 else width, width, SUBMANIFOLD) for number in range(_CONVS)
+            )
+            for read, width in zip(reads, inner, strict=True)
+        )
+        self.out_channels = out
+
+    def forward(self, features: Tensor, levels: Sequence[VoxelLevel[Tensor]]) -> list[Tensor]:
+        """Voxel features (N, in_channels) -> unitless features (M, channels) of the active cells of every level."""
+        found = []
+        for number, level in enumerate(levels):
+            if number:
+                features = self.down[number - 1](features, level.strided, level.strided_back)
+            if number < len(self.same):
+                for layer in self.same[number].children():
+                    features = layer(features, level.same)
+            found.append(features)
+        return found
+
 
 POINT_CHANNELS = 4  # x, y, z, reflectance
 _BLOCK_STRIDES = (1, 2)
-
-
-class MapBackbone(nn.Module):
-    """The backbone on the map seen from above (section 3.1): two blocks, the second at half the resolution.
-
-    With `attention` dual attention after each block, before its upsampling (AFE-RCNN, figure 3).
-    """
-
-    def __init__(
-        self,
-        in_channels: int,
-        block_channels: Sequence[int],
-        block_convs: Sequence[int],
-        upsample_channels: int,
-        attention: Attention = "none",
-    ) -> None:
-        super().__init__()
-        self.blocks, self.deblocks, stride = nn.ModuleList(), nn.ModuleList(), 1
-        self.attention: nn.ModuleList | None = None
-        if attention != "none":
-            self.attention = nn.ModuleList(
-                DualAttention(channels, residual=attention == "rda") for channels in block_channels
-            )
-        for channels, convs, step in zip(block_channels, block_convs, _BLOCK_STRIDES, strict=True):
-            stride *= step
-            self.blocks.append(convolution_block(in_channels, channels, convs, stride=step))
-            self.deblocks.append(upsampling(channels, upsample_channels, stride))
-            in_channels = channels
-        self.out_channels = upsample_channels * len(self.blocks)
-
-    def forward(self, canvas: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> (B, out_channels, H, W)."""
-        return joined_maps(canvas, self.blocks, self.deblocks, self.attention)
 
 
 class FirstStageOutputs(NamedTuple):
@@ -127,7 +193,9 @@ class PvRcnn(nn.Module):
         empty = features.new_zeros(frames * rows * columns * nz, features.shape[1])
         return empty.index_put((cells,), features).view(frames, rows, columns, -1)
 
-    def describe(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor], canvas: Tensor) -> tuple[Tensor, Tensor]:
+    def encode_keypoints(
+        self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor], canvas: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Weighted features (K, C) of the keypoints, and logits (K,) of their being part of an object."""
         cells = canvas.flatten(0, 2)
         bev = sum(
@@ -183,7 +251,14 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
     channels = {"points": POINT_CHANNELS - 3, **dict(zip(LEVEL_SOURCES, network.voxel_channels[:-1], strict=True))}
     map_channels = network.voxel_channels[-1] * spec.level_shapes[-1][0]
     neck = MapBackbone(
-        map_channels, network.block_channels, network.block_convs, network.upsample_channels, network.attention
+        map_channels,
+        network.block_channels,
+        network.block_convs,
+        network.upsample_channels,
+        strides=_BLOCK_STRIDES,
+        attention=None
+        if network.attention == "none"
+        else [DualAttention(channels, residual=network.attention == "rda") for channels in network.block_channels],
     )
     return PvRcnn(
         spec,

@@ -15,12 +15,11 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.proposals import AnchorProposals, propose_anchors
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.pillar.loss import detection_loss
-from asca_pillars.models.pv_rcnn.batch import LabeledVoxels, VoxelBatch
 from asca_pillars.models.pv_rcnn.layers import FirstStageOutputs, PvRcnn, build_pv_rcnn
-from asca_pillars.models.pv_rcnn.preparation import VoxelPreparation
+from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels, VoxelBatch, VoxelPreparation
 from asca_pillars.models.trainable import Trainable
+from asca_pillars.models.two_stage.layers import Refinements, zero_of_weights
 from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
-from asca_pillars.models.two_stage.pillar_refiner import Refinements, zero_of_weights
 from asca_pillars.ops.sparse.rulebooks import stack_rows
 from asca_pillars.ops.two_stage.decode import reported_frames
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
@@ -72,7 +71,7 @@ class PvRcnnDetector(Trainable):
         """Head maps, proposals and their refinements; training draws the proposals that it learns from."""
         scans = batch.scans
         if self.training and min(len(scans.keypoints), *(len(level.cells) for level in scans.levels)) < 2:
-            return self._silence(scans)  # no statistics of a batch
+            return self._zero_outputs(scans)  # no statistics of a batch
         first = self.network.propose(scans)
         proposals = self._proposals(first.maps, batch)
         with torch.autocast(first.canvas.device.type, enabled=False):  # positions need float32, `SetAbstraction`
@@ -132,7 +131,7 @@ class PvRcnnDetector(Trainable):
         self, scans: VoxelBatch[Tensor], first: FirstStageOutputs, proposals: Sequence[Detections]
     ) -> Refinements:
         levels, canvas = [level.float() for level in first.levels], first.canvas.float()
-        features, keypoint_logits = self.network.describe(scans, levels, canvas)
+        features, keypoint_logits = self.network.encode_keypoints(scans, levels, canvas)
         if self.training and not sum(map(len, proposals)):
             nothing = zero_of_weights(self.network.refine)
             return Refinements(
@@ -152,7 +151,7 @@ class PvRcnnDetector(Trainable):
         confidence, residuals = self.network.refine(scans.keypoints, features, points, indices)
         return Refinements(confidence, residuals, keypoint_logits)
 
-    def _silence(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
+    def _zero_outputs(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
         nothing, frames = zero_of_weights(self), len(scans.frame_keypoints)
         height, width, anchors, _ = self.model.spec.anchors.shape

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models.pillar.loss import focal_loss
-from asca_pillars.models.two_stage.pillar_refiner import Refinements
+from asca_pillars.models.two_stage.layers import Refinements
 
 _RESIDUAL_BETA, _CORNER_BETA = 1 / 9, 1.0
 _FOCAL_ALPHA, _FOCAL_GAMMA = 0.25, 2.0

@@ -4,22 +4,37 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.two_stage import RefineConfig, RefineModel
+from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.trainable import Trainable
-from asca_pillars.models.two_stage.keypoint_encoder import BallSource, KeypointEncoder
+from asca_pillars.models.two_stage.layers import (
+    BallSource,
+    KeypointEncoder,
+    PillarRefiner,
+    RefineInputs,
+    Refinements,
+    RoiHead,
+    zero_of_weights,
+)
 from asca_pillars.models.two_stage.loss import RefineTargets, refine_loss
-from asca_pillars.models.two_stage.pillar_refiner import PillarRefiner, RefineInputs, Refinements, zero_of_weights
-from asca_pillars.models.two_stage.preparation import LabeledProposals, RefinePreparation, live_preparation
-from asca_pillars.models.two_stage.roi_head import RoiHead
-from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
-from asca_pillars.ops.two_stage.decode import reported_frames
-from asca_pillars.ops.two_stage.prepare import ROI_FEATURES
+from asca_pillars.models.two_stage.preparation import (
+    LabeledProposals,
+    RefinePreparation,
+    collate_scans,
+    live_preparation,
+)
+from asca_pillars.models.two_stage.sets import SetAbstraction
+from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores, reported_frames
+from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.prepare import ROI_FEATURES, RefineSettings, refine_scan
 
 POINT_CHANNELS = 1  # reflectance
 
@@ -59,7 +74,7 @@ class RefineDetector(Trainable):
         inputs = batch.inputs
         rows = min(len(inputs.points), len(inputs.keypoints), len(inputs.roi_features))
         if self.training and rows < 2:  # no statistics of a batch, and nothing to learn
-            return RefineOutputs(self._silence(inputs), batch.proposals)
+            return RefineOutputs(self._zero_outputs(inputs), batch.proposals)
         with torch.autocast(inputs.points.device.type, enabled=False):  # positions need float32, `SetAbstraction`
             found: Refinements = self.refiner(inputs)
         return RefineOutputs(found, batch.proposals)
@@ -82,7 +97,7 @@ class RefineDetector(Trainable):
         confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
         return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.refine.scores)
 
-    def _silence(self, inputs: RefineInputs) -> Refinements:
+    def _zero_outputs(self, inputs: RefineInputs) -> Refinements:
         """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
         nothing = zero_of_weights(self)
         rois, keypoints = len(inputs.roi_features), len(inputs.keypoints)
@@ -122,3 +137,35 @@ def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> Pill
             dropout=network.dropout,
         ),
     )
+
+
+def refine(
+    network: PillarRefiner,
+    points: NDArray[np.float32],
+    proposed: Proposed,
+    settings: RefineSettings,
+    post: PostProcess,
+    scores: Scores,
+) -> Detections:
+    """Refine the proposals of one scan (N, 4); a scan without any has no detections.
+
+    Args:
+        network: in evaluation mode, on the CPU.
+        post: suppression among the refined boxes.
+        scores: of the refined boxes.
+    """
+    confidence, residuals = refine_logits(network, points, proposed, settings)
+    values = refined_scores(proposed.proposals, confidence, scores)
+    return refined_detections(proposed.proposals, values, residuals, post)
+
+
+def refine_logits(
+    network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Confidence logits (R,) and residuals (R, 7) of the proposals of one scan, see `refine`."""
+    if not len(proposed.proposals):
+        return np.empty(0, np.float32), np.empty((0, 7), np.float32)
+    inputs = collate_scans([refine_scan(points, proposed, proposed.proposals, settings)])
+    with torch.inference_mode():
+        found = network(inputs)
+    return found.confidence.numpy(), found.residuals.numpy()

@@ -1,4 +1,4 @@
-"""What a sparse neck reads: the active cells of its three levels, and a table for each of its convolutions.
+"""What a sparse neck reads: the active cells of its three levels, and a rulebook for each of its convolutions.
 
 The neck is that of Table 1 (three blocks that halve the map, three upsamplings to the head's resolution), computed at
 active cells alone. Which cells are active is a rule:
@@ -25,12 +25,12 @@ MaskRule = Literal["sub", "fine"]
 LEVELS = 3
 STRIDED = map_convolution(3, stride=2, padding=1)
 SAME = map_convolution(3, padding=1)
-_NO_TABLE = np.empty((0, SAME.taps), np.int32)
+_NO_RULEBOOK = np.empty((0, SAME.taps), np.int32)
 
 Array = TypeVar("Array")
 
 
-class LevelTables(NamedTuple, Generic[Array]):
+class LevelRulebooks(NamedTuple, Generic[Array]):
     """One block of the neck; M cells after its strided convolution, N after its first stride-1 convolution."""
 
     strided: Array
@@ -51,10 +51,10 @@ class LevelTables(NamedTuple, Generic[Array]):
     """(head cells,) rows of the upsampling's outputs, see `CellMap.places`."""
 
 
-class NeckTables(NamedTuple, Generic[Array]):
+class NeckRulebooks(NamedTuple, Generic[Array]):
     """Of one scan (NumPy), or of a batch (tensors), whose rows follow one another frame by frame."""
 
-    levels: tuple[LevelTables[Array], ...]
+    levels: tuple[LevelRulebooks[Array], ...]
     """From the finest to the coarsest."""
     head_cells: Array
     """(H,) flat index of the active cells on the head's map, of a batch counted through the maps of its frames."""
@@ -64,13 +64,13 @@ class NeckTables(NamedTuple, Generic[Array]):
     """(rows, columns) of one frame's head map."""
 
 
-class NeckTableBuilder:
-    """Builds the tables of scan after scan, in memory of its own: for one thread at a time.
+class NeckRulebookBuilder:
+    """Builds the rulebooks of scan after scan, in memory of its own: for one thread at a time.
 
     Args:
         ny, nx: pillars of the map, multiples of 8.
         rule: which cells are active.
-        training: also the tables that the backward pass reads.
+        training: also the rulebooks that the backward pass reads.
     """
 
     def __init__(self, ny: int, nx: int, rule: MaskRule, *, training: bool = False) -> None:
@@ -83,51 +83,57 @@ class NeckTableBuilder:
             self._outputs[0] = CellMap(shapes[1])
         self._head = CellMap(shapes[1])
         before = [self._pillars, *self._outputs[:-1]]
-        self._halvings = [join(STRIDED, *maps) for maps in zip(before, self._strided, strict=True)]
-        self._growths = [join(SAME, *maps) for maps in zip(self._strided, self._outputs, strict=True)]
-        self._stays = [join(SAME, level, level) for level in self._outputs]
+        self._strided_maps = [join(STRIDED, *maps) for maps in zip(before, self._strided, strict=True)]
+        self._dilated_maps = [join(SAME, *maps) for maps in zip(self._strided, self._outputs, strict=True)]
+        self._submanifold_maps = [join(SAME, level, level) for level in self._outputs]
         strides = [map_convolution(1 << level, stride=1 << level) for level in range(LEVELS)]
-        self._children = [join(stride, self._head, level) for stride, level in zip(strides, self._outputs, strict=True)]
+        self._upsampling_maps = [
+            join(stride, self._head, level) for stride, level in zip(strides, self._outputs, strict=True)
+        ]
 
-    def build(self, cells: NDArray[np.int64]) -> NeckTables[NDArray[np.int32]]:
-        """Tables of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
+    def build(self, cells: NDArray[np.int64]) -> NeckRulebooks[NDArray[np.int32]]:
+        """Rulebooks of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
         self._activate(cells)
         levels = []
         for number in range(LEVELS):
-            halving, growth, stay = self._halvings[number], self._growths[number], self._stays[number]
-            strided, output = growth.source, growth.target
-            same = stay.table()
+            strided_map, dilated_map, submanifold_map = (
+                self._strided_maps[number],
+                self._dilated_maps[number],
+                self._submanifold_maps[number],
+            )
+            strided, output = dilated_map.source, dilated_map.target
+            same = submanifold_map.table()
             levels.append(
-                LevelTables(
-                    strided=halving.table(),
-                    first=same if strided is output else growth.table(),
+                LevelRulebooks(
+                    strided=strided_map.table(),
+                    first=same if strided is output else dilated_map.table(),
                     same=same,
-                    strided_back=halving.inverse() if self.training else _NO_TABLE,
-                    first_back=growth.inverse() if self.training else _NO_TABLE,
+                    strided_back=strided_map.inverse() if self.training else _NO_RULEBOOK,
+                    first_back=dilated_map.inverse() if self.training else _NO_RULEBOOK,
                     strided_cells=strided.cells.astype(np.int32),
                     cells=output.cells.astype(np.int32),
                     places=self._head.places(output, number),
                 )
             )
-        return NeckTables(tuple(levels), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
+        return NeckRulebooks(tuple(levels), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
 
     def _activate(self, cells: NDArray[np.int64]) -> None:
         """Find the active cells of every map, as the rule says."""
         self._pillars.activate(cells)
         before = self._pillars
-        for halving, level in zip(self._halvings, self._strided, strict=True):
-            level.activate_joined([(before, halving.outputs)])  # the coarser levels do not see the growth
+        for strided_map, level in zip(self._strided_maps, self._strided, strict=True):
+            level.activate_joined([(before, strided_map.outputs)])  # the coarser levels do not see the growth
             before = level
         if self.rule == "fine":
-            growth = self._growths[0]
-            growth.target.activate_joined([(growth.source, growth.outputs)])
-        self._head.activate_joined([(children.target, children.inputs) for children in self._children])
+            dilated_map = self._dilated_maps[0]
+            dilated_map.target.activate_joined([(dilated_map.source, dilated_map.outputs)])
+        self._head.activate_joined([(upsampling.target, upsampling.inputs) for upsampling in self._upsampling_maps])
 
 
-def stack_neck_tables(
-    frames: Sequence[NeckTables[NDArray[np.int32]]], pillars: Sequence[int]
-) -> NeckTables[NDArray[np.int32]]:
-    """Tables of a batch from those of its frames.
+def stack_neck_rulebooks(
+    frames: Sequence[NeckRulebooks[NDArray[np.int32]]], pillars: Sequence[int]
+) -> NeckRulebooks[NDArray[np.int32]]:
+    """Rulebooks of a batch from those of its frames.
 
     Args:
         frames: at least one, all of one map; indices (M, 9) or (M,).
@@ -140,7 +146,7 @@ def stack_neck_tables(
         strided = [len(part.strided_cells) for part in parts]
         outputs = [len(part.cells) for part in parts]
         levels.append(
-            LevelTables(
+            LevelRulebooks(
                 strided=stack_rows([part.strided for part in parts], before),
                 first=stack_rows([part.first for part in parts], strided),
                 same=stack_rows([part.same for part in parts], outputs),
@@ -152,7 +158,7 @@ def stack_neck_tables(
             )
         )
         before = outputs
-    return NeckTables(
+    return NeckRulebooks(
         tuple(levels),
         stack_cells([frame.head_cells for frame in frames], map_cells),
         tuple(len(frame.head_cells) for frame in frames),
@@ -160,7 +166,7 @@ def stack_neck_tables(
     )
 
 
-def table_inputs(tables: NeckTables[Array]) -> dict[str, Array]:
+def rulebook_inputs(tables: NeckRulebooks[Array]) -> dict[str, Array]:
     """What a graph of the neck can ask for, by the names of its inputs; it takes what its layers read."""
     return {
         f"{kind}_{number}": getattr(level, kind)

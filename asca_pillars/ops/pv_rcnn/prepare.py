@@ -14,9 +14,10 @@ from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.detection.proposals import AnchorProposals
 from asca_pillars.ops.points.neighbors import PointScale, ball_query, point_scales, three_nearest
 from asca_pillars.ops.points.sampling import bilinear_cells, farthest_points
-from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, VoxelTableBuilder
+from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, VoxelRulebookBuilder
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import voxelize
+from asca_pillars.ops.two_stage.prepare import GridSettings
 
 Deform = Literal["none", "paper", "authors", "authors_frozen"]
 Source = Literal["points", "conv1", "conv2", "conv3", "conv4"]
@@ -53,7 +54,7 @@ class SourceBalls(Strict):
 
 
 @dataclass(frozen=True)
-class VoxelSetSettings(Strict):
+class VoxelSetSettings(GridSettings):
     """Keypoints, proposals and neighbors of PV-RCNN; the defaults are the published ones on KITTI.
 
     Attributes:
@@ -66,9 +67,6 @@ class VoxelSetSettings(Strict):
             surroundings, one for each level (Deformable PV-RCNN). `authors`: one for each level and radius, as in that
             paper's code. `authors_frozen`: likewise, learning nothing through the place, as that code does.
         proposals: which of the first stage's boxes are refined.
-        grid_size: grid points along each axis of a proposal.
-        grid_radii_m: around grid points, in which keypoints are aggregated.
-        grid_samples: of each of these balls at most.
         vector_cells: 0, or along each axis of a cube around a grid point, with `grid_radii_m` as half its length:
             VectorPool interpolates the keypoints nearest to each cell instead of aggregating balls (AV PV-RCNN).
     """
@@ -86,8 +84,6 @@ class VoxelSetSettings(Strict):
     deform: Deform = "none"
     proposals: AnchorProposals = field(default_factory=AnchorProposals)
     grid_size: int = 6
-    grid_radii_m: tuple[float, ...] = (0.8, 1.6)
-    grid_samples: int = 16
     vector_cells: int = 0
 
     def __post_init__(self) -> None:
@@ -155,7 +151,7 @@ class VoxelScan(NamedTuple):
 
 
 def voxel_scan(
-    points: NDArray[np.float32], spec: VoxelSpec, settings: VoxelSetSettings, builder: VoxelTableBuilder
+    points: NDArray[np.float32], spec: VoxelSpec, settings: VoxelSetSettings, builder: VoxelRulebookBuilder
 ) -> VoxelScan:
     """Voxels, tables, keypoints and their neighbors of the finite points (N, 4) of one scan.
 
@@ -177,7 +173,7 @@ class VoxelizedScan(NamedTuple):
     counts: ScanCounts
 
 
-def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelTableBuilder) -> VoxelizedScan:
+def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelRulebookBuilder) -> VoxelizedScan:
     """Voxels and tables of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
     voxels = voxelize(points, spec.grid, builder.maps[0])
     counts = ScanCounts(len(points), voxels.points_outside, 0)

@@ -1,4 +1,4 @@
-"""Tables of a backbone over voxels: strided convolutions join its levels (SECOND, PV-RCNN)."""
+"""Rulebooks of a backbone over voxels: strided convolutions join its levels (SECOND, PV-RCNN)."""
 
 import math
 from collections.abc import Sequence
@@ -36,14 +36,14 @@ class VoxelLevel(NamedTuple, Generic[Array]):
     """(rows of the level before, K) the inverse of `strided`, for training; empty without."""
 
 
-class VoxelTableBuilder:
-    """Builds the tables of scan after scan, in memory of its own: for one thread at a time.
+class VoxelRulebookBuilder:
+    """Builds the rulebooks of scan after scan, in memory of its own: for one thread at a time.
 
     Args:
         shape: of the first level's lattice, cells along z, y, x.
         strided: convolutions from each level to the next.
         submanifold: whether each level has submanifold convolutions, the first one included.
-        training: also the tables that the backward pass reads.
+        training: also the rulebooks that the backward pass reads.
 
     Raises:
         ConfigError: a lattice that is too tall or too large, see `CellMap`.
@@ -64,13 +64,13 @@ class VoxelTableBuilder:
         """One for each level; the first is filled by whoever finds the voxels."""
         for convolution in strided:
             self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
-        self._strides = [join(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)]
-        self._stays = [join(SUBMANIFOLD, level, level) for level in self.maps]
+        self._strided_maps = [join(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)]
+        self._submanifold_maps = [join(SUBMANIFOLD, level, level) for level in self.maps]
 
     def build(self) -> list[VoxelLevel[NDArray[Any]]]:
-        """Tables for the active cells of `maps[0]`, level by level."""
+        """Rulebooks for the active cells of `maps[0]`, level by level."""
         levels = [self._level(0)]
-        for number, stride in enumerate(self._strides, start=1):
+        for number, stride in enumerate(self._strided_maps, start=1):
             stride.target.activate_joined([(stride.source, stride.outputs)])
             strided = stride.table()
             back = stride.inverse() if self.training else _none(strided.shape[1])
@@ -78,7 +78,7 @@ class VoxelTableBuilder:
         return levels
 
     def _level(self, number: int) -> VoxelLevel[NDArray[Any]]:
-        same = self._stays[number].table() if self.submanifold[number] else _none(SUBMANIFOLD.taps)
+        same = self._submanifold_maps[number].table() if self.submanifold[number] else _none(SUBMANIFOLD.taps)
         return VoxelLevel(self.maps[number].cells, same, _none(0), _none(0))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, VoxelTableBuilder
+from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, VoxelRulebookBuilder
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
 from asca_pillars.ops.sparse.rulebooks import Convolution, Shape
 
@@ -113,6 +113,6 @@ class VoxelSpec(DetectorSpec):
         half = [self.grid.size_m[axis] * self.map_stride / 2 for axis in range(2)]
         return x + half[0], y + half[1]
 
-    def table_builder(self, *, training: bool = False) -> VoxelTableBuilder:
+    def rulebook_builder(self, *, training: bool = False) -> VoxelRulebookBuilder:
         """Of this detector's levels; for one thread at a time."""
-        return VoxelTableBuilder(self.grid.shape, self.strided, training=training)
+        return VoxelRulebookBuilder(self.grid.shape, self.strided, training=training)

@@ -3,7 +3,7 @@
 import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,27 @@ ROI_FEATURES = 4
 
 
 @dataclass(frozen=True)
-class RefineSettings(Strict):
+class GridSettings(Strict):
+    """RoI-grid pooling (PV-RCNN, section 3.3).
+
+    Attributes:
+        grid_size: grid points along each axis of a proposal.
+        grid_radii_m: around grid points, in which keypoints are aggregated.
+        grid_samples: of each of these balls at most.
+    """
+
+    grid_size: int = 4
+    grid_radii_m: tuple[float, ...] = (0.8, 1.6)
+    grid_samples: int = 16
+
+
+@dataclass(frozen=True)
+class RefineSettings(GridSettings):
     """Balls and grids of the second stage."""
 
     ball_radii_m: tuple[float, ...] = (0.4, 0.8)
     """Around keypoints, in which raw points are aggregated."""
     ball_samples: int = 16
-    grid_size: int = 4
-    """Grid points along each axis of a proposal."""
-    grid_radii_m: tuple[float, ...] = (0.8, 1.6)
-    """Around grid points, in which keypoints are aggregated."""
-    grid_samples: int = 16
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -39,22 +49,6 @@ class RefineSettings(Strict):
             values = value if isinstance(value, tuple) else (value,)
             if not values or not all(0 < each < math.inf for each in values):
                 raise ConfigError(f"{field.name} {value} of the second stage must be positive and finite")
-
-
-class GridSettings(Protocol):
-    """The part of a second stage's settings that RoI-grid pooling reads, see `RefineSettings`."""
-
-    @property
-    def grid_size(self) -> int:
-        """Grid points along each axis of a proposal."""
-
-    @property
-    def grid_radii_m(self) -> tuple[float, ...]:
-        """Around grid points."""
-
-    @property
-    def grid_samples(self) -> int:
-        """Keypoints of each ball."""
 
 
 class GridNeighbors(NamedTuple):
@@ -69,7 +63,7 @@ class GridNeighbors(NamedTuple):
 
 @dataclass(frozen=True)
 class RefineScan:
-    """One scan as the second stage takes it; `models.two_stage.pillar_refiner.RefineInputs` says what each array is."""
+    """One scan as the second stage takes it; `models.two_stage.layers.RefineInputs` says what each array is."""
 
     points: NDArray[np.float32]
     keypoints: NDArray[np.float32]

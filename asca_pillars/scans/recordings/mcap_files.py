@@ -25,7 +25,7 @@ from asca_pillars.scans.recordings.recording import (
     reason,
 )
 
-_ENCODINGS: dict[str, Encoding] = {"cdr": "cdr", "ros1": "ros1"}
+_ENCODINGS: dict[str, Encoding] = {"cdr": "cdr", "ros1": "ros1", "json": "json", "protobuf": "protobuf"}
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 3, 4, 5, 6  # opcodes
 _FIRST_PRIVATE = 0x80  # opcode
 _RECORD, _MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
@@ -106,8 +106,9 @@ class McapRecording(Recording):
                 for stored in self._indexed(stream, topic) if self._chunks else self._scanned(stream, topic):
                     encoding = _ENCODINGS.get(name := self._known.channels[stored.channel_id].message_encoding)
                     if encoding is None:
+                        known = ", ".join(_ENCODINGS)
                         raise ScanError(
-                            f"{self.path}: {topic} is encoded as {name[:40] or 'nothing'}; cdr and ros1 are read"
+                            f"{self.path}: {topic} is encoded as {name[:40] or 'nothing'}; {known} are read"
                         )
                     count += 1
                     yield Message(stored.log_time if stored.log_time <= LAST_NS else None, stored.data, encoding)

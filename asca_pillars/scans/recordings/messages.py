@@ -16,9 +16,19 @@ def decoded(message: Message, kind: str) -> Any:
     store = _typestore(message.encoding)
     if message.encoding == "ros1":
         return store.deserialize_ros1(message.data, kind)
-    # No CDR begins so. rosbag2 says in its metadata.yaml alone that it compressed the messages.
-    is_compressed = message.data.startswith(ZSTD_MAGIC)
-    return store.deserialize_cdr(decompress_zstd(message.data) if is_compressed else message.data, kind)
+    if message.encoding != "cdr":
+        raise ValueError(f"encoded as {message.encoding}; cdr and ros1 are read")
+    return store.deserialize_cdr(uncompressed(message), kind)
+
+
+def uncompressed(message: Message) -> bytes:
+    """The bytes of a message; rosbag2 says in its metadata.yaml alone that it compressed them.
+
+    Raises:
+        Exception: they are damaged.
+    """
+    # No CDR begins so.
+    return decompress_zstd(message.data) if message.data.startswith(ZSTD_MAGIC) else message.data
 
 
 def time_of(header: Any, message: Message) -> int | None:

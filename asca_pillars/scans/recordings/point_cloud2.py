@@ -6,7 +6,9 @@ import numpy as np
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.messages import decoded, time_of
+from asca_pillars.scans.recordings.other_clouds import foxglove_cloud, livox_cloud, point_cloud, posed
 from asca_pillars.scans.recordings.recording import Message, reason
+from asca_pillars.scans.recordings.scan_types import ScanKind
 from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, wanted_fields
 
 # sensor_msgs/PointField: datatype 1 to 8.
@@ -22,12 +24,13 @@ class PointCloud(NamedTuple):
     frame_id: str
 
 
-def read_point_cloud(message: Message, source: str) -> PointCloud:
+def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud2") -> PointCloud:
     """The points of a stored message.
 
     Args:
-        message: of a topic of this type.
+        message: of a topic of scans.
         source: names it in errors.
+        kind: of its type.
 
     Raises:
         ScanError: the message is damaged or contradicts itself, or has no x, y and z.
@@ -35,17 +38,41 @@ def read_point_cloud(message: Message, source: str) -> PointCloud:
     if not message.data:
         raise ScanError(f"{source}: the message has no data; record it again")
     try:
-        cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
+        header, points = _read(message, source, kind)
+    except ScanError:
+        raise
     except Exception as error:  # the library lets struct's and NumPy's errors pass
-        raise ScanError(f"{source}: no readable PointCloud2 ({reason(error)}); record it again") from None
-    points, time_ns = _points(cloud, source), time_of(cloud.header, message)
+        name = kind if kind.startswith("Point") else f"point cloud of {kind}"
+        raise ScanError(f"{source}: no readable {name} ({reason(error)}); record it again") from None
+    time_ns = time_of(header, message)
     if time_ns is None:
         said = "neither the header nor the recording has a usable time stamp, it was taken as 0"
         points, time_ns = points._replace(remarks=(*points.remarks, said)), 0
-    return PointCloud(points, time_ns, str(cloud.header.frame_id))
+    return PointCloud(points, time_ns, str(header.frame_id))
 
 
-def _points(cloud: Any, source: str) -> StoredPoints:
+def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoints]:
+    if kind == "PointCloud":
+        return point_cloud(message)
+    if kind == "Livox":
+        return livox_cloud(message)
+    if kind == "Foxglove":
+        cloud = foxglove_cloud(message)
+        return cloud.header, posed(point_cloud_points(cloud, source), cloud.pose)
+    cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
+    return cloud.header, point_cloud_points(cloud, source)
+
+
+def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
+    """The points of a PointCloud2 that was decoded by rosbags or came from ROS.
+
+    Args:
+        cloud: an object with the fields of that message.
+        source: names it in errors.
+
+    Raises:
+        ScanError: the message contradicts itself, or has no x, y and z.
+    """
     height, width, step, row_step = int(cloud.height), int(cloud.width), int(cloud.point_step), int(cloud.row_step)
     count, data = height * width, np.asarray(cloud.data, np.uint8)
     if count > MAX_POINTS:

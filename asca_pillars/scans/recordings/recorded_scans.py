@@ -7,6 +7,7 @@ from typing import NamedTuple
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Recording, Topic
+from asca_pillars.scans.recordings.scan_types import kind_of_scans
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, finite_scan
 from asca_pillars.scans.stored_scans import FolderScale, common_reflectance_scale, has_finite_point
 
@@ -40,6 +41,7 @@ class RecordedScans:
 
     def __init__(self, recording: Recording, topic: Topic, reflectance_scale: ReflectanceScale) -> None:
         self.recording, self.topic = recording, topic
+        self._kind = kind_of_scans(topic.type) or "PointCloud2"  # of an unknown type
         if reflectance_scale == "auto":
             self.scale = common_reflectance_scale([cloud.points for cloud in self._first(16)])
         else:
@@ -61,7 +63,7 @@ class RecordedScans:
                 )
                 return
             try:
-                cloud = read_point_cloud(message, self._place(number))
+                cloud = read_point_cloud(message, self._place(number), self._kind)
                 unreadable = 0
             except ScanError as error:
                 unreadable += 1
@@ -75,7 +77,7 @@ class RecordedScans:
     def _clouds_with_points(self) -> Iterator[PointCloud]:
         for number, message in enumerate(islice(self.recording.messages(self.topic.name), SEARCHED_MESSAGES)):
             try:
-                cloud = read_point_cloud(message, self._place(number))
+                cloud = read_point_cloud(message, self._place(number), self._kind)
             except ScanError:
                 continue  # named when its turn comes
             if has_finite_point(cloud.points):

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.scan_types import conversion_of
+from asca_pillars.scans.recordings.scan_types import conversion_of, kind_of_scans
 
-Encoding = Literal["cdr", "ros1"]
-"""How a message's fields are written: ROS 2's CDR or ROS 1's own."""
+Encoding = Literal["cdr", "ros1", "json", "protobuf"]
+"""How a message's fields are written: ROS 2's CDR, ROS 1's own, or one of those of Foxglove's types."""
 
 
 UNKNOWN_TYPE = "unknown"
@@ -28,8 +28,8 @@ class Topic(NamedTuple):
 
     @property
     def is_point_cloud(self) -> bool:
-        """Whether it holds scans: `sensor_msgs/msg/PointCloud2`, or as ROS 1 writes it."""
-        return self.type in ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
+        """Whether it holds scans of a type that is read."""
+        return kind_of_scans(self.type) is not None
 
 
 class Message(NamedTuple):

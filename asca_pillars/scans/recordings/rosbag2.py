@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from asca_pillars.base.yaml_text import MAX_CHARACTERS, parse_yaml
+from asca_pillars.base.settings import MAX_CHARACTERS, parse_yaml
 from asca_pillars.scans.recordings.recording import Message, Recording, merged
 
 METADATA_FILE = "metadata.yaml"

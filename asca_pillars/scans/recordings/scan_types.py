@@ -1,21 +1,30 @@
-"""Types of messages that hold a sensor's scans and are not PointCloud2, and how to convert recordings of them."""
+"""Types of messages that hold a sensor's scans: those that are read, and how to convert recordings of the others."""
 
 import re
+from typing import Literal
 
 _REPLAY = "play the recording through the sensor's driver and record the PointCloud2 that it publishes"
 _CONVERSIONS = (
     # None: no scans of a lidar in 3D.
     (r"sensor_msgs/(msg/)?(Multi\w*)?LaserScan|radar_\w*/.*", None),
-    (
-        r"livox_\w+/(msg/)?CustomMsg",
-        "record with the driver's xfer_format 0, which is PointCloud2, or convert it (livox_to_pointcloud2)",
-    ),
     (r"velodyne_msgs/(msg/)?VelodyneScan", f"{_REPLAY} (velodyne_pointcloud, topic /velodyne_points)"),
     (r"ouster_\w+/(msg/)?PacketMsg", f"{_REPLAY} (replay.launch of ouster_ros, topic /ouster/points)"),
-    (r"sensor_msgs/(msg/)?PointCloud", "convert it to PointCloud2 (ROS' package point_cloud_converter)"),
-    (r"foxglove(\.|_msgs/(msg/)?)PointCloud", "record the PointCloud2 that it was made of"),
+    (r"foxglove_msgs/(msg/)?PointCloud", "record the PointCloud2 that it was made of"),
     (r".*(Scans?|Packets?|PacketMsg|UdpFrame|PointCloud\d?|CustomMsg)", _REPLAY),
 )
+
+ScanKind = Literal["PointCloud2", "PointCloud", "Livox", "Foxglove"]
+_READ: tuple[tuple[str, ScanKind], ...] = (
+    (r"sensor_msgs/(msg/)?PointCloud2", "PointCloud2"),
+    (r"sensor_msgs/(msg/)?PointCloud", "PointCloud"),
+    (r"livox_\w+/(msg/)?CustomMsg", "Livox"),
+    (r"foxglove\.PointCloud", "Foxglove"),
+)
+
+
+def kind_of_scans(type_name: str) -> ScanKind | None:
+    """Which kind of scans messages of a type hold; None if they are not read as scans."""
+    return next((kind for pattern, kind in _READ if re.fullmatch(pattern, type_name)), None)
 
 
 def conversion_of(type_name: str) -> str | None:

@@ -20,6 +20,7 @@ import yaml
 
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import require_own_file, starting_with
+from asca_pillars.base.progress import Progress
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.boxes.box_split import DATASET_FILE
 from asca_pillars.data.kitti import in_image, write_image_set
@@ -121,7 +122,7 @@ def simulate_sequences(
     config: SimulationConfig | None = None,
     *,
     val_share: float = 0.1,
-    progress: bool = True,
+    progress: bool | Progress = True,
 ) -> Path:
     """Write `sequences` sequences of `length` scans each, at 10 Hz, below `out`; returns `out`.
 

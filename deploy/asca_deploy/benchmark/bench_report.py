@@ -56,6 +56,11 @@ class BenchmarkReport:
     bundle: str
     graphs_sha256: dict[str, str]
     input_sha256: str
+    made_by: dict[str, str]
+    """The model, its weights' digest and the version, `Detector.made_by`."""
+    deadline_ms: float | None = None
+    late_share: float | None = None
+    """Share of the measured frames that took longer than the deadline."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -68,12 +73,15 @@ def benchmark(
     rounds: int = 30,
     warmup: int = 3,
     track: Track = silently,
+    *,
+    deadline_ms: float | None = None,
 ) -> BenchmarkReport:
     """Time `rounds` passes over `scans` after `warmup` passes that are not counted.
 
     Args:
         detector: a fresh one, so that its first scan shows the cold start.
         scans: (N, 4) each, LiDAR frame, as for the detector.
+        deadline_ms: count the frames that take longer.
 
     Raises:
         ValueError: there is no scan or no round.
@@ -113,6 +121,9 @@ def benchmark(
         bundle=detector.bundle.name,
         graphs_sha256={name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         input_sha256=_sha256(scans),
+        made_by=detector.made_by,
+        deadline_ms=deadline_ms,
+        late_share=None if deadline_ms is None else float(np.mean([f.total_ms > deadline_ms for f in frames])),
     )
 
 

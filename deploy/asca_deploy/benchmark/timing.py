@@ -26,12 +26,14 @@ class Percentiles:
 
     p50: float
     p95: float
+    p99: float
+    max: float
     min: float
 
     @classmethod
     def of(cls, times_ms: list[float] | NDArray[np.float64]) -> "Percentiles":
         """Of times (F,), or (R, F) of R rounds, in ms, over all of them."""
-        return cls(*(float(np.percentile(times_ms, q)) for q in (50, 95, 0)))
+        return cls(*(float(np.percentile(times_ms, q)) for q in (50, 95, 99, 100, 0)))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps, decode
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.pillar.grid import PillarGrid, pool_pillars
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTableBuilder, NeckTables, table_inputs
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebookBuilder, NeckRulebooks, rulebook_inputs
 from asca_pillars.ops.pillar.prepare import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.two_stage.first_stage import FirstPass
@@ -213,7 +213,7 @@ class PlacedPillars(NamedTuple):
 
     features: NDArray[Any]
     """(P, C), of a pooled map (cells, C)"""
-    tables: NeckTables[NDArray[np.int32]]
+    tables: NeckRulebooks[NDArray[np.int32]]
 
 
 class TableBackbone:
@@ -256,13 +256,13 @@ class TableBackbone:
     def _rows(self, placed: PlacedPillars, names: Sequence[str]) -> list[NDArray[np.float32]]:
         if not len(placed.tables.head_cells):
             return [np.empty((0, self._channels[name]), np.float32) for name in names]
-        given = {PILLAR_FEATURES: placed.features, **table_inputs(placed.tables)}
+        given = {PILLAR_FEATURES: placed.features, **rulebook_inputs(placed.tables)}
         return run_graph(self._session, names, given)
 
-    def _new_builder(self) -> NeckTableBuilder:
+    def _new_builder(self) -> NeckRulebookBuilder:
         rule = self._bundle.pillar.active_cells
         assert rule is not None
-        return NeckTableBuilder(*self._bundle.spec.grid.map_shape, rule)
+        return NeckRulebookBuilder(*self._bundle.spec.grid.map_shape, rule)
 
 
 def run_graph(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:

@@ -120,7 +120,7 @@ class PvRcnnPipeline:
         self._deform = opened(DEFORM, deform_interface(bundle)) if self.settings.deformed else None
         self._map_channels, self._map_type = map_channels(bundle), map_type(bundle)
         self._canvases = [self._new_canvas()]
-        self._builders = [self.spec.table_builder()]
+        self._builders = [self.spec.rulebook_builder()]
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedVoxels:
         """Points (N, 4), metres, LiDAR frame, and reflectance -> the map seen from above."""
@@ -167,7 +167,7 @@ class PvRcnnPipeline:
         laps.append(("keypoints", perf_counter()))
         balls = balls_around(raw.scan, self.settings, places)
         laps.append(("neighbors", perf_counter()))
-        features = self.describe(raw.scan, raw.levels, raw.bev, places, balls)
+        features = self.encode_keypoints(raw.scan, raw.levels, raw.bev, places, balls)
         laps.append(("keypoints", perf_counter()))
         grid = grid_neighbors(raw.scan.keypoints, proposals.boxes, self.settings, self.settings.vector_cells)
         laps.append(("neighbors", perf_counter()))
@@ -177,7 +177,7 @@ class PvRcnnPipeline:
 
     def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
         """Points (N, 4), metres, LiDAR frame, and reflectance -> what voxels.onnx reads."""
-        builder = take_free(self._builders, self.spec.table_builder)
+        builder = take_free(self._builders, self.spec.rulebook_builder)
         voxelized = voxel_levels(points, self.spec, builder)
         self._builders.append(builder)
         return voxelized
@@ -201,7 +201,7 @@ class PvRcnnPipeline:
         names = list(self._deform.outputs)
         return dict(zip(names, run_graph(self._deform, names, deform_inputs(scan, self.settings, levels)), strict=True))
 
-    def describe(
+    def encode_keypoints(
         self,
         scan: VoxelScan,
         levels: Mapping[str, NDArray[np.float32]],

@@ -14,8 +14,7 @@ from asca_export.int8 import calibration_scans, quantize_bundle
 from asca_export.parity import prove_parity
 from asca_export.pillar.masked_forms import MarkedEncoder, MaskedBackbone
 from asca_export.proven_bundle import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_proven
-from asca_export.sparse_forms import SparseBackbone
-from asca_export.sparse_graphs import export_sparse_backbone, sparse_multiply_accumulates
+from asca_export.sparse_forms import SparseBackbone, export_sparse_backbone, sparse_multiply_accumulates
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads

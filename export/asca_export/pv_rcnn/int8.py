@@ -26,7 +26,7 @@ from asca_export.int8 import Points, calibration_scans, logit_error, sweep, writ
 from asca_export.pv_rcnn.voxel_forms import RoundedVoxels, VoxelSample
 from asca_export.quantize import STEPS
 from asca_export.rounded_backbones import RoundedMaps
-from asca_export.two_stage.neck_output import scale_bev
+from asca_export.two_stage.first_stage import scale_bev
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.models.pv_rcnn.layers import PvRcnn

@@ -13,8 +13,8 @@ from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.parity import require_close, require_compared, require_same_refined
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.proposals import propose_anchors
-from asca_pillars.models.pv_rcnn.batch import VoxelBatch, batch_scans
 from asca_pillars.models.pv_rcnn.layers import PvRcnn
+from asca_pillars.models.pv_rcnn.preparation import VoxelBatch, batch_scans
 from asca_pillars.ops.points.sampling import read_map
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, voxel_scan
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
@@ -38,7 +38,7 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
         ExportError: they differ; names the first stage that does, and the scan.
     """
     worst = worst_box = worst_yaw = 0.0
-    spec, builder, compared = network.spec, network.spec.table_builder(), 0
+    spec, builder, compared = network.spec, network.spec.rulebook_builder(), 0
     for number, points in enumerate(scans):
         scan = voxel_scan(points[np.isfinite(points).all(axis=1)], spec, network.settings, builder)
         if not len(scan.features):
@@ -47,7 +47,7 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
         batch = batch_scans([scan], spec)
         with torch.inference_mode():
             first = network.propose(batch)
-            described, _ = network.describe(batch, first.levels, first.canvas)
+            described, _ = network.encode_keypoints(batch, first.levels, first.canvas)
         levels = dict(zip((*LEVEL_SOURCES, OUT), (level.numpy() for level in first.levels), strict=True))
         for name, found in runtime.encode(scan).items():
             worst = max(worst, _require(f"voxels `{name}`", levels[name], found, number))
@@ -63,7 +63,7 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
         for name, found in runtime.deform(scan, levels).items():
             worst = max(worst, _require(f"deform `{name}`", places[name], found, number))
         # PyTorch's places for both sides: the last bit of one decides which voxels lie in its ball.
-        found = runtime.describe(scan, levels, bev, places, balls_around(scan, network.settings, places))
+        found = runtime.encode_keypoints(scan, levels, bev, places, balls_around(scan, network.settings, places))
         worst = max(worst, _require("keypoints", features, found, number))
         proposals = propose_anchors(maps, spec, network.settings.proposals)
         grid = grid_neighbors(scan.keypoints, proposals.boxes, network.settings, network.settings.vector_cells)

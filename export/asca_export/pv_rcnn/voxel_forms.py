@@ -19,7 +19,7 @@ from asca_export.quantize import STEPS, TINY
 from asca_export.row_graphs import RowGraph
 from asca_export.sparse_forms import linear, scale_and_shift
 from asca_export.sparse_quantize import count_steps, highest_outputs, mixed_products, read_moments, round_products
-from asca_pillars.models.pv_rcnn.voxel_backbone import TableLayer, VoxelBackbone
+from asca_pillars.models.pv_rcnn.layers import SparseConvBlock, VoxelBackbone
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
 
 _PLACES = 1000  # of each scan and layer, whose inputs weights are rounded for; 27 taps make a product of them dear
@@ -59,7 +59,7 @@ class VoxelProducts(nn.Module):
             if number < len(backbone.same):
                 convolutions += [(f"same_{number}", layer) for layer in backbone.same[number].children()]
             for index, (table, layer) in enumerate(convolutions):
-                assert isinstance(layer, TableLayer)
+                assert isinstance(layer, SparseConvBlock)
                 self.layers.append(VoxelProduct(f"{level}_{index}", table, level))
                 self.products[self.layers[-1].name] = _folded(layer)
 
@@ -169,7 +169,7 @@ def export_voxels(
     graph.save(path, "voxels")
 
 
-def _folded(layer: TableLayer) -> nn.Linear:
+def _folded(layer: SparseConvBlock) -> nn.Linear:
     weight, (scale, shift) = layer.convolution.weight.detach(), scale_and_shift(layer.norm)
     matrix = (weight * scale.detach()[:, None, None, None, None]).flatten(2).transpose(1, 2).flatten(1)
     return linear(matrix, shift.detach())

@@ -19,9 +19,15 @@ from asca_export import graphs
 from asca_export.int8 import MAX_LOGIT_ERROR, calibration_scans, logit_error, write_quantized
 from asca_export.pillar.export import export_pillar_bundle
 from asca_export.proven_bundle import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_proven
-from asca_export.two_stage.first_stage import BundleFirstStage, is_checkpoint, open_exported
+from asca_export.two_stage.first_stage import (
+    BundleFirstStage,
+    add_neck_output,
+    add_neck_steps,
+    is_checkpoint,
+    open_exported,
+    scale_bev,
+)
 from asca_export.two_stage.graphs import export_refine
-from asca_export.two_stage.neck_output import add_neck_output, add_neck_steps, scale_bev
 from asca_export.two_stage.parity import prove_refine_parity
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory

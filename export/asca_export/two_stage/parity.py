@@ -11,8 +11,8 @@ from asca_deploy.two_stage.pipeline import RefinePipeline, refine_inputs
 from asca_export.parity import MAP_TOLERANCE, require_close, require_compared, require_same_refined
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.models.two_stage.pillar_refiner import PillarRefiner
-from asca_pillars.models.two_stage.samples import collate_scans
+from asca_pillars.models.two_stage.layers import PillarRefiner
+from asca_pillars.models.two_stage.preparation import collate_scans
 from asca_pillars.ops.two_stage.first_stage import FirstStage, proposed_from
 from asca_pillars.ops.two_stage.prepare import refine_scan
 

@@ -24,7 +24,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.dataset import Collate, open_dataset
-from asca_pillars.training.loader_processes import loader_context
+from asca_pillars.training.shared_batches import loader_context
 from tests.data.insertion.simple_streets import TYPES, write_streets
 from tests.scenes import SPEC
 

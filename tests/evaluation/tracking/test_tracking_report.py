@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner
 
+from asca_deploy.evaluate import evaluate
 from asca_pillars.base.errors import ConfigError, DatasetError, OutputError
-from asca_pillars.cli.eval_tracks import evaluate_tracks
 from asca_pillars.cli.main import app
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.evaluation.tracking.tracking_report import (
@@ -233,7 +232,14 @@ def test_the_command_prints_and_writes(drives: Path, tmp_path: Path) -> None:
 
 def test_a_json_that_cannot_be_written_is_told_before_the_work(drives: Path, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="is a folder"):
-        evaluate_tracks(drives, "training", tmp_path / "none", tmp_path / "out", tmp_path, Console())
+        evaluate(
+            data=drives,
+            out=tmp_path / "out",
+            split="training",
+            protocol="tracking",
+            predictions=tmp_path / "none",
+            json=tmp_path,
+        )
 
 
 def test_plain_values(drives: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pillar.preparation import batch_pillars
-from asca_pillars.ops.pillar.neck_rulebooks import NeckTables
+from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 from tests.deploy.conftest import needs_openvino
 from tests.export.test_sparse_bundle import NOTHING, ONE_POINT, sparse_checkpoint
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint, tiny_detector
@@ -57,7 +57,7 @@ def _canvas(detector: PillarDetector, features: Tensor, cells: Tensor) -> Tensor
     return F.pad(image, (0, 0, 1, 0, 1, 0))
 
 
-def _rows(maps: tuple[Tensor, ...], tables: NeckTables[Tensor]) -> HeadMaps[Tensor]:
+def _rows(maps: tuple[Tensor, ...], tables: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
     return HeadMaps(*(part.flatten(0, 2)[tables.head_cells.long()] for part in maps))
 
 

@@ -26,8 +26,8 @@ from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
-from asca_pillars.models.pv_rcnn.batch import batch_scans
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from asca_pillars.models.pv_rcnn.preparation import batch_scans
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, voxel_scan
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
 from asca_pillars.training.loop import train
@@ -204,7 +204,7 @@ def test_a_place_for_each_radius(trained: Trained, tmp_path: Path) -> None:
     widths = dataclasses.replace(NETWORK, source_widths=((8, 8), (8, 8)))
     network = tiny_detector(settings=settings, network=widths).eval().network
     export_deform(network, bundle, tmp_path / "deform.onnx")
-    scan = voxel_scan(SCANS[0], SPEC, settings, SPEC.table_builder())
+    scan = voxel_scan(SCANS[0], SPEC, settings, SPEC.rulebook_builder())
     batch = batch_scans([scan], SPEC)
     with torch.inference_mode():
         levels = network.propose(batch).levels

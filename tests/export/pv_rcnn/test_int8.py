@@ -45,7 +45,7 @@ def random_checkpoint() -> Checkpoint:
     scans = batch(detector, frame(50), frame(51)).scans
     with torch.no_grad():
         first = detector.network.train().propose(scans)
-        detector.network.describe(scans, first.levels, first.canvas)
+        detector.network.encode_keypoints(scans, first.levels, first.canvas)
         for part in (detector.network.head.scores, detector.network.head.boxes):
             part.weight.normal_(0, 0.02)
     model = dataclasses.replace(MODEL, spec=SPEC.with_score_threshold(0.02))
@@ -135,7 +135,7 @@ def test_what_the_second_stage_reads_is_what_it_was(folders: tuple[Path, Path]) 
             assert found.levels[name].dtype == np.float32 and error < 0.1, name
         first = [pipeline.infer(each, []) for pipeline, each in ((floating, wanted), (eight_bit, found))]
         features = [
-            pipeline.describe(each.scan, each.levels, each.bev, {}, each.scan.ball_indices)
+            pipeline.encode_keypoints(each.scan, each.levels, each.bev, {}, each.scan.ball_indices)
             for pipeline, each in zip((floating, eight_bit), first, strict=True)
         ]
         errors.append(np.sqrt(np.square(features[1] - features[0]).mean()) / features[0].std())

@@ -5,7 +5,7 @@ import onnx
 import onnxruntime
 import pytest
 
-from asca_export.two_stage.neck_output import add_neck_output, add_neck_steps, scale_bev
+from asca_export.two_stage.first_stage import add_neck_output, add_neck_steps, scale_bev
 from asca_pillars.base.errors import ExportError
 
 

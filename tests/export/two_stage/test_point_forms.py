@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from asca_export.graphs import export_graph
-from asca_export.two_stage.point_forms import GatheredSetAbstraction, GroupedSetAbstraction
-from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
+from asca_export.two_stage.graphs import GatheredSetAbstraction, GroupedSetAbstraction
+from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.points.ball_layouts import BallGroup, GroupedBalls, gather_balls, group_balls
 from asca_pillars.ops.points.neighbors import ball_query
 from tests.ops.points.clouds import cloud

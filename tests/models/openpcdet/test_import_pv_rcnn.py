@@ -139,7 +139,7 @@ def assert_same_parts(theirs: Parts, ours: OurNetwork) -> None:
         for ours_map, their_map in zip(first.maps, theirs.head(theirs.backbone(seen_from_above)), strict=True):
             torch.testing.assert_close(ours_map, their_map, atol=1e-4, rtol=1e-3)
 
-        described, logits = ours.describe(scans, first.levels, first.canvas)
+        described, logits = ours.encode_keypoints(scans, first.levels, first.canvas)
         cells = seen_from_above[0].flatten(1).T
         parts: Any = [sum(cells[scans.bev_cells[:, i]] * scans.bev_weights[:, i, None] for i in range(4))]
         sources = {"points": scans.points[:, 3:], "conv2": first.levels[1], "conv4": first.levels[3]}

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from asca_pillars.models.pillar.attention import ChannelAttention, ChannelLinear, PaperAttention, PointAttention
+from asca_pillars.models.pillar.encoder import ChannelAttention, ChannelLinear, PaperAttention, PointAttention
 
 CHANNELS = 8
 

@@ -23,7 +23,7 @@ from asca_pillars.models.pillar.preparation import (
     batch_targets,
 )
 from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder
 from tests.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(2, 1, 1), upsample_channels=8)
@@ -41,7 +41,7 @@ def make_batch(rule: MaskRule | None, seeds: tuple[int, ...] = (0, 1), *, traini
     frames = [SPEC.pillarize(make_scene(seed)[0]) for seed in seeds]
     if rule is None:
         return batch_pillars(frames)
-    builder = NeckTableBuilder(SPEC.grid.ny, SPEC.grid.nx, rule, training=training)
+    builder = NeckRulebookBuilder(SPEC.grid.ny, SPEC.grid.nx, rule, training=training)
     return batch_pillars(frames, [Placement(None, builder.build(frame.cells)) for frame in frames])
 
 
@@ -86,7 +86,7 @@ def test_where_everything_is_active_it_is_the_dense_neck() -> None:
     sparse.load_state_dict(dense.state_dict())  # the same names and shapes
     ny, nx = SPEC.grid.ny, SPEC.grid.nx
     features = torch.randn(ny * nx, 8, dtype=torch.float64)
-    tables = NeckTableBuilder(ny, nx, "fine").build(np.arange(ny * nx))
+    tables = NeckRulebookBuilder(ny, nx, "fine").build(np.arange(ny * nx))
     (batch,) = [batch_pillars([SPEC.pillarize(make_scene(0)[0])], [Placement(None, tables)])]
     assert isinstance(sparse.neck, SparseRPNNeck) and isinstance(dense.neck, RPNNeck) and batch.neck is not None
     with torch.no_grad():

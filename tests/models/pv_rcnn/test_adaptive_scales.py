@@ -9,7 +9,7 @@ import torch
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.models.pv_rcnn.adaptive_scales import AdaptiveScales, Adjustment
+from asca_pillars.models.pv_rcnn.keypoints import AdaptiveScales, Adjustment
 from asca_pillars.ops.points.neighbors import PointScale, point_scales, three_nearest
 from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings

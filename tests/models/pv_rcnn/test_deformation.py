@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.models.pv_rcnn.deformation import AuthorsDeformation, PaperDeformation, Surroundings
+from asca_pillars.models.pv_rcnn.keypoints import AuthorsDeformation, PaperDeformation, Surroundings
 from asca_pillars.ops.pv_rcnn.prepare import Deform, SourceBalls, VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import SETTINGS, batch, frame, tiny_detector
 
@@ -68,7 +68,7 @@ def test_places_learn_unless_they_are_frozen(deform: Deform) -> None:
     detector = tiny_detector(settings=dataclasses.replace(SETTINGS, deform=deform)).train()
     inputs = batch(detector, frame(0), frame(1))
     first = detector.network.propose(inputs.scans)
-    features, _ = detector.network.describe(inputs.scans, first.levels, first.canvas.detach())
+    features, _ = detector.network.encode_keypoints(inputs.scans, first.levels, first.canvas.detach())
     features.square().sum().backward()
     gradients = {name: weight.grad for name, weight in detector.network.deform.named_parameters()}
     of_backbone = detector.network.voxels.get_parameter("down.1.convolution.weight").grad
@@ -90,7 +90,7 @@ def test_balls_are_around_the_shifted_places() -> None:
     with torch.inference_mode():
         for scans in (together, *alone):
             first = detector.network.propose(scans)
-            described.append(detector.network.describe(scans, first.levels, first.canvas)[0])
+            described.append(detector.network.encode_keypoints(scans, first.levels, first.canvas)[0])
     torch.testing.assert_close(described[0], torch.cat(described[1:]), atol=1e-4, rtol=1e-3)
 
 

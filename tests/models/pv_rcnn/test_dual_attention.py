@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.models.pv_rcnn.dual_attention import DualAttention
+from asca_pillars.models.pv_rcnn.layers import DualAttention
 
 
 def by_hand(module: DualAttention, features: np.ndarray) -> np.ndarray:

@@ -14,9 +14,9 @@ from asca_pillars.config.tree import load_config
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.proposals import AnchorProposals
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.models.pv_rcnn.batch import LabeledVoxels
 from asca_pillars.models.pv_rcnn.layers import build_pv_rcnn
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels
 from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, VARIANTS, batch, frame, tiny_detector
 from tests.ops.sparse.test_rulebooks import at_cells, dense

@@ -11,8 +11,8 @@ from asca_pillars.config.tree import Config, DataConfig, TrainConfig
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.proposals import AnchorProposals
-from asca_pillars.models.pv_rcnn.batch import LabeledVoxels
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector, build_pv_rcnn_detector
+from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, VoxelSetSettings
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid

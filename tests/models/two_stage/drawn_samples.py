@@ -3,7 +3,7 @@
 import numpy as np
 
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.models.two_stage.samples import RefineSample, sample_of
+from asca_pillars.models.two_stage.preparation import RefineSample, sample_of
 from asca_pillars.ops.two_stage.first_stage import Proposed
 from asca_pillars.ops.two_stage.prepare import RefineSettings
 from asca_pillars.ops.two_stage.rois import match_proposals, sample_rois

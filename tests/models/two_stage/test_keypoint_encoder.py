@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from asca_pillars.models.two_stage.keypoint_encoder import BallSource, ContextGate, KeypointEncoder, SourceRows
+from asca_pillars.models.two_stage.layers import BallSource, ContextGate, KeypointEncoder, SourceRows
 
 
 def by_equation(gate: ContextGate, features: NDArray[np.float64]) -> NDArray[np.float64]:

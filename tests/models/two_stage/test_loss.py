@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 
 from asca_pillars.geometry.boxes import corners
+from asca_pillars.models.two_stage.layers import Refinements
 from asca_pillars.models.two_stage.loss import (
     RefineTargets,
     corner_loss,
@@ -15,7 +16,6 @@ from asca_pillars.models.two_stage.loss import (
     distance_iou_loss,
     refine_loss,
 )
-from asca_pillars.models.two_stage.pillar_refiner import Refinements
 from asca_pillars.ops.two_stage.rois import boxes_in_frames, encode_refinement
 from tests.ops.points.boxes_near import CHANGES, PROPOSALS, changed
 

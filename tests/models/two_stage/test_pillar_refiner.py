@@ -8,13 +8,11 @@ from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.models.two_stage.keypoint_encoder import BallSource, KeypointEncoder
+from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, PillarRefiner, RoiHead
 from asca_pillars.models.two_stage.loss import refine_loss
-from asca_pillars.models.two_stage.pillar_refiner import PillarRefiner
-from asca_pillars.models.two_stage.refined_detector import refine
-from asca_pillars.models.two_stage.roi_head import RoiHead
-from asca_pillars.models.two_stage.samples import RefineBatch, collate_samples, collate_scans
-from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
+from asca_pillars.models.two_stage.network import refine
+from asca_pillars.models.two_stage.preparation import RefineBatch, collate_samples, collate_scans
+from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.two_stage.first_stage import Proposed
 from asca_pillars.ops.two_stage.prepare import RefineSettings, refine_scan

@@ -7,7 +7,7 @@ import pytest
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.models.two_stage.samples import RefineSample, collate_samples, collate_scans
+from asca_pillars.models.two_stage.preparation import RefineSample, collate_samples, collate_scans
 from asca_pillars.ops.two_stage.first_stage import propose_on
 from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan, roi_features
 from tests.models.two_stage.drawn_samples import prepare_sample

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.two_stage.set_abstraction import SetAbstraction
+from asca_pillars.models.two_stage.sets import SetAbstraction
 
 Balls: TypeAlias = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.models.two_stage.vector_pool import VectorPool
+from asca_pillars.models.two_stage.sets import VectorPool
 from asca_pillars.ops.points.neighbors import nearest_in_cubes
 
 HALF_M = 0.8

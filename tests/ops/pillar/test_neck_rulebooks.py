@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckTableBuilder, NeckTables, stack_neck_tables
+from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder, NeckRulebooks, stack_neck_rulebooks
 
 NY, NX = 16, 24
 
@@ -16,7 +16,7 @@ def cells(share: float, seed: int) -> np.ndarray:
     return np.flatnonzero(np.random.default_rng(seed).random(NY * NX) < share)
 
 
-def arrays(tables: NeckTables[np.ndarray]) -> list[np.ndarray]:
+def arrays(tables: NeckRulebooks[np.ndarray]) -> list[np.ndarray]:
     return [*(part for level in tables.levels for part in level), tables.head_cells]
 
 
@@ -26,7 +26,7 @@ def test_active_cells_follow_the_rule(seed: int, share: float, rule: MaskRule) -
     mask = torch.zeros(NY * NX)
     mask[torch.from_numpy(cells(share, seed))] = 1
     level, outputs = mask.view(1, 1, NY, NX), []
-    tables = NeckTableBuilder(NY, NX, rule).build(cells(share, seed))
+    tables = NeckRulebookBuilder(NY, NX, rule).build(cells(share, seed))
     for number, found in enumerate(tables.levels):
         level = F.max_pool2d(level, 3, 2, 1)  # a strided output is active where it sees an active input
         outputs.append(F.max_pool2d(level, 3, 1, 1) if rule == "fine" and number == 0 else level)
@@ -41,27 +41,27 @@ def test_active_cells_follow_the_rule(seed: int, share: float, rule: MaskRule) -
 
 def test_only_training_asks_for_inverse_tables() -> None:
     for training in (False, True):
-        level = NeckTableBuilder(NY, NX, "fine", training=training).build(cells(0.1, 0)).levels[0]
+        level = NeckRulebookBuilder(NY, NX, "fine", training=training).build(cells(0.1, 0)).levels[0]
         assert len(level.first_back) == len(level.strided_cells) * training
         assert len(level.strided_back) == len(cells(0.1, 0)) * training
 
 
 def test_one_builder_serves_scan_after_scan() -> None:
-    builder = NeckTableBuilder(NY, NX, "fine")
+    builder = NeckRulebookBuilder(NY, NX, "fine")
     for seed in range(4):
         again = builder.build(cells(0.1, seed))
         for one, other in zip(
-            arrays(again), arrays(NeckTableBuilder(NY, NX, "fine").build(cells(0.1, seed))), strict=True
+            arrays(again), arrays(NeckRulebookBuilder(NY, NX, "fine").build(cells(0.1, seed))), strict=True
         ):
             np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("rule", ["sub", "fine"])
 def test_a_batch_holds_its_frames(rule: MaskRule) -> None:
-    builder = NeckTableBuilder(NY, NX, rule, training=True)
+    builder = NeckRulebookBuilder(NY, NX, rule, training=True)
     pillars = [cells(share, seed) for seed, share in enumerate((0.1, 0.0, 0.3))]
     frames, counts = [builder.build(each) for each in pillars], [len(each) for each in pillars]
-    batch = stack_neck_tables(frames, counts)
+    batch = stack_neck_rulebooks(frames, counts)
     assert batch.frame_rows == tuple(len(frame.head_cells) for frame in frames)
     rows = np.cumsum([0, *batch.frame_rows])
     rng = np.random.default_rng(0)

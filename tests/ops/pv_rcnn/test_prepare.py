@@ -20,7 +20,7 @@ SETTINGS = VoxelSetSettings(
 
 def test_neighbors_lie_in_their_balls() -> None:
     points = make_scene(0)[0]
-    scan = voxel_scan(points, SPEC, SETTINGS, SPEC.table_builder())
+    scan = voxel_scan(points, SPEC, SETTINGS, SPEC.rulebook_builder())
     assert scan.counts.points == len(points) and scan.counts.points - scan.counts.points_outside == len(scan.points)
     assert len(scan.keypoints) == 64 and len(scan.positions[1]) == len(scan.levels[2].cells)
     for source, positions, balls in zip(SETTINGS.sources, scan.positions, scan.ball_indices, strict=True):
@@ -39,7 +39,7 @@ def test_neighbors_lie_in_their_balls() -> None:
 def test_a_keypoint_reads_the_map_where_openpcdet_does(last_stride: Literal[1, 2], stride: int) -> None:
     """Column (x - x_min) / voxel / stride, without half a cell: as the published weights have learnt to read it."""
     spec = dataclasses.replace(SPEC, last_stride=last_stride)
-    scan = voxel_scan(make_scene(0)[0], spec, SETTINGS, spec.table_builder())
+    scan = voxel_scan(make_scene(0)[0], spec, SETTINGS, spec.rulebook_builder())
     rows, columns = spec.map_shape
     x, y = scan.keypoints[:, :2].astype(np.float64).T
     column, row = (x - 4.8) / 0.2 / stride, (y + 6.4) / 0.2 / stride
@@ -53,7 +53,7 @@ def test_a_keypoint_reads_the_map_where_openpcdet_does(last_stride: Literal[1, 2
 
 @pytest.mark.parametrize("points", [np.empty((0, 4)), np.array([[500.0, 0, 0, 0]])])
 def test_scans_without_anything_in_range(points: np.ndarray) -> None:
-    scan = voxel_scan(points.astype(np.float32), SPEC, SETTINGS, SPEC.table_builder())
+    scan = voxel_scan(points.astype(np.float32), SPEC, SETTINGS, SPEC.rulebook_builder())
     assert len(scan.features) == len(scan.points) == len(scan.keypoints) == len(scan.bev_cells) == 0
     assert [len(level.cells) for level in scan.levels] == [0] * 5
 

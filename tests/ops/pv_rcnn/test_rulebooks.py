@@ -6,7 +6,7 @@ import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD, VoxelTableBuilder
+from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD, VoxelRulebookBuilder
 from asca_pillars.ops.sparse.rulebooks import Convolution
 from tests.ops.sparse.test_rulebooks import at_cells, dense, random_cells
 
@@ -21,7 +21,7 @@ def by_table(features: np.ndarray, table: np.ndarray, weight: torch.Tensor) -> n
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.2])
 def test_every_level_is_the_dense_one(share: float) -> None:
     torch.manual_seed(0)
-    builder = VoxelTableBuilder(SHAPE, training=True)
+    builder = VoxelRulebookBuilder(SHAPE, training=True)
     for seed in range(2):
         builder.maps[0].activate(random_cells(SHAPE, share, seed))
         levels = builder.build()
@@ -46,4 +46,4 @@ def test_every_level_is_the_dense_one(share: float) -> None:
 
 def test_lattices_that_are_too_tall_are_refused() -> None:
     with pytest.raises(ConfigError, match="64 along z"):
-        VoxelTableBuilder((65, 8, 8), (Convolution((3, 3, 3), (2, 2, 2), (1, 1, 1)),), (True, True))
+        VoxelRulebookBuilder((65, 8, 8), (Convolution((3, 3, 3), (2, 2, 2), (1, 1, 1)),), (True, True))

@@ -28,7 +28,7 @@ def test_a_map_of_finer_cells() -> None:
 
 def test_a_level_that_keeps_its_resolution_does_not_grow_sideways() -> None:
     spec = VoxelSpec(grid=VoxelGrid((0.0, 6.4), (-3.2, 3.2), size_m=(0.1, 0.1, 0.1)), last_stride=1)
-    builder = spec.table_builder()
+    builder = spec.rulebook_builder()
     voxelize(np.array([[1.0, 0.0, -1.0, 0.5], [5.0, 2.0, 0.3, 0.5]], np.float32), spec.grid, builder.maps[0])
     levels = builder.build()
     above = [set(level.cells // shape[0]) for level, shape in zip(levels, spec.level_shapes, strict=True)]
@@ -40,7 +40,7 @@ def test_centers_of_coarse_voxels_hold_their_points() -> None:
     rng = np.random.default_rng(0)
     spec = VoxelSpec(grid=VoxelGrid((0.0, 6.4), (-3.2, 3.2), size_m=(0.1, 0.1, 0.1)))
     points = rng.uniform([-1, -4, -4, 0], [7, 4, 2, 1], (500, 4)).astype(np.float32)
-    builder = spec.table_builder()
+    builder = spec.rulebook_builder()
     voxels = voxelize(points, spec.grid, builder.maps[0])
     assert spec.grid.inside(points).sum() == len(points) - voxels.points_outside
     np.testing.assert_array_equal(spec.grid.centers_m(voxels.cells), spec.grid.centers_m(voxels.cells, spec.grid.shape))

@@ -82,13 +82,10 @@ def test_a_topic_without_a_schema_that_holds_something_else(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("kind", "remedy"),
     [
-        ("livox_ros_driver/CustomMsg", "xfer_format 0"),
-        ("livox_ros_driver2/msg/CustomMsg", "xfer_format 0"),
         ("velodyne_msgs/msg/VelodyneScan", "velodyne_pointcloud"),
         ("ouster_ros/msg/PacketMsg", "ouster_ros"),
         ("ouster_sensor_msgs/msg/PacketMsg", "ouster_ros"),
-        ("sensor_msgs/msg/PointCloud", "point_cloud_converter"),
-        ("foxglove.PointCloud", "record the PointCloud2"),
+        ("foxglove_msgs/msg/PointCloud", "record the PointCloud2"),
         ("pandar_msgs/PandarScan", "driver"),
         ("rslidar_msg/msg/RslidarPacket", "driver"),
         ("nebula_msgs/msg/NebulaPackets", "driver"),

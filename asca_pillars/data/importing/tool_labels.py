@@ -1,0 +1,252 @@
+"""What the formats of labelling tools share: a file for each scan, found by its name, and pre-labels written safely."""
+
+import hashlib
+import json
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_pillars.base.errors import ConfigError, DatasetError, OutputError
+from asca_pillars.base.files import is_hidden, write_json, write_text
+from asca_pillars.base.input_files import read_text
+from asca_pillars.base.own_files import json_object, require_no_link, require_own_file
+from asca_pillars.data.boxes.box_records import BoxRecords, read_frames, records_from
+from asca_pillars.data.importing.box_files import dataset_settings
+from asca_pillars.data.importing.foreign_values import LeftOut, entry, numbers, text_of
+from asca_pillars.data.importing.formats import FORMATS, TOOLS
+from asca_pillars.data.importing.imported import Imported, ImportedFrame
+from asca_pillars.data.yaw_units import why_no_yaw
+from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, natural_order
+from asca_pillars.scans.scan_settings import ScanSettings
+
+WRITTEN_FILE = "prelabels.json"
+"""Digests of the files that were written for labelling tools, so that corrected ones are not replaced."""
+COMMAND = "asca detect --write"
+COLORS = ("#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#42d4f4")
+"""Of classes, for tools that want them stated."""
+_DECIMALS = 4
+_ANGLE_DECIMALS = 8  # of angles that are converted, so that the radians come back to their last digit
+_UPRIGHT_RAD = 0.01
+_TOOL_FOLDERS = {"label", "labels", "label_2", "ann", "lidar", "pointcloud", "pointclouds", "points", "velodyne", "ds0"}
+"""Folders by which tools keep scans and labels apart: they do not tell one scan from another."""
+
+
+class ScanLabels(NamedTuple):
+    """A scan, its path below the folder of the scans without a suffix, and its boxes in the scan's own frame."""
+
+    scan: Path
+    name: Path
+    records: BoxRecords
+
+
+class ToolBox(NamedTuple):
+    """A box as a tool states it: class, center and size (m; length, width, height), yaw, roll and pitch (rad)."""
+
+    kind: Any
+    center: Any
+    size: Any
+    yaw: float
+    tilt: float = 0.0
+    track_id: str | None = None
+
+
+Parser: TypeAlias = Callable[[str], Iterable[ToolBox]]
+"""From the text of a file. Raises ValueError with a clause that says what is wrong and what to do."""
+
+
+def read_tool_labels(
+    source: Path, scans: Path, settings: ScanSettings, suffix: str, parse: Parser, *, left: frozenset[str] = frozenset()
+) -> Imported:
+    """Every label file below `source` with its scan, which has the same name. Scans without a file are left out.
+
+    Args:
+        source: a file or folder of labels.
+        scans: folder of the scans.
+        settings: how the scans lie; labels are in the scans' own frame.
+        suffix: of label files.
+        parse: gives the boxes of a file.
+        left: names of files that hold no labels; nor do those that begin with an underscore.
+
+    Raises:
+        ConfigError: the pose cannot be read.
+        ScanError: there are no scans.
+        DatasetError: no label file, one that is not of the format, or one that belongs to no scan or to several.
+    """
+    dataset = dataset_settings(scans, settings)
+    scan_of = _scans_by_name(Path(dataset.scans))
+    paths = [source] if source.is_file() else sorted(files_below(source), key=natural_order)
+    root = source.parent if source.is_file() else source
+    left_out, frames = LeftOut(), []
+    for path in paths:
+        relative = path.relative_to(root)
+        if path.suffix.lower() != suffix or is_hidden(relative) or path.name in left or path.name.startswith("_"):
+            continue
+        try:
+            records = _records(parse(read_text(path, DatasetError)), path, left_out)
+        except UnicodeDecodeError:
+            raise DatasetError(f"{path}: not UTF-8 text; export the labels again") from None
+        except (ValueError, RecursionError) as reason:
+            raise DatasetError(f"{path}: {reason}") from None
+        scan = scan_of(path, relative)
+        recording = scan.parent.relative_to(dataset.scans).as_posix()
+        frames.append(ImportedFrame(scan, records, recording))
+    if not frames:
+        raise DatasetError(f"{source}: no *{suffix} with labels there; give the folder that the tool writes them to")
+    return Imported(dataset, frames, left_out)
+
+
+def json_of(text: str) -> Any:
+    """The value of a JSON text; ValueError with one clause."""
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"not valid JSON ({str(error)[:80]}); export the labels again") from None
+
+
+def xyz(row: Any, name: str, keys: Sequence[str] = ("x", "y", "z")) -> NDArray[np.float64]:
+    """Three numbers of an object in an object; ValueError if they are not there."""
+    vector = entry(row, name)
+    return numbers([entry(vector, key) for key in keys], 3, name)
+
+
+def rounded(values: Iterable[float]) -> list[float]:
+    """Lengths and angles as they are written: with four decimals, as `asca detect` writes boxes."""
+    return [round(float(value), _DECIMALS) for value in values]
+
+
+def rounded_angle(angle: float) -> float:
+    """An angle that was converted, with as many decimals as it takes to find the four of the radians again."""
+    return round(angle, _ANGLE_DECIMALS)
+
+
+def class_names(frames: Iterable[ScanLabels]) -> list[str]:
+    """The classes of all boxes, sorted."""
+    return sorted({kind for frame in frames for kind in frame.records.types})
+
+
+def write_prelabels(run_file: Path, name: str, out: Path) -> Path:
+    """Write the boxes of a run as labels of a tool, and return their folder, `out`/`name`.
+
+    Args:
+        run_file: detections.jsonl of `asca detect`.
+        name: of the format.
+        out: folder of the results.
+
+    Raises:
+        OutputError: a file there was changed since, or a label cannot be written in the format.
+    """
+    require_unchanged(out, name)
+    lines = list(read_frames(run_file))
+    paths = [Path(line.scan).absolute() for line in lines]
+    common = Path(os.path.commonpath([path.parent for path in paths])) if paths else Path()
+    named = [path.relative_to(common).with_suffix("") for path in paths]
+    if twice := [path for path in paths if named.count(path.relative_to(common).with_suffix("")) > 1]:
+        raise OutputError(f"{twice[0]}: another scan has the same name, and labels go by names; detect them one by one")
+    labels = [ScanLabels(path, stem, line.records) for path, stem, line in zip(paths, named, lines, strict=True)]
+    texts = FORMATS[name].files(labels)
+    folder = out / name
+    digests = {relative: hashlib.sha256(text.encode()).hexdigest() for relative, text in texts.items()}
+    before = _written(out)
+    known = {
+        path: [*before.get(name, {}).get(path, ()), digests.get(path, "")] for path in before.get(name, {}) | digests
+    }
+    write_json(out / WRITTEN_FILE, before | {name: known})  # of both runs: after a kill, files of either are ours
+    for relative, text in texts.items():
+        (folder / relative).parent.mkdir(parents=True, exist_ok=True)
+        write_text(folder / relative, text)
+    for relative in known.keys() - digests.keys():
+        (folder / relative).unlink(missing_ok=True)
+    write_json(out / WRITTEN_FILE, before | {name: {path: [digest] for path, digest in digests.items()}})
+    return folder
+
+
+def require_unchanged(out: Path, name: str) -> None:
+    """Make sure that pre-labels may be written to `out`/`name`: nothing there was corrected since, or added.
+
+    Raises:
+        ConfigError: no tool's format has this name.
+        OutputError: names the file.
+    """
+    if name not in TOOLS:
+        raise ConfigError(f"--write {name}: no such format; there are {', '.join(TOOLS)}")
+    folder = out / name
+    require_no_link(out, name)
+    require_own_file(out / WRITTEN_FILE, COMMAND, json_object())
+    digests = _written(out).get(name, {})
+    for path in files_below(folder) if folder.exists() else ():
+        if hashlib.sha256(path.read_bytes()).hexdigest() not in digests.get(path.relative_to(folder).as_posix(), ()):
+            raise OutputError(
+                f"{path}: was changed or added since `{COMMAND} {name}`, and may hold corrections; "
+                f"import it first and move {folder} away, or give another --out"
+            )
+
+
+def _written(out: Path) -> dict[str, dict[str, list[str]]]:
+    path = out / WRITTEN_FILE
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() and path.stat().st_size else {}
+
+
+def _records(boxes: Iterable[ToolBox], path: Path, left_out: LeftOut) -> BoxRecords:
+    rows, types, tracks = [], [], []
+    for number, box in enumerate(boxes, start=1):
+        try:
+            types.append(text_of(box.kind, "the class"))
+            center, size = numbers(box.center, 3, "the center"), numbers(box.size, 3, "the size")
+            numbers([box.yaw, box.tilt], 2, "the rotation")
+        except ValueError as reason:
+            raise ValueError(f"box {number}: {reason}; correct it in the tool") from None
+        if (why := why_no_yaw(box.yaw)) is not None:
+            raise ValueError(f"box {number}: the yaw {why}")
+        if box.tilt > _UPRIGHT_RAD:
+            left_out.add("tilts", f"{path}, box {number}", f"rolled or pitched by {box.tilt:.2g} rad, read upright")
+        rows.append([*center, *size, box.yaw])
+        tracks.append(box.track_id)
+    array = np.array(rows, np.float64).reshape(-1, 7)
+    array[:, 6] = np.round(wrap_angle(array[:, 6]), _ANGLE_DECIMALS) + 0.0  # 0 and not -1e-17, or -0
+    return records_from(array, types, None, tracks)
+
+
+def _scans_by_name(scans: Path) -> Callable[[Path, Path], Path]:
+    """A function from a label file, and its path below the folder of labels, to its scan."""
+    by_stem: dict[str, list[Path]] = defaultdict(list)
+    for scan in find_scans(scans):
+        by_stem[scan.stem].append(scan)
+
+    def place(folder: Path) -> str:
+        return "_".join(part for part in folder.parts if part not in _TOOL_FOLDERS)
+
+    def scan_of(path: Path, relative: Path) -> Path:
+        name = relative.with_suffix("")
+        stem = name.stem if name.suffix.lower() in SCAN_SUFFIXES else name.name  # 000000.pcd.json, 000000.json
+        candidates = by_stem.get(stem, [])
+        if len(candidates) > 1:
+            wanted = place(relative.parent)
+            candidates = [scan for scan in candidates if place(scan.parent.relative_to(scans)) == wanted]
+        if len(candidates) != 1:
+            found = " and ".join(map(str, candidates[:2])) or "none"
+            raise DatasetError(f"{path}: belongs to one scan {stem}.* below {scans}, there is {found}; correct --scans")
+        return candidates[0]
+
+    return scan_of
+
+
+def track_numbers(frames: Iterable[ScanLabels]) -> Mapping[tuple[int, int], str]:
+    """An identity for each box, by the numbers of its frame and row: that of its track, or one of its own.
+
+    Tools want one for each object; those without a track get numbers above those of all tracks.
+    """
+    frames = list(frames)
+    stated = [track for frame in frames for track in frame.records.track_ids if track is not None]
+    following = max((int(track) for track in stated if track.isdecimal()), default=0) + 1
+    identities: dict[tuple[int, int], str] = {}
+    for number, frame in enumerate(frames):
+        for row, track in enumerate(frame.records.track_ids):
+            identities[number, row] = str(following) if track is None else track
+            following += track is None
+    return identities

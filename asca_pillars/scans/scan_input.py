@@ -1,0 +1,61 @@
+"""Scan files read as `ScanSettings` say, and the mounting of their sensor."""
+
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+
+from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, read_scan
+from asca_pillars.scans.scan_settings import ScanSettings, sample_points
+from asca_pillars.scans.stored_scans import FolderScale, folder_reflectance_scale
+
+
+class ScanInput:
+    """Reads scans; the reflectance scale of each folder and suffix is decided once.
+
+    Attributes:
+        mounting: of the sensor.
+        said: sentences about what was decided, for the user.
+
+    Raises:
+        ConfigError, ScanError: an option cannot be used, or the height not be estimated.
+    """
+
+    def __init__(self, settings: ScanSettings, paths: Sequence[Path]) -> None:
+        self._columns = settings.columns
+        self._scales: dict[tuple[Path, str], FolderScale] = {}
+        self.said: list[str] = []
+        stated = settings.reflectance_scale
+        for key, group in groupby(sorted(paths, key=_folder_and_suffix), _folder_and_suffix):
+            self._scales[key] = self._decide(key[0], list(group)) if stated == "auto" else FolderScale(stated, None)
+        self.mounting, estimate = settings.mounting(sample_points(paths, lambda path: self.read(path).points))
+        if estimate is not None:
+            self.said.append(f"sensor height: {estimate}")
+
+    def read(self, path: Path) -> Scan:
+        """One of the scans.
+
+        Raises:
+            ScanError: as `read_scan`.
+        """
+        return read_scan(path, columns=self._columns, reflectance_scale=self.scale(path))
+
+    def scale(self, path: Path) -> ReflectanceScale:
+        """The reflectance scale of one of the scans."""
+        return self._scales[_folder_and_suffix(path)].scale
+
+    def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
+        where = folder if len(paths) > 1 else paths[0]
+        decided = folder_reflectance_scale(paths, columns=self._columns)
+        self.said += [f"{where}: {line}" for line in said_of_scale(decided)]
+        return decided
+
+
+def said_of_scale(decided: FolderScale) -> list[str]:
+    """What a user is to know of a scale that the values decided: a sentence, or none."""
+    if decided.scale in (1.0, "auto"):
+        return []
+    return [decided.doubt or f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"]
+
+
+def _folder_and_suffix(path: Path) -> tuple[Path, str]:
+    return path.parent, path.suffix.lower()

@@ -1,0 +1,116 @@
+"""A model that is to be run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.detector import Detector
+from asca_deploy.providers import Precision, Provider, arithmetic
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.extras import require
+from asca_pillars.base.system import check_threads
+from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.spec import ScoreThresholds
+from asca_pillars.evaluation.model import Model
+from asca_pillars.scans.mounting import Mounting
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuntimeOptions:
+    """Which model runs, and how. The arguments of `Detector` by the same names."""
+
+    bundle: str | Path | None = None
+    provider: str = "cpu"
+    precision: str | None = None
+    threads: int | None = None
+
+
+def open_detector(
+    options: RuntimeOptions,
+    score: ScoreThresholds | None = None,
+    mounting: Mounting | None = None,
+    *,
+    around: bool = False,
+) -> Detector:
+    """The detector of a bundle that is run as `options` say, from `score` on; None for the bundle's own thresholds.
+
+    Raises:
+        AscaError: as `asca_deploy.Detector`.
+    """
+    return Detector(
+        options.bundle,
+        provider=cast("Provider", options.provider),  # checked by Detector, as the precision is
+        precision=cast("Precision | None", options.precision),
+        threads=options.threads,
+        score_threshold=score,
+        mounting=mounting,
+        view="around" if around else "ahead",
+    )
+
+
+def open_model(
+    options: RuntimeOptions, min_score: float, *, sensor_height_m: float | None = None, around: bool = False
+) -> Model:
+    """Open a bundle's folder or a checkpoint file; None for the bundle that ships.
+
+    Args:
+        options: which one, and how it runs.
+        min_score: lowest score of what it reports.
+        sensor_height_m: of the scans; None: as high as in the training.
+        around: look in every direction, by turned passes.
+
+    Raises:
+        AscaError: missing, damaged, or not to be run as asked; one line.
+    """
+    path = None if options.bundle is None else Path(options.bundle)
+    if path is not None and (path.is_file() or path.suffix == ".ckpt"):
+        if around:
+            raise ConfigError("--around runs bundles: export the checkpoint first (asca export)")
+        return _open_checkpoint(path, options, min_score, Mounting(sensor_height_m))
+    return _open_bundle(options, min_score, Mounting(sensor_height_m), around=around)
+
+
+def _open_bundle(options: RuntimeOptions, min_score: float, mounting: Mounting, *, around: bool) -> Model:
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are collected below
+    detector = open_detector(options, min_score, mounting, around=around)
+    bundle = detector.bundle
+    unlike: list[str] = []
+
+    def detect(points: NDArray[np.float32]) -> Detections:
+        detections = detector(points)
+        unlike.extend(detections.report.warnings[:1])
+        return detections
+
+    about = {
+        "name": bundle.name,
+        "bundle": str(detector.folder),
+        "sha256": {name: graph.sha256 for name, graph in bundle.graphs.items()},
+        "trained_on": bundle.provenance.trained_on,
+        "passes": detector.passes,
+        "provider": detector.provider,
+        "precision": arithmetic(bundle.precision, detector.precision),
+        "threads": detector.threads,
+        "min_score": min_score,
+    }
+    camera_view = bundle.expected_input.camera_view and not around
+    return Model(bundle.name, detect, bundle.spec, camera_view, about, unlike)
+
+
+def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float, mounting: Mounting) -> Model:
+    require("train")
+    from asca_pillars.models.scan_detector import open_checkpoint
+
+    provider, precision, threads = options.provider, options.precision, options.threads
+    if threads is not None:
+        check_threads(threads)
+    if provider not in ("cpu", "cuda", "auto"):
+        raise ConfigError(f"provider {provider} does not run checkpoints: choose cpu, cuda or auto, or give a bundle")
+    if precision not in (None, "float32"):
+        raise ConfigError(f"precision {precision} does not go with checkpoints: they run in float32; give a bundle")
+    opened = open_checkpoint(path, min_score, mounting, device=provider, threads=threads)
+    config = opened.config
+    return Model(config.name, opened.detector, config.model.spec, config.data.camera_view, opened.about)

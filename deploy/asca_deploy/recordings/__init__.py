@@ -1,0 +1,1 @@
+"""Recordings: detection scan by scan, and the files that are written of it."""

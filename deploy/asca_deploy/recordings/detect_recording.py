@@ -1,0 +1,397 @@
+"""Detection in a recording: scans of one topic in, boxes with time stamps and identities out."""
+
+import json
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import count
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.around import ranges_around
+from asca_deploy.detect_scans import DetectedScan, repairs
+from asca_deploy.detector import Detector
+from asca_deploy.manifest import load_bundle
+from asca_deploy.open_model import RuntimeOptions, open_detector
+from asca_deploy.recordings.foxglove_file import FoxgloveFile, is_own_mcap
+from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
+from asca_deploy.recordings.rerun_file import RerunFile, is_own_rrd
+from asca_deploy.recordings.results import (
+    Found,
+    JsonLines,
+    KittiTracks,
+    ResultFile,
+    open_text,
+    said_of_stamps,
+    tracked,
+)
+from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz, video_options
+from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
+from asca_deploy.shipped import find_bundle
+from asca_deploy.tracker import WEAK_SHARE, Tracker
+from asca_pillars.base.errors import ConfigError, ScanError
+from asca_pillars.base.extras import require
+from asca_pillars.base.files import atomic_path
+from asca_pillars.base.progress import Progress, Remark, Reporter
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.writable_file import require_suffix, require_writable
+from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
+from asca_pillars.data.kitti import read_calibration
+from asca_pillars.detection.spec import ScoreThresholds
+from asca_pillars.pictures.video import VideoView
+from asca_pillars.scans.ground_height import NamedPoints
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.recordings.odometry import Poses, read_poses
+from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.scans.scan_input import said_of_scale
+from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
+
+_PLAIN = RuntimeOptions()
+_AS_TRAINED = ScanSettings()
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """What `detect_recording` found and wrote.
+
+    Attributes:
+        scans: with results.
+        boxes: number of boxes of each class in all scans.
+        files: that were written; the first one is detections.jsonl.
+        cpu_ms_per_scan: processor time of a scan; None if an earlier run had detected all of them.
+        problems: sentences about scans that could not be read and damaged parts of the recording; empty if there were
+            none.
+        remarks: what was decided, repaired or odd.
+    """
+
+    scans: int
+    boxes: dict[str, int]
+    files: tuple[Path, ...]
+    cpu_ms_per_scan: float | None
+    problems: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """What is made of a recording; the arguments of `detect_recording` by the same names."""
+
+    path: Path
+    out: Path
+    score: ScoreThresholds | None
+    around: bool
+    topic: str | None
+    track: bool
+    odometry: str | None
+    calib: Path | None
+    foxglove: Path | None
+    rerun: Path | None
+    video: Path | None = None
+    video_view: VideoView = "above"
+
+
+def detect_recording(
+    path: str | Path,
+    out: str | Path,
+    *,
+    topic: str | None = None,
+    track: bool = False,
+    odometry: str | None = None,
+    calib: str | Path | None = None,
+    foxglove: str | Path | None = None,
+    rerun: str | Path | None = None,
+    video: str | Path | None = None,
+    video_view: str = "above",
+    options: RuntimeOptions = _PLAIN,
+    reading: ScanSettings = _AS_TRAINED,
+    score: ScoreThresholds | None = None,
+    around: bool = False,
+    progress: Progress | None = None,
+    remark: Remark | None = None,
+) -> RecordingResult:
+    """Detect in every scan of a topic and write the results; what a killed run had done is not done again.
+
+    Args:
+        path: of the recording: .mcap, .db3, .bag or the folder of a rosbag2.
+        out: folder for detections.jsonl and recording.json.
+        topic: of the scans; None: the only one of the recording.
+        track: give boxes identities and velocities over time.
+        odometry: with `track`, the topic of the car's poses; None: velocities are as the car sees them.
+        calib: KITTI calibration, for KITTI's tracking text in `out`.
+        foxglove: an .mcap to write for Foxglove.
+        rerun: an .rrd to write for the rerun viewer.
+        video: an .mp4 to write.
+        video_view: "above" or "chase".
+        options: which model runs, and how.
+        reading: how the sensor was mounted.
+        score: report detections from this score on, or by class; None: the thresholds of the model.
+        around: look in every direction, by turned passes.
+        progress: called after each scan.
+        remark: called with each of the result's `remarks` as soon as it is known.
+
+    Raises:
+        AscaError: something cannot be read or written; scans that cannot be read are skipped, see
+            `RecordingResult.problems`.
+    """
+    task = _Task(
+        path=Path(path),
+        out=Path(out),
+        score=score,
+        around=around,
+        topic=topic,
+        track=track,
+        odometry=odometry,
+        calib=None if calib is None else Path(calib),
+        foxglove=None if foxglove is None else Path(foxglove),
+        rerun=None if rerun is None else Path(rerun),
+        video=None if video is None else Path(video),
+        video_view=video_options(None if video is None else Path(video), video_view, [Path(path)]),
+    )
+    return _detect(task, reading, options, Reporter(progress, remark))
+
+
+def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporter: Reporter) -> RecordingResult:
+    require("recordings")
+    if task.rerun is not None:
+        require("view")
+        require_suffix("--rerun", task.rerun, ".rrd")
+    if task.foxglove is not None:
+        require_suffix("--foxglove", task.foxglove, ".mcap")
+    inputs = (task.path, task.calib)
+    require_writable(task.foxglove, COMMAND, is_own_mcap, inputs)
+    require_writable(task.rerun, COMMAND, is_own_rrd, inputs)
+    calibration = None if task.calib is None else read_calibration(task.calib)
+    claim(task.out, {JOURNAL_FILE: is_journal})
+    recording = open_recording(task.path)
+    topic = recording.point_cloud_topic(task.topic)
+    if task.odometry is not None and not task.track:
+        raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
+    poses = None if task.odometry is None else read_poses(recording, task.odometry)
+    damages = set() if poses is None else {recording.damage}
+    scans = RecordedScans(recording, topic, reading.reflectance_scale)
+    said = [f"{topic.name}: {topic.messages} scans", *said_of_scale(scans.scale)]
+    first = enumerate(scans.first(SEARCHED_SCANS), start=1)
+    samples = (NamedPoints(f"scan {number} with points of {topic.name}", scan.points) for number, scan in first)
+    mounting, estimate = reading.mounting(samples)
+    if estimate is not None:
+        said.append(f"sensor height: {estimate}")
+    for line in said:
+        reporter.remark(line)
+    births = _thresholds(options.bundle, task.score)
+    least = WEAK_SHARE * min(births.values()) if task.track else task.score
+    detector = open_detector(options, least, mounting, around=task.around)
+    about = _about(task, reading, mounting, detector, topic.name, least)
+    with Journal(task.out, about, detector.spec.class_names) as journal:
+        if journal.done:
+            reporter.remark(f"going on after the {journal.done} scans that {journal.path} holds")
+        if journal.differs:
+            reporter.remark(f"beginning anew: another run was killed here, with another {journal.differs}")
+        start = process_time()
+        run = _Run(detector, scans, journal)
+        for _ in reporter.track(run.results(), "Detecting", topic.messages, journal.done):
+            pass
+        seconds = process_time() - start
+        tracker = Tracker(birth_score=births) if task.track else None
+        damages.add(recording.damage)
+        times_ns = [one.time_ns for one in journal.results() if one.detections is not None]
+        if not times_ns:
+            why = run.first() or (f": {recording.damage}" if recording.damage else "")
+            raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{why}")
+        if task.track:
+            _check_times(times_ns, task, topic.name, poses, reporter)
+        results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
+        scope = detector_scope(detector.spec, around=task.around)
+        video = _video(task, detector, scans, times_ns, poses)
+        written, classes = _write(task, results, scans, calibration, scope, about, video)
+        journal.remove()
+    for line in repairs(run.kept):
+        reporter.remark(line)
+    others = (None if task.calib is None else task.out / KITTI_FILE, task.foxglove, task.rerun, task.video)
+    return RecordingResult(
+        written,
+        {name: classes[name] for name in detector.spec.class_names},
+        (task.out / RUN_FILE, *(path for path in others if path is not None)),
+        1e3 * seconds / len(run.kept) if run.kept else None,
+        (*sorted(filter(None, damages)), *run.skipped()),
+        tuple(reporter.remarks),
+    )
+
+
+class _Run:
+    """Detection of the scans that the journal does not hold yet."""
+
+    def __init__(self, detector: Detector, scans: RecordedScans, journal: Journal) -> None:
+        self._detector, self._scans, self._journal = detector, scans, journal
+        self._coming: deque[RecordedScan] = deque()
+        self.troubles = [one.trouble for one in journal.results() if one.trouble] if journal.done else []
+        self.kept: list[DetectedScan] = []
+
+    def results(self) -> Iterator[None]:
+        """One item for each scan that is in the journal now."""
+        for found in self._detector.stream(self._points()):
+            yield from self._skip()
+            scan = self._coming.popleft()
+            assert scan.scan is not None, "only scans that could be read are streamed"
+            self._journal.add(
+                ScanResult(
+                    scan.number,
+                    scan.time_ns,
+                    scan.frame_id,
+                    found,
+                    dropped_points=scan.scan.dropped_points + found.report.non_finite_points,
+                )
+            )
+            where = self._scans.recording.path / str(scan.number)
+            self.kept.append(DetectedScan(where, scan.scan.notes, found))
+            yield
+        yield from self._skip()
+
+    def first(self) -> str:
+        """The first reason why a scan was skipped, to end a sentence with."""
+        return f": {self.troubles[0]}" if self.troubles else ""
+
+    def skipped(self) -> list[str]:
+        """A sentence, if scans were skipped."""
+        return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
+
+    def _points(self) -> Iterator[NDArray[np.float32]]:
+        first = next(number for number in count() if number not in self._journal)
+        for one in self._scans.read(first):
+            if one.number in self._journal:
+                continue
+            self._coming.append(one)
+            if one.scan is not None:
+                yield one.scan.points
+
+    def _skip(self) -> Iterator[None]:
+        """Note the scans before the next one that could be read."""
+        while self._coming and self._coming[0].scan is None:
+            one = self._coming.popleft()
+            self.troubles.append(str(one.trouble))
+            self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.trouble))
+            yield
+
+
+def _thresholds(bundle: str | Path | None, score: ScoreThresholds | None) -> dict[str, float]:
+    """The score of each class from which on a detection begins a track; ConfigError if it is none."""
+    spec = load_bundle(find_bundle(bundle)).spec
+    spec = spec if score is None else spec.with_score_threshold(score)
+    return {one.name: one.score_threshold for one in spec.classes}
+
+
+def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
+    """Say that stamps are out of order or the odometry is too short; ScanError if it is of another time."""
+    if stamps := said_of_stamps(times):
+        reporter.remark(f"{task.path}, {topic}: {stamps}")
+    if poses is None:
+        return
+    outside = [time for time in times if not poses.covers(time)]
+    if not outside:
+        return
+    began, ended = ((int(poses.times_ns[end]) - min(times)) / 1e9 for end in (0, -1))
+    share = f"{len(outside)} of {len(times)} scans"
+    said = f"{task.path}, {task.odometry}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {share}"
+    if len(outside) == len(times):
+        raise ScanError(f"{said} are at other times, as of another clock; leave --odometry out")
+    reporter.remark(f"{said} lie outside, with wrong velocities over ground")
+
+
+def _about(
+    task: _Task,
+    reading: ScanSettings,
+    mounting: Mounting,
+    detector: Detector,
+    topic: str,
+    least: ScoreThresholds | None,
+) -> dict[str, Any]:
+    """All that detections depend on: a journal of anything else is not gone on with."""
+    files = recording_files(task.path)
+    return {
+        "recording": str(task.path),
+        "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files],
+        "topic": topic,
+        "made_by": detector.made_by,
+        "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
+        "runs_on": detector.runs_on,
+        **detector_scope(detector.spec, around=task.around).to_json(),
+        "score": least,
+        "around": task.around,
+        "mounting": to_dict(mounting),  # what the files that `reading` names had in them
+        "reading": {name: None if value is None else str(value) for name, value in asdict(reading).items()},
+    }
+
+
+def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.float64]:
+    """From the scan to the frame that stands still: the scan is turned to x forward, where the odometry's axes lie."""
+    level = np.eye(4)
+    level[:3, :3], level[:3, 3] = mounting.level.axes, mounting.level.shift_m
+    return np.asarray(poses.at(time_ns) @ level)
+
+
+def _video(
+    task: _Task, detector: Detector, scans: RecordedScans, times_ns: Sequence[int], poses: Poses | None
+) -> Callable[[Path], RecordingVideo] | None:
+    """A function that opens the video, or None where there is none."""
+    if task.video is None:
+        return None
+    mounting = detector.mounting
+    return partial(
+        RecordingVideo,
+        rate_hz=recording_rate_hz(times_ns),
+        view=task.video_view,
+        ranges=ranges_around(detector.spec.ranges, detector.passes),
+        level=None if mounting.level.is_identity else mounting.level,
+        scans=scans.read(),
+        pose_at=None if poses is None else partial(_pose_of_scan, poses, mounting),
+    )
+
+
+def _write(
+    task: _Task,
+    results: Iterator[Found],
+    scans: RecordedScans,
+    calibration: Any,
+    scope: DetectorScope,
+    about: dict[str, Any],
+    video: Callable[[Path], RecordingVideo] | None,
+) -> tuple[int, Counter[str]]:
+    """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
+    with ExitStack() as places, ExitStack() as handles:
+        place = places.enter_context(atomic_path(task.out / ABOUT_FILE))
+        place.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")
+        text = places.enter_context(atomic_path(task.out / RUN_FILE))
+        files: list[ResultFile] = [JsonLines(open_text(handles, text), task.path.name, scope)]
+        if calibration is not None:
+            kitti = places.enter_context(atomic_path(task.out / KITTI_FILE))
+            files.append(KittiTracks(open_text(handles, kitti), calibration))
+        if task.foxglove is not None:
+            place = places.enter_context(atomic_path(task.foxglove))
+            foxglove = FoxgloveFile(handles.enter_context(place.open("wb")))
+            handles.callback(foxglove.finish)
+            files.append(foxglove)
+        if task.rerun is not None:
+            rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
+            handles.callback(rerun.finish)
+            files.append(rerun)
+        if task.video is not None and video is not None:
+            place = places.enter_context(atomic_path(task.video))
+            drawn = video(place)
+            handles.callback(drawn.finish)
+            files.append(drawn)
+        scans_written = 0
+        classes: Counter[str] = Counter()
+        for found in results:
+            scans_written += 1
+            classes.update(found.detections.names)
+            for file in files:
+                file.write(found)
+        handles.close()  # before the names are changed
+    remove_companions(task.out, [ABOUT_FILE, *([] if calibration is None else [KITTI_FILE])])
+    return scans_written, classes

@@ -1,0 +1,85 @@
+"""`asca detect --video`: the options, looked at before the work, and the video of a recording."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.recordings.results import Found
+from asca_deploy.result_files import COMMAND
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.writable_file import require_suffix, require_writable
+from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.pictures.video import SUFFIX, BoxVideo, VideoFile, VideoView, find_encoder, is_own_video
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan
+
+_RATES_HZ = (1.0, 60.0)
+_USUAL_RATE_HZ = 10.0
+
+
+def video_options(video: Path | None, view: str, inputs: Sequence[Path]) -> VideoView:
+    """The view that was asked for, after a look at whether the video can be written.
+
+    Raises:
+        AscaError: there is no such view or no encoder, or `video` is another's file, an input, or no .mp4.
+    """
+    known: dict[str, VideoView] = {name: name for name in get_args(VideoView)}
+    if view not in known:
+        raise ConfigError(f"--video-view {view}: give {' or '.join(known)}")
+    if video is None:
+        if view != "above":
+            raise ConfigError(f"--video-view {view}: is of a video; give --video FILE.mp4, too")
+        return "above"
+    require_suffix("--video", video, SUFFIX)
+    find_encoder()
+    require_writable(video, COMMAND, is_own_video, inputs)
+    return known[view]
+
+
+def recording_rate_hz(times_ns: Sequence[int]) -> float:
+    """Scans per second of a recording, by the usual pause between two of them; 10 where that says nothing."""
+    steps = np.diff(np.sort(np.array(times_ns, np.int64)))
+    steps = steps[steps > 0]
+    return float(np.clip(1e9 / float(np.median(steps)), *_RATES_HZ)) if len(steps) else _USUAL_RATE_HZ
+
+
+class RecordingVideo:
+    """Draws each scan of a recording with its boxes and tracks; OSError if it cannot be written.
+
+    Args:
+        path: to write to.
+        rate_hz: scans per second.
+        view: "above" or "chase".
+        ranges: where the detector looked, level frame.
+        level: from the scans to a level frame; None: they are level.
+        scans: those of the results, in the same order; others are passed over.
+        pose_at: the pose of a scan at a time in nanoseconds, 4x4; None: it is not known.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        rate_hz: float,
+        view: VideoView,
+        ranges: Ranges,
+        level: FrameChange | None,
+        scans: Iterator[RecordedScan],
+        pose_at: Callable[[int], NDArray[np.float64]] | None,
+    ) -> None:
+        self._file, self._scans, self._pose_at = VideoFile(path, rate_hz), scans, pose_at
+        self._video = BoxVideo(self._file, view, ranges, level)
+
+    def write(self, found: Found) -> None:
+        """One picture."""
+        points = next(one.scan.points for one in self._scans if one.number == found.number and one.scan is not None)
+        ids = None if found.tracks is None else found.tracks.track_ids
+        pose = None if self._pose_at is None else self._pose_at(found.time_ns)
+        self._video.add(points, found.detections, found.time_ns / 1e9, ids, pose)
+
+    def finish(self) -> None:
+        """Write the end."""
+        self._file.finish()

@@ -1,0 +1,1 @@
+"""`asca ros2`: a node that answers a topic of point clouds with boxes."""

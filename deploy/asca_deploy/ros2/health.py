@@ -1,0 +1,105 @@
+"""How a node fares: counters and latencies, as a line of its log and as what its diagnostics say."""
+
+import threading
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from asca_deploy.ros2.messages import ERROR, OK, WARN
+
+_QUIET_S = 2.0
+"""A sensor that sends nothing for so long is worth a warning."""
+_MOST_LATENCIES = 10_000
+
+
+@dataclass
+class Health:
+    """Counters since the start; several threads count."""
+
+    received: int = 0
+    """Messages of the topic."""
+    answered: int = 0
+    dropped: int = 0
+    """Scans that gave way to a later one before the detector had time for them."""
+    lost: int = 0
+    """Messages that the middleware says it lost."""
+    unreadable: int = 0
+    trouble: str | None = None
+    """Why the last unreadable one was that."""
+    warnings: tuple[str, ...] = ()
+    """Of the last answered scan."""
+    failure: str | None = None
+    """Why the detector ended."""
+    latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_LATENCIES))
+    """From a message's arrival to its answer, of the scans since the last `summary`."""
+    boxes: Counter[str] = field(default_factory=Counter)
+    """By class, likewise."""
+    _last_message_s: float = field(default_factory=monotonic)
+    _since: tuple[float, int] = field(default_factory=lambda: (monotonic(), 0))
+    _told: tuple[int, int, int] = (0, 0, 0)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def take(self) -> None:
+        """A message came."""
+        with self._lock:
+            self.received += 1
+            self._last_message_s = monotonic()
+
+    def refuse(self, why: str) -> None:
+        """The message could not be read."""
+        with self._lock:
+            self.unreadable += 1
+            self.trouble = why
+
+    def answer(self, latency_ms: float, names: list[str], warnings: tuple[str, ...]) -> None:
+        """A scan was answered with boxes of these classes."""
+        with self._lock:
+            self.answered += 1
+            self.latencies_ms.append(latency_ms)
+            self.boxes.update(names)
+            self.warnings = warnings
+
+    def summary(self) -> dict[str, Any]:
+        """What happened since the last call, and the counters since the start."""
+        with self._lock:
+            now, (since, answered) = monotonic(), self._since
+            self._since = now, self.answered
+            figures: dict[str, Any] = {
+                "received": self.received,
+                "answered": self.answered,
+                "dropped": self.dropped,
+                "lost": self.lost,
+                "unreadable": self.unreadable,
+                "answers_per_s": round((self.answered - answered) / max(now - since, 1e-9), 2),
+            }
+            if self.latencies_ms:
+                p50, p95, p99 = np.percentile(np.array(self.latencies_ms), [50, 95, 99])
+                latest = {"p50": p50, "p95": p95, "p99": p99, "max": max(self.latencies_ms)}
+                figures["latency_ms"] = {name: round(float(value), 1) for name, value in latest.items()}
+            figures["boxes"] = dict(self.boxes)
+            self.latencies_ms.clear()
+            self.boxes.clear()
+            return figures
+
+    def status(self, topic: str, publishers: int) -> tuple[int, str]:
+        """A level of diagnostics and a sentence about the time since the last call."""
+        with self._lock:
+            before, self._told = self._told, (self.dropped, self.lost, self.unreadable)
+            dropped, lost, unreadable = (now - then for now, then in zip(self._told, before, strict=True))
+            quiet_s = monotonic() - self._last_message_s
+            if self.failure:
+                return ERROR, self.failure
+            if not publishers:
+                return WARN, f"nobody publishes {topic}"
+            if quiet_s > _QUIET_S:
+                return WARN, f"no scan on {topic} for {quiet_s:.0f} s"
+            if unreadable:
+                return WARN, f"{unreadable} scans could not be read: {self.trouble}"
+            if dropped or lost:
+                return WARN, f"{dropped} scans dropped for later ones, {lost} lost on the way"
+            if self.warnings:
+                return WARN, self.warnings[0]
+            return OK, "every scan is answered"

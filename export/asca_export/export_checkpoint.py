@@ -1,0 +1,197 @@
+"""A checkpoint, or a bundle that holds its weights, becomes a bundle: what `asca export` does."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.bundle import BUNDLE_FOLDER, MANIFEST, Bundle
+from asca_deploy.manifest import load_bundle
+from asca_deploy.shipped import find_checkpoint
+from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_pillars.base.extras import require
+from asca_pillars.base.own_files import require_not_input, require_replaceable
+from asca_pillars.base.progress import Progress, Reporter
+from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.scan_reader import read_scan
+
+if TYPE_CHECKING:
+    from asca_pillars.models.checkpoint import Checkpoint
+
+PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
+CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
+
+View = Literal["camera", "full"]
+
+
+class Source(NamedTuple):
+    """What is exported, and what it says of itself."""
+
+    path: Path
+    """Of the checkpoint."""
+    checkpoint: "Checkpoint"
+    score_thresholds: dict[str, float]
+    """Of the bundle that holds the checkpoint, class by class; empty of others: those of its config are meant."""
+    trained_on: str
+    command: str
+    """That trained it."""
+
+
+def export(
+    checkpoint: str | Path,
+    out: str | Path,
+    *,
+    scans: str | Path | None = None,
+    trained_on: str | None = None,
+    score: ScoreThresholds | None = None,
+    range_m: tuple[float, float, float, float] | None = None,
+    int8: bool = False,
+    calibrate: str | Path | None = None,
+    dense_neck: bool = False,
+    with_weights: bool = False,
+    progress: Progress | None = None,
+    step: Callable[[str], None] | None = None,
+) -> Bundle:
+    """Export to ONNX, and compare with PyTorch on scans, head maps and boxes; what `asca export` does.
+
+    Args:
+        checkpoint: of a run, or a bundle (folder, or name of one that ships) that holds its weights.
+        out: folder of the bundle; an earlier bundle there is replaced.
+        scans: like those trained on, to compare on; None: simulated ones.
+        trained_on: what the weights saw, for the manifest; None: what a bundle says of itself.
+        score: thresholds of the bundle; None: those of the checkpoint.
+        range_m: where the bundle looks for objects, x0 x1 y0 y1 in metres; None: as trained.
+        int8: make the graphs 8-bit ones.
+        calibrate: scans to calibrate these with; None: simulated ones.
+        dense_neck: write a sparse neck as dense convolutions with masks.
+        with_weights: add the weights, in 16 bits.
+        progress: called while scans are simulated.
+        step: told what is being done.
+
+    Returns:
+        The manifest; `parity` and `quantization` say how far it is from the checkpoint.
+
+    Raises:
+        AscaError: an argument cannot be used, `out` holds something else, or the graphs differ from PyTorch.
+    """
+    require("train")
+    from asca_export.export import export_bundle
+    from asca_export.pillar.export import require_maskable
+    from asca_export.proven_bundle import ExportOptions
+
+    checkpoint, out, reporter = Path(checkpoint), Path(out), Reporter(progress)
+    require_replaceable(out, *BUNDLE_FOLDER)  # before minutes of work
+    require_not_input(out, (scans, calibrate))
+    source = open_source(checkpoint)
+    loaded = source.checkpoint
+    spec = loaded.config.model.spec.with_score_threshold(source.score_thresholds)
+    if score is not None:
+        spec = spec.with_score_threshold(score)
+    if range_m is not None:
+        spec = with_ranges(spec, range_m)
+    model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
+    loaded = loaded.with_model(model)
+    if calibrate is not None and not int8:
+        raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
+    require_not_input(out, (getattr(model, "first_stage", None),))
+    if dense_neck:
+        require_maskable(loaded.config.model, int8=int8)
+    if loaded.expected_input is None and scans is None:
+        raise ConfigError(
+            f"{checkpoint} does not say what its training scans looked like, which the bundle has to know; "
+            "give some of them with --scans"
+        )
+    points = read_or_simulate(scans, reporter, PARITY_SCANS, PARITY_SEED)
+    # Ranges are those of what the model was trained on; parity has to hold for whole revolutions too.
+    view: View = "camera" if loaded.config.data.camera_view else "full"
+    calibration = read_or_simulate(calibrate, reporter, CALIBRATION_SCANS, CALIBRATION_SEED, view) if int8 else None
+    # A bundle that is written anew from its own weights keeps them: they may be the only ones.
+    keeps = with_weights or source.path.parent.resolve() == out.resolve()
+    options = ExportOptions(
+        trained_on=trained_on or source.trained_on,
+        command=source.command,
+        calibration=calibration,
+        dense_neck=dense_neck,
+        weights=source.path if keeps else None,
+    )
+    return export_bundle(loaded, out, points, options if step is None else replace(options, progress=step))
+
+
+def open_source(source: Path) -> Source:
+    """A checkpoint, or a bundle (folder, or name of one that ships) that holds its own.
+
+    Raises:
+        AscaError: it is missing, damaged or a bundle without weights.
+    """
+    from asca_pillars.models.checkpoint import load_checkpoint
+
+    path = find_checkpoint(source)
+    checkpoint = load_checkpoint(path)
+    if not (path.parent / MANIFEST).exists():  # the folder of a run's checkpoints holds weights, too
+        source = path
+    if path == source:
+        command = run_environment(source).get("command", "not recorded")
+        return Source(path, checkpoint, {}, "not stated", command)
+    bundle = load_bundle(path.parent)
+    scores = {each.name: each.score_threshold for each in bundle.spec.classes}
+    return Source(path, checkpoint, scores, bundle.provenance.trained_on, bundle.provenance.command)
+
+
+def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:
+    """The same detector that looks for objects elsewhere: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
+
+    Raises:
+        ConfigError: it is no detector on pillars, or pillars do not fill these ranges; the nearest that fit are named.
+    """
+    if not isinstance(spec, PillarSpec):
+        raise ConfigError("--range: only detectors on pillars look elsewhere with the same weights; leave it out")
+    x0, x1, y0, y1 = range_m
+    return replace(spec, grid=replace(spec.grid, x_range_m=(x0, x1), y_range_m=(y0, y1)))
+
+
+def read_or_simulate(
+    folder: str | Path | None, reporter: Reporter, most: int, seed: int, view: View = "full"
+) -> list[NDArray[np.float32]]:
+    """Scans of a folder, evenly spaced if there are more than `most`; without a folder simulated ones.
+
+    Each is (N, 4): x, y, z in metres, LiDAR frame, and reflectance.
+    """
+    if folder is not None:
+        paths = find_scans(folder)
+        chosen = paths if len(paths) <= most else [paths[i * len(paths) // most] for i in range(most)]
+        return [read_scan(path).points for path in chosen]
+    require("sim")
+    from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
+
+    config = SimulationConfig(field_of_view=view)
+    frames = reporter.track(range(most), f"Simulating {most} scans")
+    return [simulate_frame(seed, index, config).points for index in frames]
+
+
+def run_environment(checkpoint: Path) -> dict[str, Any]:
+    """What the run wrote of itself, if the checkpoint still lies in its run's folder.
+
+    Raises:
+        TrainingError: the file there is damaged.
+    """
+    path = checkpoint.parent.parent / "environment.json"
+    if not path.exists():
+        return {}
+    try:
+        environment = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # not JSON, or not UTF-8
+        reason = " ".join(str(error).split())
+    else:
+        if isinstance(environment, dict) and isinstance(environment.get("command", ""), str):
+            return environment
+        reason = "no object with the text `command`"
+    raise TrainingError(
+        f"{path}: not what `asca train` wrote, or damaged ({reason}); delete it, and the bundle will not say which "
+        "command trained it"
+    )

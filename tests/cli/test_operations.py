@@ -1,0 +1,112 @@
+"""What programs that run `asca` go by: exit codes, JSON, deadlines, and what results say about the model."""
+
+import errno
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+
+from asca_deploy import Detector, default_bundle_path
+from asca_pillars.base import errors
+from asca_pillars.cli import doctor_checks
+from asca_pillars.cli.run_command import run_command
+from asca_pillars.scans.scan_reader import write_scan
+from tests.in_process import run_here
+
+DEPLOY = Path(__file__).parents[2] / "docs" / "guide" / "deploy.md"
+KINDS = {
+    2: {errors.ConfigError, errors.OutputError},
+    3: {errors.PartialError},
+    4: {errors.ScanError, errors.DatasetError, errors.BundleError, errors.ExportError, errors.TrainingError},
+    5: {errors.AscaError, errors.ProviderError, errors.ClusterError, errors.WorkerError},
+}
+
+
+def code_of(error: BaseException) -> int:
+    def fail() -> None:
+        raise error
+
+    app = typer.Typer()
+    app.command()(fail)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:
+        patch.setattr("sys.argv", ["asca"])
+        run_command(app, "asca")
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def test_every_kind_of_error_has_its_exit_code() -> None:
+    classes = [one for one in vars(errors).values() if isinstance(one, type) and issubclass(one, errors.AscaError)]
+    assert set().union(*KINDS.values()) == set(classes)
+    for code, own in KINDS.items():
+        assert {code_of(kind("said")) for kind in own} == {code}
+        assert f"| {code} |" in DEPLOY.read_text()
+    assert code_of(FileNotFoundError(errno.ENOENT, "no such file", "x")) == 4
+    assert code_of(OSError(errno.ENOSPC, "disk full", "x")) == code_of(MemoryError()) == 5
+
+
+def test_a_scan_that_cannot_be_read_makes_a_run_partial(tmp_path: Path) -> None:
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "1.bin").write_bytes(b"torn")
+    write_scan(tmp_path / "scans" / "2.bin", np.ones((3, 4), np.float32))
+    done = run_here("detect", tmp_path / "scans", "--no-pictures", "--out", tmp_path / "out", "--write", "openpcdet")
+    assert done.returncode == 3, done.stderr
+    assert [path.name for path in (tmp_path / "out" / "openpcdet").iterdir()] == ["2.txt"]
+    assert run_here("detect", tmp_path / "none.bin", cwd=tmp_path).returncode == 4
+    assert run_here("detect", "--score", "Tram=1", cwd=tmp_path).returncode == 2
+    line = json.loads((tmp_path / "out" / "detections.jsonl").read_text())
+    assert line["made_by"] == Detector().made_by
+    assert set(line["made_by"]) == {"model", "weights_sha256", "version"}
+
+
+def test_doctor_as_json_says_whether_the_model_runs() -> None:
+    done = run_here("doctor", "--json")
+    assert done.returncode == 0
+    checks = json.loads(done.stdout)
+    assert checks["model"]["ok"] and checks["model"]["made_by"]["model"] == checks["model"]["name"]
+    assert checks["providers"]["cpu"] == {"ok": True, "says": "ok"}
+    assert set(checks["extras"]["train"]) == {"ok", "says"}
+
+    def broken() -> dict:
+        raise errors.BundleError("damaged")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(doctor_checks, "_bundled_model", broken)
+        done = run_here("doctor")
+    assert done.returncode == 1 and "damaged" in done.stdout
+
+
+def test_a_deadline_is_judged(tmp_path: Path) -> None:
+    write_scan(tmp_path / "1.bin", np.ones((3, 4), np.float32))
+    command = ("bench", tmp_path / "1.bin", "--rounds", 2, "--bundle", "asca_small_sim_int8", "--deadline")
+    late = run_here(*command, 0.001, "--late", 0.5, "--json", tmp_path / "report.json")
+    assert late.returncode == 1 and "later than 0.001 ms: 100.0% of 2 frames" in late.stdout, late.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["late_share"] == 1 and report["made_by"]["model"] == "asca_small_sim_int8"
+    total = report["total_ms"]
+    assert total["min"] <= total["p50"] <= total["p95"] <= total["p99"] <= total["max"]
+    assert run_here(*command, 1e6, "--late", 0).returncode == 0
+
+
+def test_bundles_are_listed_described_and_verified(tmp_path: Path) -> None:
+    assert "asca_sim_int8: pillar, int8, 3.4 MiB, Apache-2.0, the default" in run_here("bundle", "list").stdout
+    about = json.loads(run_here("bundle", "info", "--json").stdout)
+    assert about["weights_sha256"] == Detector().made_by["weights_sha256"]
+    folder = shutil.copytree(default_bundle_path(), tmp_path / "bundle")
+    whole = run_here("bundle", "verify", folder)
+    assert whole.returncode == 0 and "whole; " in whole.stdout
+    path = folder / "backbone.onnx"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    damaged = run_here("bundle", "verify", folder)
+    assert damaged.returncode == 4 and "backbone.onnx is damaged" in damaged.stderr
+
+
+def test_warm_up_changes_no_result(caplog: pytest.LogCaptureFixture) -> None:
+    points = np.random.default_rng(1).uniform(0, 1, (2000, 4)).astype(np.float32) * [40, 8, 2, 1] - [0, 4, 2, 0]
+    fresh, warm = Detector("asca_small_sim_int8"), Detector("asca_small_sim_int8")
+    assert warm.warm_up(5000) > 0
+    assert not caplog.records
+    np.testing.assert_array_equal(warm(points).boxes, fresh(points).boxes)

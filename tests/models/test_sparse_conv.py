@@ -1,0 +1,112 @@
+"""Table convolutions against dense ones, forward and backward."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F  # noqa: N812  (torch's own convention)
+
+from asca_pillars.models import sparse_conv as module
+from asca_pillars.models.sparse_conv import rulebook_conv
+from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
+from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
+
+CASES = (
+    ((1, 8, 10), map_convolution(3, stride=2, padding=1)),
+    ((1, 8, 10), map_convolution(3, padding=1)),
+    ((7, 6, 8), SUBMANIFOLD),
+    *(((7, 6, 8), convolution) for convolution in PV_RCNN_STRIDED),
+)
+
+
+def make_tables(
+    shape: Shape, convolution: Convolution, share: float = 0.2
+) -> tuple[CellMap, CellMap, tuple[torch.Tensor, torch.Tensor]]:
+    """Input and output cells, and the two tables; cells of submanifold convolutions stay."""
+    source, target = CellMap(shape), CellMap(convolution.output_shape(shape))
+    source.activate(np.flatnonzero(np.random.default_rng(0).random(int(np.prod(shape))) < share))
+    if target.shape == shape:
+        target = source
+    else:
+        target.activate_joined([(source, convolution.outputs(source.shape, target.shape))])
+    table = target.table(source, convolution.inputs(target.shape, source.shape))
+    back = source.table(target, convolution.outputs(source.shape, target.shape))
+    return source, target, (torch.from_numpy(table), torch.from_numpy(back))
+
+
+@pytest.mark.parametrize(("shape", "convolution"), CASES)
+@pytest.mark.parametrize("chunk", [64, 1 << 20])
+def test_equals_the_dense_convolution(
+    shape: Shape, convolution: Convolution, chunk: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "CHUNK_VALUES", chunk)
+    torch.manual_seed(0)
+    source, target, (table, back) = make_tables(shape, convolution)
+    features = torch.randn(len(source), 3, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(5, 3, *convolution.kernel, dtype=torch.float64, requires_grad=True)
+    z, y, x = shape
+    volume = features.new_zeros(y * x * z, 3).index_put((torch.from_numpy(source.cells),), features)
+    volume = F.conv3d(
+        volume.view(y, x, z, 3).permute(3, 2, 0, 1)[None], weight, None, convolution.stride, convolution.padding
+    )
+    expected = volume[0].permute(2, 3, 1, 0).reshape(-1, 5)[torch.from_numpy(target.cells)]
+    found = rulebook_conv(features, weight, table, None if target is source else back)
+    torch.testing.assert_close(found, expected)
+    upstream = torch.randn_like(expected)
+    for one, other in zip(
+        torch.autograd.grad(found, (features, weight), upstream),
+        torch.autograd.grad(expected, (features, weight), upstream),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("convolution", [SUBMANIFOLD, PV_RCNN_STRIDED[0]])
+def test_gradients_are_those_of_finite_differences(convolution: Convolution) -> None:
+    torch.manual_seed(0)
+    source, _, tables = make_tables((4, 3, 4), convolution, share=0.3)
+    features = torch.randn(len(source), 2, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(3, 2, *convolution.kernel, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda f, w: rulebook_conv(f, w, *tables), (features, weight))
+
+
+def test_nothing_active_gives_nothing() -> None:
+    _, _, (table, back) = make_tables((1, 8, 10), map_convolution(3, stride=2, padding=1), share=0)
+    weight = torch.randn(3, 2, 1, 3, 3, requires_grad=True)
+    found = rulebook_conv(torch.empty(0, 2), weight, table, back)
+    assert found.shape == (0, 3)
+    found.sum().backward()
+    assert weight.grad is not None and not weight.grad.any()
+
+
+def test_autocast_computes_in_bfloat16_and_adds_up_in_float32() -> None:
+    torch.manual_seed(0)
+    source, _, (table, back) = make_tables((1, 40, 40), map_convolution(3, padding=1), share=0.5)
+    features = torch.randn(len(source), 8, requires_grad=True)
+    weight = torch.randn(8, 8, 1, 3, 3, requires_grad=True)
+    expected = rulebook_conv(features, weight, table, back)
+    (exact,) = torch.autograd.grad(expected.square().sum(), weight)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = rulebook_conv(features, weight, table, back)
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found.float(), expected, rtol=0.02, atol=0.2)
+    (rounded,) = torch.autograd.grad(found.float().square().sum(), weight)
+    assert rounded.dtype == torch.float32
+    assert float((rounded - exact).norm() / exact.norm()) < 0.02
+
+
+def test_the_same_bits_in_every_run() -> None:
+    torch.manual_seed(0)
+    source, _, (table, back) = make_tables((1, 64, 64), map_convolution(3, padding=1), share=0.4)
+    features = torch.randn(len(source), 16, requires_grad=True)
+    weight = torch.randn(16, 16, 1, 3, 3, requires_grad=True)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(4)
+        results = []
+        for _ in range(20):
+            found = rulebook_conv(features, weight, table, back)
+            results.append((found.detach(), *torch.autograd.grad(found.square().sum(), (features, weight))))
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
