@@ -127,6 +127,7 @@ def detect(
 
     from asca_deploy import sample_scan_path
     from asca_deploy.open_model import RuntimeOptions
+    from asca_deploy.recordings.video import require_video
     from asca_pillars.cli.progress import Bars
     from asca_pillars.scans.recordings.open_recording import is_recording
 
@@ -137,6 +138,7 @@ def detect(
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
+    view = require_video(video, video_view, [*(scans or ()), *([] if calib is None else [calib])])
     recordings = [path for path in scans or () if is_recording(path)]
     if write is not None:
         from asca_pillars.data.importing.tool_labels import require_unchanged
@@ -164,7 +166,7 @@ def detect(
                 foxglove=foxglove,
                 rerun=rerun,
                 video=video,
-                video_view=video_view,
+                video_view=view,
                 options=options,
                 reading=reading,
                 score=scores,
@@ -213,7 +215,7 @@ def detect(
             around=around,
             pictures=pictures is not False,
             video=video,
-            video_view=video_view,
+            video_view=view,
             progress=bars,
             failed=lambda line: print(f"asca: {line}", file=sys.stderr),
         )

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
 from asca_deploy.open_model import RuntimeOptions, open_detector
-from asca_deploy.recordings.video import video_options
 from asca_deploy.result_files import ResultWriter
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import sample_scan_path
@@ -21,6 +20,7 @@ from asca_pillars.base.errors import ScanError, printable
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
+from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.find_scans import name_scans
 from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import ScanNotes
@@ -80,7 +80,7 @@ def detect_scans(
     around: bool = False,
     pictures: bool = True,
     video: str | Path | None = None,
-    video_view: str = "above",
+    video_view: VideoView = "above",
     progress: Progress | None = None,
     failed: Remark | None = None,
 ) -> DetectedScans:
@@ -94,8 +94,8 @@ def detect_scans(
         score: report detections from this score on, or by class; None: the thresholds of the model.
         around: look in every direction, by turned passes.
         pictures: whether pictures are drawn into `out`.
-        video: with `out`, an .mp4 of all scans to write; None: none.
-        video_view: "above" or "chase".
+        video: an .mp4 of all scans, written with `out`; None makes none.
+        video_view: from above, or "chase" in 3D.
         progress: called after each scan.
         failed: called with a line for each scan that cannot be read or written, as soon as that is known.
 
@@ -104,7 +104,6 @@ def detect_scans(
         AscaError: the model cannot be opened, or `out` holds something else; one line with the remedy.
     """
     chosen = [sample_scan_path()] if scans is None else [scans] if isinstance(scans, str | Path) else scans
-    view = video_options(None if video is None else Path(video), video_view, [Path(path) for path in chosen])
     named = name_scans([Path(path) for path in chosen])
     scan_input = ScanInput(reading, [path for path, _ in named])
     detector = open_detector(options, score, scan_input.mounting, around=around)
@@ -117,7 +116,7 @@ def detect_scans(
             pictures=pictures,
             scope=scope,
             video=None if video is None else Path(video),
-            video_view=view,
+            video_view=video_view,
         )
     reporter = Reporter(progress if len(named) > 1 else None, failed)
     results: list[DetectedScan] = []

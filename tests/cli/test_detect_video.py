@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from asca_deploy import result_files
-from asca_deploy.recordings import video as video_module
-from asca_deploy.recordings.video import recording_rate_hz, video_options
+from asca_deploy.recordings import video as recording_video
+from asca_deploy.recordings.video import recording_rate_hz, require_video
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError
 from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.video import is_own_video
@@ -53,7 +53,7 @@ def test_a_recording_becomes_a_video_of_tracks(drive: Path, tmp_path: Path) -> N
 def test_what_cannot_be_a_video_is_refused_before_the_work(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(video_module, "find_encoder", lambda: "ffmpeg")
+    monkeypatch.setattr(recording_video, "find_encoder", lambda: "ffmpeg")
     (tmp_path / "mine.mp4").write_bytes(b"\0\0\0\x20ftypisom of mine")
     cases: list[tuple[dict[str, Any], type[AscaError], str]] = [
         ({"video": tmp_path / "mine.mp4"}, OutputError, "mine.mp4: `asca detect` did not write it"),
@@ -67,7 +67,7 @@ def test_what_cannot_be_a_video_is_refused_before_the_work(
             detect([folder], out=tmp_path / "out", threads=1, **options)
     assert not (tmp_path / "out").exists()
     monkeypatch.undo()
-    assert video_options(None, "above", []) == "above"
+    assert require_video(None, "above", []) == "above"
 
 
 def test_a_video_runs_as_fast_as_its_recording() -> None:

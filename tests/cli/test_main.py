@@ -89,7 +89,7 @@ def test_detect_finds_boxes_in_the_sample_without_torch(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "Car" in result.stdout and "FPS" in result.stdout and "pillarize" in result.stdout
     out = tmp_path / "detections"
-    assert {path.name for path in out.iterdir()} == {"detections.jsonl", "street.json", "street_bev.png"}
+    assert {path.name for path in out.iterdir()} == {"detections.jsonl", "index.html", "street.json", "street_bev.png"}
     boxes = json.loads((out / "street.json").read_text())["boxes"]
     expected = Detector()(read_scan(sample_scan_path()).points)
     assert [box["class"] for box in boxes] == expected.names and len(boxes) >= 3
@@ -125,7 +125,7 @@ def test_doctor_names_the_missing_extras() -> None:
     result = asca("doctor")
     assert result.returncode == 0, result.stderr
     assert "provider cpu: ok" in result.stdout
-    assert install_command("train") in result.stdout and install_command("sim") in result.stdout
+    assert install_command("train") in result.stdout and install_command("cluster") in result.stdout
     assert f"provider openvino is not installed: `{install_command('openvino')}`" in result.stdout
     assert "auto takes cpu int8" in result.stdout
 
@@ -165,7 +165,6 @@ def test_commands_whose_extra_is_missing_say_what_to_install(tmp_path: Path) -> 
     message = refusal(asca("train", tmp_path / "config.yaml", "--data", tmp_path, "--out", tmp_path / "run"))
     assert install_command("train") in message
     assert install_command("train") in refusal(asca("export", "last.ckpt", "-o", tmp_path / "bundle"))
-    assert install_command("sim") in refusal(asca("simulate", tmp_path / "sim", "-n", 1))
 
 
 def test_train_refuses_typos_and_missing_data(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from asca_deploy.recordings.results import (
     said_of_stamps,
     tracked,
 )
-from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz, video_options
+from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz
 from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
 from asca_deploy.shipped import find_bundle
 from asca_deploy.tracker import WEAK_SHARE, Tracker
@@ -108,7 +108,7 @@ def detect_recording(
     foxglove: str | Path | None = None,
     rerun: str | Path | None = None,
     video: str | Path | None = None,
-    video_view: str = "above",
+    video_view: VideoView = "above",
     options: RuntimeOptions = _PLAIN,
     reading: ScanSettings = _AS_TRAINED,
     score: ScoreThresholds | None = None,
@@ -127,8 +127,8 @@ def detect_recording(
         calib: KITTI calibration, for KITTI's tracking text in `out`.
         foxglove: an .mcap to write for Foxglove.
         rerun: an .rrd to write for the rerun viewer.
-        video: an .mp4 to write.
-        video_view: "above" or "chase".
+        video: an .mp4 to write, boxes with their tracks.
+        video_view: from above, or "chase" in 3D.
         options: which model runs, and how.
         reading: how the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
@@ -152,7 +152,7 @@ def detect_recording(
         foxglove=None if foxglove is None else Path(foxglove),
         rerun=None if rerun is None else Path(rerun),
         video=None if video is None else Path(video),
-        video_view=video_options(None if video is None else Path(video), video_view, [Path(path)]),
+        video_view=video_view,
     )
     return _detect(task, reading, options, Reporter(progress, remark))
 

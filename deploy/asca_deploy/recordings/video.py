@@ -1,4 +1,4 @@
-"""`asca detect --video`: the options, looked at before the work, and the video of a recording."""
+"""Videos of detections: a check before the work that one can be written, and that of a recording."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ _RATES_HZ = (1.0, 60.0)
 _USUAL_RATE_HZ = 10.0
 
 
-def video_options(video: Path | None, view: str, inputs: Sequence[Path]) -> VideoView:
+def require_video(video: Path | None, view: str, inputs: Sequence[Path]) -> VideoView:
     """The view that was asked for, after a look at whether the video can be written.
 
     Raises:
