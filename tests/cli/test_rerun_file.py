@@ -14,6 +14,7 @@ from asca_deploy.recordings import detect_recording as steps
 from asca_deploy.recordings.journal import JOURNAL_FILE
 from asca_deploy.recordings.rerun_file import is_own_rrd
 from asca_pillars.base.errors import ConfigError, OutputError
+from asca_pillars.pictures.colors import class_rgb
 from tests.cli.short_drive import SCANS
 from tests.cli.test_detect_recording import run
 
@@ -22,7 +23,8 @@ def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
     rerun = pytest.importorskip("rerun", reason="needs pip install -e '.[view]'")
     lines = run(drive, tmp_path / "out", track=True, rerun=tmp_path / "out.rrd")
     boxes: dict[int, list[str]] = {}
-    points = 0
+    points = arrows = 0
+    colors: set[int] = set()
     for chunk in rerun.chunk.RrdReader(tmp_path / "out.rrd").stream():
         batch = chunk.to_record_batch()
         if chunk.entity_path == "/boxes":
@@ -30,6 +32,13 @@ def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
             boxes |= dict(zip(times, labels, strict=True))
         if chunk.entity_path == "/scan":
             points += sum(map(len, batch["Points3D:positions"].to_pylist()))
+        if chunk.entity_path == "/velocities":
+            arrows += sum(map(len, batch["Arrows3D:vectors"].to_pylist()))
+        if chunk.entity_path == "/boxes":
+            colors |= {color for scan in batch["Boxes3D:colors"].to_pylist() for color in scan}
+    assert arrows > 0
+    spoken = {box["class"] for line in lines for box in line["boxes"]}
+    assert {color >> 8 for color in colors} == {int.from_bytes(bytes(class_rgb(name))) for name in spoken}
     assert is_own_rrd(tmp_path / "out.rrd")
     assert boxes == {line["time_ns"]: [f"{box['class']} {box['track_id']}" for box in line["boxes"]] for line in lines}
     assert 1000 * SCANS < points <= 20_000 * SCANS
@@ -70,8 +79,13 @@ def test_what_rerun_cannot_write_ends_the_run(
         def __getattr__(self, _: str) -> Any:
             return lambda *_, **__: None
 
-    made = SimpleNamespace(RecordingStream=Stream, Points3D=lambda *_, **__: None, Boxes3D=lambda **_: None)
+    def nothing(*_: Any, **__: Any) -> None:
+        """Stands for what is logged."""
+
+    made = SimpleNamespace(RecordingStream=Stream, Points3D=nothing, Boxes3D=nothing, Arrows3D=nothing)
+    made.blueprint = SimpleNamespace(Blueprint=nothing, Spatial3DView=nothing)
     monkeypatch.setitem(sys.modules, "rerun", made)
+    monkeypatch.setitem(sys.modules, "rerun.blueprint", made.blueprint)
     monkeypatch.setattr(steps, "require", lambda extra: None)
     with pytest.raises(OSError, match=r"rerun cannot write \(File-writer .*is the disk full") as failure:
         run(drive, tmp_path / "out", rerun=tmp_path / "out.rrd")

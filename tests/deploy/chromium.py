@@ -58,10 +58,10 @@ class Tab:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
-    def choose_file(self, selector: str, path: Path) -> None:
+    def choose_file(self, selector: str, *paths: Path) -> None:
         """What a user does with an `<input type="file">`."""
         node = self.call("Runtime.evaluate", expression=f"document.querySelector({selector!r})")["result"]["objectId"]
-        self.call("DOM.setFileInputFiles", files=[str(path)], objectId=node)
+        self.call("DOM.setFileInputFiles", files=[str(path) for path in paths], objectId=node)
 
     def screenshot(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))

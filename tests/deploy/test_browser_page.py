@@ -80,6 +80,11 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         tab.choose_file("#file", tmp_path / "outside.bin")
         nothing = finished(tab, "outside.bin")
         assert (nothing["pillars"], nothing["boxes"]) == (0, [])
+        tab.choose_file("#file", tmp_path / "half.bin", tmp_path / "ahead.bin")  # the first by name, then the other
+        finished(tab, "ahead.bin")
+        tab.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }))")
+        finished(tab, "half.bin")
+        assert tab.evaluate("document.getElementById('place').textContent").startswith("2 of 2")
         tab.choose_file("#file", page / "bundle.json")
         assert "scans are .bin and .pcd files" in failure(tab)
     print(f"{name} in {CHROMIUM}: {sum(warm['times_ms'].values()):.0f} ms per scan", warm["times_ms"])

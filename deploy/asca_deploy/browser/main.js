@@ -10,6 +10,8 @@ const waiting = new Map();
 let scene;
 let colors = {}; // of the classes, red, green, blue 0..255: those of the pictures of `asca detect`
 let last; // the file that is shown
+let files = []; // those that were opened together
+let position = 0;
 let busy = false;
 let asked = 0;
 
@@ -20,7 +22,11 @@ function ask(task, given = {}) {
   return new Promise((resolve, reject) => waiting.set(id, { resolve, reject }));
 }
 
-worker.addEventListener("message", ({ data: { id, result, error } }) => {
+worker.addEventListener("message", ({ data: { id, result, error, preview } }) => {
+  if (preview !== undefined) { // the points of a scan, before its boxes are there
+    scene.show(preview, []);
+    return;
+  }
   const { resolve, reject } = waiting.get(id);
   waiting.delete(id);
   if (error === undefined) resolve(result);
@@ -116,17 +122,34 @@ function fail(message) {
   document.body.dataset.state = "failed";
 }
 
-async function open(file) {
-  if (file) await detect({ name: file.name, buffer: await file.arrayBuffer() });
+/** Open the first of some files; the arrow keys go to the others. */
+async function open(chosen) {
+  if (chosen.length === 0 || busy) return;
+  files = [...chosen].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
+  position = 0;
+  await step(0);
 }
 
-element("file").addEventListener("change", (event) => open(event.target.files[0]));
+async function step(by) {
+  if (busy || files[position + by] === undefined) return;
+  position += by;
+  const file = files[position];
+  await detect({ name: file.name, buffer: await file.arrayBuffer() });
+  if (files.length > 1) element("place").textContent = `${position + 1} of ${files.length}, arrow keys for the others`;
+  else element("place").textContent = "";
+}
+
+element("file").addEventListener("change", (event) => open(event.target.files));
+document.addEventListener("keydown", (event) => {
+  if (event.key === "ArrowRight") step(1);
+  if (event.key === "ArrowLeft") step(-1);
+});
 element("again").addEventListener("click", () => detect(last));
 for (const kind of ["dragover", "dragleave", "drop"]) {
   document.addEventListener(kind, (event) => {
     event.preventDefault();
     document.body.classList.toggle("dropping", kind === "dragover");
-    if (kind === "drop") open(event.dataTransfer.files[0]);
+    if (kind === "drop") open(event.dataTransfer.files);
   });
 }
 

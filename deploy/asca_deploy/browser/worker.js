@@ -19,8 +19,9 @@ const tasks = {
     return manifest;
   },
 
-  async detect({ name, buffer }) {
+  async detect({ name, buffer }, id) {
     const { points, remarks } = readScan(name, buffer);
+    self.postMessage({ id, preview: points });
     const found = await detector.detect(points);
     return { ...found, points, remarks: [...remarks, ...found.remarks] };
   },
@@ -34,7 +35,7 @@ async function fetched(file) {
 
 self.addEventListener("message", async ({ data: { id, task, ...given } }) => {
   try {
-    self.postMessage({ id, result: await tasks[task](given) });
+    self.postMessage({ id, result: await tasks[task](given, id) });
   } catch (error) {
     self.postMessage({ id, error: error.message });
   }

@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.recordings.results import Found
-from asca_pillars.pictures.colors import class_rgb
+from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan
 
 MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
 TIMELINE = "time"
+MOVES_MPS = 0.5
+"""Slower tracks have no arrow."""
+_BACKGROUND = (14, 18, 24)
 APPLICATION = "asca-pillars"
 _HEAD_BYTES = 4096  # of a file, among which the application's name is
 _FLUSH_S = 60.0
@@ -27,7 +30,9 @@ def is_own_rrd(path: Path) -> bool:
 
 
 class RerunFile:
-    """Writes an .rrd: `scan` the points, gray by reflectance, `boxes` what was found. OSError if it cannot.
+    """Writes an .rrd: `scan` the points, colored by height, `boxes` what was found, `velocities` of tracks.
+
+    The viewer opens it with a 3D view of these and its panels folded. OSError if it cannot be written.
 
     Args:
         path: to write to.
@@ -40,7 +45,9 @@ class RerunFile:
         self._rr, self._scans = rr, scans
         self._stream = rr.RecordingStream(APPLICATION)
         self._stream.save(path)
+        self._stream.send_blueprint(self._blueprint())
         self._failed = False
+        self._ground_m: float | None = None
 
     def write(self, found: Found) -> None:
         """One scan with its boxes."""
@@ -48,9 +55,13 @@ class RerunFile:
         stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
         points = next(one.scan.points for one in self._scans if one.number == found.number and one.scan is not None)
         shown = points[:: -(-len(points) // MAX_POINTS) or 1]
-        gray = (np.clip(0.2 + shown[:, 3], 0, 1) * 255).astype(np.uint8)
-        stream.log("scan", rr.Points3D(shown[:, :3], colors=np.repeat(gray[:, None], 3, axis=1), radii=0.03))
+        if self._ground_m is None and len(points):
+            self._ground_m = ground_height(points[:, 2])  # once: colors do not flicker
+        colors = height_rgb(shown[:, 2], self._ground_m or 0.0)
+        stream.log("scan", rr.Points3D(shown[:, :3], colors=colors, radii=0.03))
         stream.log("boxes", self._boxes(found))
+        if found.tracks is not None:
+            stream.log("velocities", self._velocities(found))
         self._flush()
 
     def finish(self) -> None:
@@ -67,6 +78,27 @@ class RerunFile:
             self._failed = True
             raise OSError(errno.EIO, f"rerun cannot write ({error}); is the disk full?") from None
 
+    def _blueprint(self) -> Any:
+        import rerun.blueprint as rrb
+
+        view = rrb.Spatial3DView(origin="/", name="Scan, boxes and velocities", background=_BACKGROUND)
+        return rrb.Blueprint(view, collapse_panels=True)
+
+    def _velocities(self, found: Found) -> Any:
+        """An arrow for each track that moves, as long as its way of one second, from the center of its roof."""
+        assert found.tracks is not None
+        moving = np.hypot(*found.tracks.velocities_mps.T) > MOVES_MPS
+        boxes, velocities = found.detections.boxes[moving], found.tracks.velocities_mps[moving]
+        return self._rr.Arrows3D(
+            origins=np.column_stack([boxes[:, :2], boxes[:, 2] + boxes[:, 5] / 2]),
+            vectors=np.column_stack([velocities, np.zeros(len(velocities))]),
+            colors=self._colors(found)[moving],
+            radii=0.06,
+        )
+
+    def _colors(self, found: Found) -> NDArray[np.uint8]:
+        return np.array([class_rgb(name) for name in found.detections.names], np.uint8).reshape(-1, 3)
+
     def _boxes(self, found: Found) -> Any:
         rr, boxes = self._rr, found.detections.boxes
         half: NDArray[np.float64] = boxes[:, 6].astype(np.float64) / 2
@@ -80,5 +112,6 @@ class RerunFile:
             sizes=boxes[:, 3:6],
             quaternions=quaternions,
             labels=labels,
-            colors=np.array([class_rgb(name) for name in found.detections.names], np.uint8).reshape(-1, 3),
+            colors=self._colors(found),
+            radii=0.02,
         )
