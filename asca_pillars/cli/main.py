@@ -22,6 +22,7 @@ from asca_pillars.cli.ros2 import ros2
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.cli.simulate import simulate
 from asca_pillars.cli.train import train
+from asca_pillars.cli.view import view
 
 app = typer.Typer(
     help="LiDAR 3D detection: boxes from a point cloud on an ordinary CPU, and the pipeline that trains the model.",
@@ -38,6 +39,7 @@ def _add(function: Callable[..., None], name: str | None = None) -> None:
 
 
 _add(detect)
+_add(view)
 _add(bench)
 _add(simulate)
 _add(import_dataset, "import")

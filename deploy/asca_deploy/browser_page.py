@@ -62,7 +62,7 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
     version, read = _open_package(ort_web)
     points = read_scan(scan).points
     with atomic_directory(out, *PAGE_FOLDER) as folder:
-        for file in _modules():
+        for file in page_modules():
             (folder / file.name).write_bytes(file.read_bytes())
         # Under names of ours, whatever the bundle calls its graphs: they lie beside the page's scripts.
         described = read_manifest(bundle / MANIFEST)
@@ -99,7 +99,8 @@ def find_ort_web(given: Path | None) -> Path:
     raise ConfigError(f"{where}; {_GET_IT}")
 
 
-def _modules() -> list[Path]:
+def page_modules() -> list[Path]:
+    """The files of the page that are ours, whatever it shows."""
     folder = Path(str(resources.files("asca_deploy") / "browser"))
     return sorted(path for path in folder.iterdir() if path.suffix in (".html", ".css", ".js", ".json"))
 

@@ -139,7 +139,7 @@ def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32]) -> 
     assert saved["pillars"] == expected.report.counts.pillars
 
 
-def assert_drawn(tab: Tab, path: Path) -> None:
+def assert_drawn(tab: Tab, path: Path, cars: int = 6) -> None:
     """Points, boxes in the color of cars, and a label for each box."""
     tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     tab.screenshot(path)
@@ -150,7 +150,7 @@ def assert_drawn(tab: Tab, path: Path) -> None:
     assert (np.abs(scene - background).max(axis=2) > 30).mean() > 0.02
     assert (np.abs(scene - car).max(axis=2) < 12).sum() > 50
     labels = tab.evaluate("document.getElementById('labels').innerText").split("\n")
-    assert sum(label.startswith("Car ") for label in labels) == 6
+    assert sum(label.startswith("Car ") for label in labels) == cars
 
 
 def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_path: Path) -> None:

@@ -1,51 +1,35 @@
-/** The page: the worker's detector, the scene, and the panel beside it. */
+/** The page: a detector, in a worker or behind `asca view`, the scene, and the panel beside it. */
 
 import { Scene, cssColor } from "./scene.js";
+import { ServedDetector, WorkerDetector, fetched } from "./sources.js";
 
 const SAMPLE = "sample.bin";
 
 const element = (id) => document.getElementById(id);
-const worker = new Worker("worker.js", { type: "module" });
-const waiting = new Map();
 let scene;
+let detector;
 let colors = {}; // of the classes, red, green, blue 0..255: those of the pictures of `asca detect`
 let last; // the file that is shown
 let files = []; // those that were opened together
 let position = 0;
 let busy = false;
-let asked = 0;
-
-/** Let the worker do one of its tasks. */
-function ask(task, given = {}) {
-  const id = asked++;
-  worker.postMessage({ id, task, ...given });
-  return new Promise((resolve, reject) => waiting.set(id, { resolve, reject }));
-}
-
-worker.addEventListener("message", ({ data: { id, result, error, preview } }) => {
-  if (preview !== undefined) { // the points of a scan, before its boxes are there
-    scene.show(preview, []);
-    return;
-  }
-  const { resolve, reject } = waiting.get(id);
-  waiting.delete(id);
-  if (error === undefined) resolve(result);
-  else reject(new Error(error));
-});
-worker.addEventListener("error", (event) => fail(event.message || "worker.js cannot be loaded"));
 
 async function start() {
   scene = new Scene(element("scene"), element("labels"));
-  const manifest = await ask("open");
-  colors = (await (await fetched("page.json")).json()).colors;
+  const page = await (await fetched("page.json")).json();
+  colors = page.colors;
+  if (page.scans) {
+    document.body.classList.add("served");
+    detector = new ServedDetector();
+    element("model").textContent = `${page.bundle}, ${page.runs_on}`;
+    files = page.scans.map((name, number) => ({ name, number }));
+    await step(0);
+    return;
+  }
+  detector = new WorkerDetector();
+  const manifest = await detector.open();
   element("model").textContent = `${manifest.name}, ${manifest.precision}, in this browser`;
   await detect({ name: SAMPLE, buffer: await (await fetched(SAMPLE)).arrayBuffer() });
-}
-
-async function fetched(file) {
-  const response = await fetch(file);
-  if (!response.ok) throw new Error(`${file}: ${response.status} ${response.statusText}`);
-  return response;
 }
 
 /** Run one file; `document.body.dataset.state` says when it is done. */
@@ -55,7 +39,7 @@ async function detect(file) {
   document.body.dataset.state = "busy";
   say(`${file.name}: detecting`);
   try {
-    const found = await ask("detect", file);
+    const found = await detector.detect(file, (points) => scene.show(points, []));
     last = file;
     show(file, found);
     document.body.dataset.state = "done";
@@ -67,7 +51,7 @@ async function detect(file) {
   }
 }
 
-function show(file, { points, remarks, detections, timesMs, counts }) {
+function show(file, { points, remarks, detections, timesMs, counts, save: content }) {
   const colored = detections.map((found) => ({ ...found, color: colors[found.class].map((value) => value / 255) }));
   scene.show(points, colored);
   const total = Object.values(timesMs).reduce((sum, time) => sum + time, 0);
@@ -85,7 +69,7 @@ function show(file, { points, remarks, detections, timesMs, counts }) {
     line.addEventListener("click", () => scene.lookAt(box));
     return line;
   }));
-  save({ scan: file.name, times_ms: timesMs, ...counts, warnings: remarks, boxes: detections.map(plain) });
+  save(content ?? { scan: file.name, times_ms: timesMs, ...counts, warnings: remarks, boxes: detections.map(plain) });
 }
 
 /** A box as `asca detect` writes it. */
@@ -124,7 +108,7 @@ function fail(message) {
 
 /** Open the first of some files; the arrow keys go to the others. */
 async function open(chosen) {
-  if (chosen.length === 0 || busy) return;
+  if (chosen.length === 0 || busy || detector instanceof ServedDetector) return;
   files = [...chosen].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
   position = 0;
   await step(0);
@@ -134,7 +118,7 @@ async function step(by) {
   if (busy || files[position + by] === undefined) return;
   position += by;
   const file = files[position];
-  await detect({ name: file.name, buffer: await file.arrayBuffer() });
+  await detect(file instanceof File ? { name: file.name, buffer: await file.arrayBuffer() } : file);
   if (files.length > 1) element("place").textContent = `${position + 1} of ${files.length}, arrow keys for the others`;
   else element("place").textContent = "";
 }

@@ -1,0 +1,83 @@
+"""`asca view`: scans and their boxes in 3D in the browser."""
+
+from typing import Annotated
+
+import typer
+
+from asca_pillars.cli.options import (
+    AroundOption,
+    AxesOption,
+    BundleOption,
+    ColumnsOption,
+    PoseOption,
+    PrecisionOption,
+    ProviderOption,
+    ReflectanceScaleOption,
+    ScansArgument,
+    ScoreOption,
+    SensorHeightOption,
+    ThreadsOption,
+    read_scores,
+    scan_settings,
+)
+
+
+def view(
+    scans: ScansArgument = None,
+    *,
+    port: Annotated[
+        int,
+        typer.Option(
+            "--port", min=0, max=65535, help="Of this computer, to serve on. Default: a free one.", show_default=False
+        ),
+    ] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the address only; open no browser.", rich_help_panel="Output")
+    ] = False,
+    bundle: BundleOption = None,
+    score: ScoreOption = None,
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
+    around: AroundOption = False,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
+) -> None:
+    """Show scans and the boxes found in them in 3D, in a browser on this computer, until Ctrl-C.
+
+    The arrow keys go from scan to scan; each is detected when it is shown. The page is served on 127.0.0.1 alone, and
+    needs no network.
+
+    Examples:
+
+    asca view my_scans/
+
+    asca view sweeps/ --around --axes y-forward --sensor-height auto
+
+    asca view scan.pcd --port 8000 --no-browser
+    """
+    import logging
+    import threading
+    import webbrowser
+
+    from asca_deploy.open_model import RuntimeOptions
+    from asca_deploy.view_scans import ScanServer
+
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are on the page
+    reading = scan_settings(
+        sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
+    )
+    options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
+    with ScanServer(scans, port, options=options, reading=reading, score=read_scores(score), around=around) as server:
+        for line in server.said:
+            print(line)
+        print(f"{len(server.names)} scans: {server.address} (Ctrl-C ends)", flush=True)
+        if not no_browser:  # in a thread: a browser of the terminal returns when it is left
+            threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
+        try:
+            server.serve()
+        except KeyboardInterrupt:
+            print()
