@@ -74,7 +74,8 @@ def export(
         bool, typer.Option("--golden", help="Write every stage's arrays for one scan, to check other runtimes by.")
     ] = False,
     browser: Annotated[
-        bool, typer.Option("--browser", help="Write a static web page that runs the bundle in the browser.")
+        bool,
+        typer.Option("--browser", help="Write a static web page that runs the bundle in the browser, zipped too."),
     ] = False,
     ort_web: Annotated[
         Path | None,
@@ -194,7 +195,7 @@ def _export_for_runtime(
     from rich.console import Console
 
     from asca_deploy import find_bundle, sample_scan_path
-    from asca_deploy.browser_page import START, find_ort_web, write_page
+    from asca_deploy.browser_page import START, find_ort_web, page_zip, write_page
     from asca_deploy.golden import GOLDEN, write_golden
     from asca_pillars.base.errors import ConfigError
     from asca_pillars.scans.find_scans import find_scans
@@ -208,7 +209,9 @@ def _export_for_runtime(
     console = Console(markup=False)
     if browser:
         size_bytes = write_page(out, folder, scan, find_ort_web(ort_web))
+        zipped = page_zip(out)
         console.print(f"{out}: {size_bytes / 1e6:.0f} MB. {START.format(out=out)}", soft_wrap=True)
+        console.print(f"{zipped}: {zipped.stat().st_size / 1e6:.0f} MB, the same to copy or upload", soft_wrap=True)
         return
     stages = write_golden(out, folder, scan)
     arrays = [array for named in stages.values() for array in named.values()]

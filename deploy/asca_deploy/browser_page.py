@@ -1,11 +1,15 @@
 """A static page that runs a bundle in the browser: our modules, the bundle, a scan, and ONNX Runtime's WebAssembly.
 
-The page is a flat folder and needs no network and no program on the server. ONNX Runtime comes from npm's package
-onnxruntime-web, which is read where `npm pack` or `npm install` put it and never fetched from here.
+The page is a flat folder, with a zip of it beside, and needs no network and no program on the server. ONNX Runtime
+comes from npm's package onnxruntime-web, which is read where `npm pack` or `npm install` put it and never fetched from
+here.
 """
 
+import importlib.util
 import json
 import tarfile
+import zipfile
+import zlib
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -14,30 +18,37 @@ from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.manifest_file import read_manifest
 from asca_pillars.base.errors import BundleError, ConfigError
-from asca_pillars.base.files import atomic_directory, write_json
+from asca_pillars.base.files import atomic_directory, atomic_path, write_json
 from asca_pillars.base.input_files import require_content
-from asca_pillars.base.own_files import json_object, require_not_input, require_replaceable
+from asca_pillars.base.own_files import json_object, require_not_input, require_own_file, require_replaceable
 from asca_pillars.pictures.colors import color_table
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 
 PAGE = "page.json"
-PAGE_FOLDER = ("asca export --browser", PAGE, json_object("bundle", "scan", "onnxruntime_web", "files"))
+_COMMAND = "asca export --browser"
+_KEYS = ("bundle", "scan", "onnxruntime_web", "files")
+PAGE_FOLDER = (_COMMAND, PAGE, json_object(*_KEYS))
 """Command, marker and its recognizer, as `atomic_directory` takes them."""
 SAMPLE = "sample.bin"
 START = "Open it from a file server: python -m http.server --directory {out}"
 ORT_FILES = ("ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm")
 """Of the package's `dist`: ONNX Runtime for the CPU alone, 14 MB."""
+ORT_LICENSE = "LICENSE-onnxruntime.txt"
+"""Of ONNX Runtime, which the package itself does not hold; it lies among our modules."""
+ORT_NOTICES = "ThirdPartyNotices-onnxruntime.txt"
+"""Licenses of what is built into ONNX Runtime, from the installed one."""
 ORT_VERSION = "1.30.0"
 """What the tests run."""
 
+_LARGEST_PAGE_BYTES = 1 << 20
 _GET_IT = f"get it with `npm pack onnxruntime-web@{ORT_VERSION}` and give the .tgz with --ort-web"
 
 
 def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
-    """Write the page for one bundle; its size in bytes.
+    """Write the page for one bundle, and beside it a zip of it (`page_zip`); the size of the folder in bytes.
 
     Args:
-        out: folder: absent, empty, or an earlier output of this function.
+        out: folder: absent, empty, or an earlier output of this function, as the zip has to be.
         bundle: folder of a bundle of kind pillar on a warped map.
         scan: what the page shows first; any format that `read_scan` reads.
         ort_web: npm's package onnxruntime-web, a .tgz or its folder.
@@ -45,10 +56,12 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
     Raises:
         BundleError: the bundle is damaged, or of a kind that the page does not run.
         ConfigError: the package is not one.
-        OutputError: `out` holds something else, or what is read.
+        OutputError: `out` or the zip is something else, or what is read.
     """
     require_replaceable(out, *PAGE_FOLDER)
     require_not_input(out, (bundle, scan, ort_web))
+    archive = page_zip(out)
+    require_own_file(archive, _COMMAND, _is_own_zip, (bundle, scan, ort_web))
     manifest = load_pillar_bundle(bundle)
     if manifest.kind != "pillar" or manifest.spec.grid.pools:
         raise BundleError(
@@ -72,6 +85,8 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
         write_json(folder / MANIFEST, described)
         for name in ORT_FILES:
             (folder / name).write_bytes(read(f"dist/{name}"))
+        if (notices := _installed_notices()) is not None:
+            (folder / ORT_NOTICES).write_bytes(notices.read_bytes())
         write_scan(folder / SAMPLE, points)
         files = sorted(path.name for path in folder.iterdir())
         content = {
@@ -82,7 +97,15 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
             "files": files,
         }
         write_json(folder / PAGE, content)
-        return sum(path.stat().st_size for path in folder.iterdir())
+    with atomic_path(archive) as temporary:
+        _write_zip(temporary, out)
+    return sum(path.stat().st_size for path in out.iterdir())
+
+
+def page_zip(out: Path) -> Path:
+    """Where the zip of the page in the folder `out` is: beside it."""
+    folder = out.resolve()  # `.` has no name
+    return folder.with_name(f"{folder.name}.zip")
 
 
 def find_ort_web(given: Path | None) -> Path:
@@ -99,10 +122,40 @@ def find_ort_web(given: Path | None) -> Path:
     raise ConfigError(f"{where}; {_GET_IT}")
 
 
+def _write_zip(path: Path, page: Path) -> None:
+    """The folder of a page as a zip, the same bytes whenever it is written; `page.json` is its first file."""
+    name = page_zip(page).stem
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in (page / PAGE, *sorted(path for path in page.iterdir() if path.name != PAGE)):
+            about = zipfile.ZipInfo(f"{name}/{file.name}")
+            about.external_attr = 0o644 << 16
+            archive.writestr(about, file.read_bytes(), zipfile.ZIP_DEFLATED)
+
+
+def _is_own_zip(path: Path) -> bool:
+    """Whether it is a zip of a page: the first of its files is one's `page.json`."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            first = archive.infolist()[0]
+            if not first.filename.endswith(f"/{PAGE}") or first.file_size > _LARGEST_PAGE_BYTES:
+                return False
+            content = json.loads(archive.read(first))
+    except (zipfile.BadZipFile, zlib.error, IndexError, ValueError, NotImplementedError, RuntimeError, EOFError):
+        return False
+    return isinstance(content, dict) and all(key in content for key in _KEYS)
+
+
+def _installed_notices() -> Path | None:
+    """The third-party notices of the installed onnxruntime, which is not imported; None if it has none."""
+    spec = importlib.util.find_spec("onnxruntime")
+    notices = None if spec is None or spec.origin is None else Path(spec.origin).with_name("ThirdPartyNotices.txt")
+    return notices if notices is not None and notices.is_file() else None
+
+
 def page_modules() -> list[Path]:
     """The files of the page that are ours, whatever it shows."""
     folder = Path(str(resources.files("asca_deploy") / "browser"))
-    return sorted(path for path in folder.iterdir() if path.suffix in (".html", ".css", ".js", ".json"))
+    return sorted(path for path in folder.iterdir() if path.suffix in (".html", ".css", ".js", ".json", ".txt"))
 
 
 def _open_package(path: Path) -> tuple[str, Callable[[str], bytes]]:

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import time
+import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from asca_deploy import Detector, sample_scan_path, shipped_bundles
-from asca_deploy.browser_page import ORT_FILES, find_ort_web, write_page
+from asca_deploy.browser_page import ORT_FILES, ORT_LICENSE, ORT_NOTICES, find_ort_web, page_zip, write_page
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.pipeline import PillarPipeline
@@ -174,6 +175,31 @@ def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_pa
             loaded = re.findall(r'"([^" ]+\.(?:js|mjs|css|wasm))"', text)
             assert {Path(word).name for word in loaded} <= set(files), name
             assert "://" not in text, f"{name} loads something from elsewhere"
+
+
+def test_the_zip_is_the_page_with_the_license_of_its_runtime(made_up_package: Path, tmp_path: Path) -> None:
+    page, bundle = tmp_path / "page", shipped_bundles()["asca_small_sim_int8"]
+    write_page(page, bundle, sample_scan_path(), made_up_package)
+    first = page_zip(page).read_bytes()
+    write_page(page, bundle, sample_scan_path(), made_up_package)
+    assert page_zip(page) == tmp_path / "page.zip" and page_zip(page).read_bytes() == first
+    with zipfile.ZipFile(page_zip(page)) as archive:
+        assert archive.testzip() is None
+        held = {name: archive.read(name) for name in archive.namelist()}
+    assert held == {f"page/{path.name}": path.read_bytes() for path in page.iterdir()}
+    assert b"Copyright (c) Microsoft Corporation" in held[f"page/{ORT_LICENSE}"]
+    assert len(held[f"page/{ORT_NOTICES}"]) > 1000
+
+
+def test_a_zip_of_something_else_is_left_alone(made_up_package: Path, tmp_path: Path) -> None:
+    bundle, zipped = shipped_bundles()["asca_small_sim_int8"], tmp_path / "page.zip"
+    with zipfile.ZipFile(zipped, "w") as archive:
+        archive.writestr("page/page.json", "{}")
+    for content in (zipped.read_bytes(), b"precious"):
+        zipped.write_bytes(content)
+        with pytest.raises(OutputError, match=r"page\.zip: `asca export --browser` did not write it"):
+            write_page(tmp_path / "page", bundle, sample_scan_path(), made_up_package)
+        assert zipped.read_bytes() == content and not (tmp_path / "page").exists()
 
 
 @pytest.mark.parametrize("name", ["index.html", "main.js", "page.json", "sample.bin", "évil .mjs"])
