@@ -74,7 +74,8 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         tab.evaluate("document.getElementById('again').click()")
         warm = finished(tab, "sample.bin")
         tab.choose_file("#file", tmp_path / "half.bin")
-        assert_same(finished(tab, "half.bin"), detector, points[::2])
+        half = finished(tab, "half.bin")
+        assert_same(half, detector, points[::2])
         assert "49% of the points lie behind the sensor" in warm["warnings"][0] and "--around" in status(tab)
         tab.choose_file("#file", tmp_path / "ahead.bin")
         assert finished(tab, "ahead.bin")["warnings"] == [] and "--around" not in status(tab)
@@ -86,8 +87,11 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         tab.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }))")
         finished(tab, "half.bin")
         assert tab.evaluate("document.getElementById('place').textContent").startswith("2 of 2")
+        np.save(tmp_path / "array.npy", points[::2])
+        tab.choose_file("#file", tmp_path / "array.npy")
+        assert finished(tab, "array.npy")["boxes"] == half["boxes"]
         tab.choose_file("#file", page / "bundle.json")
-        assert "scans are .bin and .pcd files" in failure(tab)
+        assert "scans are .bin, .npy, .pcd and .ply files" in failure(tab)
     print(f"{name} in {CHROMIUM}: {sum(warm['times_ms'].values()):.0f} ms per scan", warm["times_ms"])
 
 

@@ -1,10 +1,11 @@
-/** Scan files -> points: KITTI's .bin and the Point Cloud Library's .pcd (docs/SCANS.md). */
+/** Scan files -> points: KITTI's .bin, the Point Cloud Library's .pcd, .ply and NumPy's .npy (docs/SCANS.md). */
 
-const REFLECTANCE = ["intensity", "reflectance", "reflectivity", "i"];
-const AGAIN = "the file is damaged or incomplete";
-const MAX_HEADER_BYTES = 65536;
-const SPACE = "[ \\t\\n\\r\\v\\f]"; // of ASCII; \s is more, U+FEFF among it
-const WORDS = new RegExp(`${SPACE}+`);
+import { readNpy } from "./npy.js";
+import { readPly } from "./ply.js";
+import {
+  AGAIN, MAX_HEADER_BYTES, READ, columnsOfRows, readColumn, rowsOf, selectFields, stride, text, wholeNumber, wordsOf,
+} from "./records.js";
+
 const LFS_POINTER = /^version https:\/\/git-lfs/;
 
 /**
@@ -15,8 +16,8 @@ const LFS_POINTER = /^version https:\/\/git-lfs/;
  */
 export function readScan(name, buffer) {
   const suffix = name.toLowerCase().split(".").pop();
-  const readers = { bin: readBin, pcd: readPcd };
-  if (!Object.hasOwn(readers, suffix)) throw new Error(`${name}: scans are .bin and .pcd files`);
+  const readers = { bin: readBin, npy: readNpy, pcd: readPcd, ply: readPly };
+  if (!Object.hasOwn(readers, suffix)) throw new Error(`${name}: scans are .bin, .npy, .pcd and .ply files`);
   if (buffer.byteLength === 0) throw new Error(`${name}: the file is empty`);
   if (buffer.byteLength <= 1024 && LFS_POINTER.test(text(new Uint8Array(buffer)))) {
     throw new Error(`${name}: is a pointer of Git LFS, its content was not fetched; run git lfs pull`);
@@ -75,21 +76,11 @@ function readPcd(buffer) {
   if (!Object.hasOwn(readers, encoding)) {
     throw new Error(`DATA is '${encoding}'; PCD knows ascii, binary and binary_compressed`);
   }
-  const names = fields.map(({ name }) => name.toLowerCase().replace(/^scalar_/, "")); // CloudCompare's scalar_Intensity
-  const wanted = ["x", "y", "z"].map((name) => names.indexOf(name));
-  if (wanted.includes(-1)) throw new Error(`no field x, y or z among ${names.join(", ")}`);
-  const bright = REFLECTANCE.map((name) => names.indexOf(name)).find((index) => index >= 0);
-  if (bright !== undefined) wanted.push(bright);
-  for (const index of wanted) {
-    const { count: values } = fields[index];
-    if (values !== 1) throw new Error(`${names[index]} has ${values} values per point; export one`);
-    if (names.indexOf(names[index], index + 1) >= 0) throw new Error(`several fields ${names[index]}; export one`);
-  }
+  const { wanted, integers, bytes } = selectFields(fields);
   const { columns, surplus } = readers[encoding](body, fields, count, wanted, start);
   const [x, y, z, reflectance] = columns;
-  const integers = bright !== undefined && fields[bright].type !== "F";
   const remarks = surplus >= stride(fields) ? [`${surplus} bytes after the points were left out`] : [];
-  return { x, y, z, reflectance, bytes: integers && fields[bright].size === 1, integers, remarks };
+  return { x, y, z, reflectance, bytes, integers, remarks };
 }
 
 const KEYS = ["VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"];
@@ -113,12 +104,6 @@ function splitHeader(bytes) {
   }
   return { header, body: bytes.slice(position), start: position };
 }
-
-/** Bytes as characters, one each: Python splits them before it decodes them, too. */
-const text = (bytes) => new TextDecoder("latin1").decode(bytes);
-const wordsOf = (line) => line.split(WORDS).filter(Boolean);
-const wholeNumber = (word) => (/^[0-9]{1,18}$/.test(word) ? Number(word) : undefined);
-const stride = (fields) => fields.reduce((sum, field) => sum + field.size * field.count, 0);
 
 /** POINTS, which has to be WIDTH times HEIGHT where those are there too. */
 function pointCount(header) {
@@ -156,50 +141,10 @@ function pcdFields(header) {
   });
 }
 
-const READ = {
-  F: {
-    2: (view, at) => halfFloat(view.getUint16(at, true)),
-    4: (view, at) => view.getFloat32(at, true),
-    8: (view, at) => view.getFloat64(at, true),
-  },
-  U: {
-    1: (view, at) => view.getUint8(at),
-    2: (view, at) => view.getUint16(at, true),
-    4: (view, at) => view.getUint32(at, true),
-    8: (view, at) => Number(view.getBigUint64(at, true)),
-  },
-  I: {
-    1: (view, at) => view.getInt8(at),
-    2: (view, at) => view.getInt16(at, true),
-    4: (view, at) => view.getInt32(at, true),
-    8: (view, at) => Number(view.getBigInt64(at, true)),
-  },
-};
-
-function halfFloat(bits) {
-  const [sign, exponent, fraction] = [bits >> 15 ? -1 : 1, (bits >> 10) & 31, bits & 1023];
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
-}
-
 function asciiColumns(body, fields, count, wanted) {
-  const lines = text(body).split(/\r\n|\n|\r/).map(wordsOf).filter((words) => words.length);
-  if (lines.length !== count) throw new Error(`${lines.length} lines where the header states ${count} points`);
-  const starts = fields.map((_, index) => fields.slice(0, index).reduce((sum, field) => sum + field.count, 0));
-  const width = fields.reduce((sum, field) => sum + field.count, 0);
-  const rows = lines.map((words, row) => {
-    if (words.length !== width) throw new Error(`point ${row} has ${words.length} values, not ${width}`);
-    return words.map(asNumber);
-  });
-  return { columns: wanted.map((index) => Float64Array.from(rows, (numbers) => numbers[starts[index]])), surplus: 0 };
-}
-
-/** A decimal number, nan or inf, as Python reads them; `Number` alone takes 0x10 and makes NaN of any other word. */
-function asNumber(word) {
-  if (/^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?$/i.test(word)) return Number(word);
-  if (/^[+-]?nan$/i.test(word)) return NaN;
-  if (/^[+-]?inf(inity)?$/i.test(word)) return word.startsWith("-") ? -Infinity : Infinity;
-  throw new Error(`'${word.slice(0, 20)}' is no number; ${AGAIN}`);
+  const rows = rowsOf(body);
+  if (rows.length !== count) throw new Error(`${rows.length} lines where the header states ${count} points`);
+  return { columns: columnsOfRows(rows, fields, wanted), surplus: 0 };
 }
 
 /** Point after point. What follows them may be padding: zeros, or as many bytes as PCL up to 1.8 appends (pcd.py). */
@@ -234,12 +179,6 @@ function compressedColumns(body, fields, count, wanted) {
     return readColumn(unpacked, field, count, field.start * count, field.size);
   });
   return { columns, surplus: body.length - used };
-}
-
-function readColumn(bytes, field, count, start, stride) {
-  const view = new DataView(bytes.buffer, bytes.byteOffset);
-  const read = READ[field.type][field.size];
-  return Float64Array.from({ length: count }, (_, row) => read(view, start + row * stride));
 }
 
 /** An LZF stream of `size` bytes: literals, and references of length and distance, which may overlap their output. */
