@@ -35,6 +35,8 @@ from asca_pillars.scans.scan_reader import Scan
 from asca_pillars.scans.scan_settings import ScanSettings
 
 HOST = "127.0.0.1"
+LOWEST_SCORE = 0.1
+"""That the page's sliders reach where one pass looks everywhere: in the merging of several, low boxes remove others."""
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -94,6 +96,9 @@ class ScanServer:
         paths = [scan.path for scan in named]
         scan_input = ScanInput(reading, paths)
         detector = open_detector(options, score, scan_input.mounting, around=around)
+        shown = {one.name: one.score_threshold for one in detector.spec.classes}
+        lowest = {name: min(value, LOWEST_SCORE) if detector.passes == 1 else value for name, value in shown.items()}
+        detector.spec = detector.pipeline.spec = detector.spec.with_score_threshold(lowest)
         self.names = [scan.name.as_posix() + scan.path.suffix for scan in named]
         self.said = tuple(scan_input.said)
         answers = _Answers(paths, scan_input, detector, around=around)
@@ -104,6 +109,8 @@ class ScanServer:
             "bundle": detector.bundle.name,
             "runs_on": detector.runs_on,
             "scans": self.names,
+            "classes": [{"name": name, "score": value, "lowest": lowest[name]} for name, value in shown.items()],
+            "limit": detector.spec.post.max_detections,
             "colors": color_table(detector.spec.class_names),
         }
         files[f"/{PAGE}"] = _json(page)

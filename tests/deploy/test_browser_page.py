@@ -71,6 +71,10 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         tab.call("Page.navigate", url=address)
         assert_same(finished(tab, "sample.bin"), detector, points)
         assert_drawn(tab, tmp_path / "page.png")
+        for score in (0.2, 0.9, detector.spec.classes[0].score_threshold):
+            move_slider(tab, "Car", score)
+            moved = {"Car": score}
+            assert_same(finished(tab, "sample.bin"), Detector(name, threads=1, score_threshold=moved), points, least=0)
         tab.evaluate("document.getElementById('again').click()")
         warm = finished(tab, "sample.bin")
         tab.choose_file("#file", tmp_path / "half.bin")
@@ -103,6 +107,11 @@ def finished(tab: Tab, scan: str) -> Any:
     return saved
 
 
+def move_slider(tab: Tab, name: str, score: float) -> None:
+    slider = f"document.querySelector('#scores input[name={name}]')"
+    tab.evaluate(f"{slider}.value = {score}; {slider}.dispatchEvent(new Event('input'))")
+
+
 def failure(tab: Tab) -> str:
     wait_for(tab, "failed")
     return status(tab)
@@ -123,9 +132,9 @@ def wait_for(tab: Tab, state: str) -> None:
     assert found == state, tab.evaluate("document.getElementById('status').textContent")
 
 
-def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32]) -> None:
+def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32], least: int = 4) -> None:
     expected = detector(points)
-    assert len(expected) > 3
+    assert len(expected) >= least
     assert [box["class"] for box in saved["boxes"]] == list(expected.names)
     centers = np.array([[box["x_m"], box["y_m"], box["z_m"]] for box in saved["boxes"]])
     scores = np.array([box["score"] for box in saved["boxes"]])

@@ -25,7 +25,7 @@ from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
 from tests.deploy.chromium import CHROMIUM, open_tab
-from tests.deploy.test_browser_page import assert_drawn, failure, finished
+from tests.deploy.test_browser_page import assert_drawn, failure, finished, move_slider
 
 POINTS = read_scan(sample_scan_path()).points[::2].copy()
 SMALL = RuntimeOptions(bundle="asca_small_sparse_sim_int8", threads=1)
@@ -43,8 +43,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def serving(*args: Any, **kwargs: Any) -> Iterator[ScanServer]:
-    with ScanServer(*args, options=SMALL, **kwargs) as server:
+def serving(*args: Any, bundle: str = "asca_small_sparse_sim_int8", **kwargs: Any) -> Iterator[ScanServer]:
+    with ScanServer(*args, options=RuntimeOptions(bundle=bundle, threads=1), **kwargs) as server:
         thread = threading.Thread(target=server.serve)
         thread.start()
         yield server
@@ -83,12 +83,32 @@ def test_the_page_gets_points_and_the_boxes_that_the_detector_finds(server: Scan
     assert b"<!doctype html>" in get(server, "") and b"Scene" in get(server, "main.js")
     np.testing.assert_array_equal(np.frombuffer(get(server, "scans/0.bin"), "<f4").reshape(-1, 4), POINTS)
     found = json.loads(get(server, "scans/0.json"))
-    expected = Detector(SMALL.bundle, threads=1)(POINTS)
-    assert [one["class"] for one in found["detections"]] == list(expected.names) and len(expected) > 3
+    detector = Detector(SMALL.bundle, threads=1)
+    assert {one["name"]: one["score"] for one in page["classes"]} == {
+        one.name: one.score_threshold for one in detector.spec.classes
+    }
+    assert {one["lowest"] for one in page["classes"]} == {0.1}
+    fewer, expected = shown(page, found), detector(POINTS)
+    assert len(found["detections"]) > len(fewer) and len(fewer) == len(expected) > 3  # more for the sliders
+    expected = Detector(SMALL.bundle, threads=1, score_threshold=0.1)(POINTS)
+    assert [one["class"] for one in found["detections"]] == list(expected.names)
     np.testing.assert_array_equal(np.float32([one["box"] for one in found["detections"]]), expected.boxes)
     assert found["save"]["boxes"] == expected.to_dicts()
     assert found["save"]["made_by"] == dict(expected.made_by)
     assert found["counts"]["points"] == len(POINTS) and found["timesMs"].keys() == expected.report.times_ms.keys()
+
+
+def shown(page: Any, found: Any) -> list[Any]:
+    """The boxes that the page shows before a slider is moved, as they are saved."""
+    scores = {one["name"]: one["score"] for one in page["classes"]}
+    return [one for one in found["save"]["boxes"] if one["score"] >= scores[one["class"]]]
+
+
+def test_what_several_passes_find_is_not_lowered() -> None:
+    """Of two passes the box stays that is seen nearest to straight ahead, whatever the scores."""
+    with serving([sample_scan_path()], bundle="asca_small_sim_int8", around=True) as server:
+        classes = json.loads(get(server, "page.json"))["classes"]
+    assert [one["lowest"] for one in classes] == [one["score"] for one in classes]
 
 
 def test_a_scan_that_cannot_be_read_is_said_and_others_go_on(server: ScanServer) -> None:
@@ -142,7 +162,8 @@ def test_a_turned_sensor_is_drawn_level_and_saved_in_its_own_frame(tmp_path: Pat
         points = np.frombuffer(get(server, "scans/0.bin"), "<f4").reshape(-1, 4)
         found = json.loads(get(server, "scans/0.json"))
     np.testing.assert_array_equal(points, POINTS)
-    expected = Detector(SMALL.bundle, threads=1, mounting=Mounting(axes="y-forward"))(turned)
+    mounting = Mounting(axes="y-forward")
+    expected = Detector(SMALL.bundle, threads=1, mounting=mounting, score_threshold=0.1)(turned)
     assert found["save"]["boxes"] == expected.to_dicts() and len(expected) > 3
     for shown, own in zip(found["detections"], expected.boxes, strict=True):
         np.testing.assert_allclose(shown["box"][:2], [own[1], -own[0]], atol=1e-5)
@@ -195,10 +216,16 @@ def test_the_browser_shows_them(server: ScanServer, tmp_path: Path) -> None:
     with open_tab(tmp_path / "profile") as tab:
         tab.call("Page.navigate", url=server.address)
         saved = finished(tab, server_scan(server, 0))
-        assert saved["boxes"] == json.loads(get(server, "scans/0.json"))["save"]["boxes"]
+        page, found = json.loads(get(server, "page.json")), json.loads(get(server, "scans/0.json"))
+        assert saved["boxes"] == shown(page, found)
         assert tab.evaluate("getComputedStyle(document.querySelector('label.button')).display") == "none"
         cars = sum(box["class"] == "Car" for box in saved["boxes"])
         assert_drawn(tab, tmp_path / "view.png", cars)
+        move_slider(tab, "Car", 0.1)
+        scores = {"Car": 0.1, "Pedestrian": page["classes"][1]["score"], "Cyclist": page["classes"][2]["score"]}
+        more = finished(tab, server_scan(server, 0))["boxes"]
+        assert more == [one for one in found["save"]["boxes"] if one["score"] >= scores[one["class"]]]
+        assert len(more) > len(saved["boxes"])
         arrow = "document.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }))"
         tab.evaluate(arrow)
         assert "2.bin: 5 bytes" in failure(tab)

@@ -1,6 +1,7 @@
 /** The page: a detector, in a worker or behind `asca view`, the scene, and the panel beside it. */
 
 import { Scene, cssColor } from "./scene.js";
+import { LOWEST_SCORE, ScoreSliders } from "./scores.js";
 import { ServedDetector, WorkerDetector, fetched } from "./sources.js";
 
 const SAMPLE = "sample.bin";
@@ -8,8 +9,10 @@ const SAMPLE = "sample.bin";
 const element = (id) => document.getElementById(id);
 let scene;
 let detector;
+let sliders;
 let colors = {}; // of the classes, red, green, blue 0..255: those of the pictures of `asca detect`
 let last; // the file that is shown
+let found; // in it
 let files = []; // those that were opened together
 let position = 0;
 let busy = false;
@@ -22,6 +25,7 @@ async function start() {
     document.body.classList.add("served");
     detector = new ServedDetector();
     element("model").textContent = `${page.bundle}, ${page.runs_on}`;
+    sliders = new ScoreSliders(element("scores"), page.classes, page.limit, show);
     files = page.scans.map((name, number) => ({ name, number }));
     await step(0);
     return;
@@ -29,6 +33,12 @@ async function start() {
   detector = new WorkerDetector();
   const manifest = await detector.open();
   element("model").textContent = `${manifest.name}, ${manifest.precision}, in this browser`;
+  const classes = manifest.spec.classes.map(({ name, score_threshold: score }) => ({
+    name,
+    score,
+    lowest: Math.min(score, LOWEST_SCORE),
+  }));
+  sliders = new ScoreSliders(element("scores"), classes, manifest.spec.post.max_detections, show);
   await detect({ name: SAMPLE, buffer: await (await fetched(SAMPLE)).arrayBuffer() });
 }
 
@@ -39,9 +49,9 @@ async function detect(file) {
   document.body.dataset.state = "busy";
   say(`${file.name}: detecting`);
   try {
-    const found = await detector.detect(file, (points) => scene.show(points, []));
+    found = await detector.detect(file, (points) => scene.show(points, []));
     last = file;
-    show(file, found);
+    show();
     document.body.dataset.state = "done";
   } catch (error) {
     fail(error.message);
@@ -51,13 +61,18 @@ async function detect(file) {
   }
 }
 
-function show(file, { points, remarks, detections, timesMs, counts, save: content }) {
-  const colored = detections.map((found) => ({ ...found, color: colors[found.class].map((value) => value / 255) }));
+/** Draw and list what was found in the last file, from the sliders' scores on. */
+function show() {
+  if (found === undefined) return;
+  const { points, remarks, timesMs, counts, save: content } = found;
+  const chosen = sliders.chosen(found.detections);
+  const detections = chosen.map((place) => found.detections[place]);
+  const colored = detections.map((one) => ({ ...one, color: colors[one.class].map((value) => value / 255) }));
   scene.show(points, colored);
   const total = Object.values(timesMs).reduce((sum, time) => sum + time, 0);
   const seen = counts.points - counts.points_outside;
   say([
-    `${file.name}: ${detections.length} objects in ${total.toFixed(0)} ms.`,
+    `${last.name}: ${detections.length} objects in ${total.toFixed(0)} ms.`,
     `${counts.points.toLocaleString("en")} points, ${seen.toLocaleString("en")} within the model's ranges.`,
     ...remarks,
   ].join(" "));
@@ -69,7 +84,8 @@ function show(file, { points, remarks, detections, timesMs, counts, save: conten
     line.addEventListener("click", () => scene.lookAt(box));
     return line;
   }));
-  save(content ?? { scan: file.name, times_ms: timesMs, ...counts, warnings: remarks, boxes: detections.map(plain) });
+  const boxes = content ? chosen.map((place) => content.boxes[place]) : detections.map(plain);
+  save({ ...(content ?? { scan: last.name, times_ms: timesMs, ...counts, warnings: remarks }), boxes });
 }
 
 /** A box as `asca detect` writes it. */
@@ -125,6 +141,7 @@ async function step(by) {
 
 element("file").addEventListener("change", (event) => open(event.target.files));
 document.addEventListener("keydown", (event) => {
+  if (event.target.type === "range") return; // which they move
   if (event.key === "ArrowRight") step(1);
   if (event.key === "ArrowLeft") step(-1);
 });
