@@ -7,6 +7,7 @@ CIE76 differences of 40 and more between cars, pedestrians and cyclists, of 20 a
 
 import zlib
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,11 @@ def class_shares(name: str) -> tuple[float, float, float]:
 def color_table(names: Iterable[str]) -> dict[str, list[int]]:
     """Red, green, blue, 0..255, of each class by its name, as JSON holds them."""
     return {name: list(class_rgb(name)) for name in names}
+
+
+def height_table() -> dict[str, Any]:
+    """The color ramp of heights as JSON holds it: `ramp`, red, green, blue 0..255, and `span_m`."""
+    return {"ramp": [list(color) for color in HEIGHT_RAMP], "span_m": HEIGHT_SPAN_M}
 
 
 def ground_height(z_m: NDArray[np.floating]) -> float:

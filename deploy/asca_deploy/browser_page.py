@@ -21,7 +21,7 @@ from asca_pillars.base.errors import BundleError, ConfigError
 from asca_pillars.base.files import atomic_directory, atomic_path, write_json
 from asca_pillars.base.input_files import require_content
 from asca_pillars.base.own_files import json_object, require_not_input, require_own_file, require_replaceable
-from asca_pillars.pictures.colors import color_table
+from asca_pillars.pictures.colors import color_table, height_table
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 
 PAGE = "page.json"
@@ -94,6 +94,7 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
             "scan": scan.name,
             "onnxruntime_web": version,
             "colors": color_table(one.name for one in manifest.spec.classes),
+            "heights": height_table(),
             "files": files,
         }
         write_json(folder / PAGE, content)

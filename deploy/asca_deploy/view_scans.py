@@ -27,7 +27,7 @@ from asca_deploy.shipped import sample_scan_path
 from asca_pillars.base.errors import AscaError, ConfigError, printable
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
-from asca_pillars.pictures.colors import color_table
+from asca_pillars.pictures.colors import color_table, height_table
 from asca_pillars.scans.find_scans import name_scans
 from asca_pillars.scans.recordings.open_recording import is_recording
 from asca_pillars.scans.scan_input import ScanInput
@@ -112,6 +112,7 @@ class ScanServer:
             "classes": [{"name": name, "score": value, "lowest": lowest[name]} for name, value in shown.items()],
             "limit": detector.spec.post.max_detections,
             "colors": color_table(detector.spec.class_names),
+            "heights": height_table(),
         }
         files[f"/{PAGE}"] = _json(page)
 

@@ -18,6 +18,7 @@ from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import ScanError
 from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.pictures.colors import ground_height
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.fuzz import damaged
 from benchmarks.fuzz_inputs import Kind, read_points, scan_seeds
@@ -108,6 +109,13 @@ def test_a_revolution_is_said_to_be_cut() -> None:
     cut, *fine = (answer["result"] for answer in found)
     assert len(cut) == 1 and "asca detect --around" in cut[0]
     assert fine == [[], [], []]
+
+
+def test_the_ground_of_the_color_ramp_is_that_of_the_pictures() -> None:
+    scans = [read_scan(sample_scan_path()).points[::40], tiny.make_scan(count=7), tiny.make_scan(count=7)[:0]]
+    answers = call("scene.js", "groundHeight", *([scan.reshape(-1).tolist()] for scan in scans))
+    for scan, answer in zip(scans, answers, strict=True):
+        assert answer["result"] == pytest.approx(ground_height(scan[:, 2]), abs=1e-6)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])

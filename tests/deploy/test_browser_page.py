@@ -25,7 +25,7 @@ from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_pillars.base.errors import BundleError, ConfigError, OutputError
 from asca_pillars.cli.main import app
 from asca_pillars.ops.pillar.prepare import PillarCounts
-from asca_pillars.pictures.colors import class_rgb
+from asca_pillars.pictures.colors import HEIGHT_RAMP, HEIGHT_SPAN_M, class_rgb, height_rgb
 from asca_pillars.pictures.visualize import class_color
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.deploy.chromium import CHROMIUM, Tab, file_server, open_tab
@@ -160,6 +160,9 @@ def assert_drawn(tab: Tab, path: Path, cars: int = 6) -> None:
     picture = cv2.imread(str(path))
     assert picture is not None
     scene = picture[: int(tab.evaluate("document.getElementById('scene').clientHeight"))].astype(int)
+    ground, above = height_rgb(np.array([0.0, HEIGHT_SPAN_M]), 0.0)[:, ::-1] * 0.75  # of points that reflect nothing
+    for color in (ground, above):
+        assert (np.abs(scene - color).max(axis=2) < 14).sum() > 20
     background, car = np.array([26, 20, 15]), np.array(class_color("Car"))  # blue, green, red
     assert (np.abs(scene - background).max(axis=2) > 30).mean() > 0.02
     assert (np.abs(scene - car).max(axis=2) < 12).sum() > 50
@@ -176,6 +179,7 @@ def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_pa
     assert f"python -m http.server --directory {page}" in " ".join(result.output.split())
     contents = json.loads((page / "page.json").read_text())
     assert contents["colors"] == {name: list(class_rgb(name)) for name in ("Car", "Pedestrian", "Cyclist")}
+    assert contents["heights"] == {"ramp": [list(color) for color in HEIGHT_RAMP], "span_m": HEIGHT_SPAN_M}
     assert contents["onnxruntime_web"] == "9.9.9" and contents["bundle"] == bundle.name
     files = {path.name: path for path in page.iterdir()}
     assert {*contents["files"], "page.json"} == set(files)

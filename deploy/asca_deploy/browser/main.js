@@ -18,8 +18,8 @@ let position = 0;
 let busy = false;
 
 async function start() {
-  scene = new Scene(element("scene"), element("labels"));
   const page = await (await fetched("page.json")).json();
+  scene = new Scene(element("scene"), element("labels"), page.heights);
   colors = page.colors;
   if (page.scans) {
     document.body.classList.add("served");

@@ -3,21 +3,22 @@
 import { corners } from "./boxes.js";
 import { OrbitCamera, project } from "./camera.js";
 
-const POINTS = {
+/** Shaders of points colored by height: a ramp of so many colors from the ground to some metres above it. */
+const pointShaders = (colors) => ({
   vertex: `#version 300 es
-    uniform mat4 matrix; uniform float ratio; in vec4 point; out vec3 color;
+    uniform mat4 matrix; uniform float ratio, ground, span; uniform vec3 ramp[${colors}]; in vec4 point; out vec3 color;
     void main() {
       gl_Position = matrix * vec4(point.xyz, 1.0);
       gl_PointSize = ratio * clamp(70.0 / gl_Position.w, 1.3, 3.5);
-      float height = clamp((point.z + 2.0) / 4.0, 0.0, 1.0);
-      vec3 low = vec3(0.22, 0.33, 0.48), middle = vec3(0.35, 0.66, 0.62), high = vec3(0.93, 0.87, 0.62);
-      color = mix(mix(low, middle, min(height * 2.0, 1.0)), high, max(height * 2.0 - 1.0, 0.0));
+      float place = clamp((point.z - ground) / span, 0.0, 1.0) * ${(colors - 1).toFixed(1)};
+      int low = min(int(place), ${colors - 2});
+      color = mix(ramp[low], ramp[low + 1], place - float(low));
       color *= 0.75 + 0.6 * point.w;
     }`,
   fragment: `#version 300 es
     precision mediump float; in vec3 color; out vec4 pixel;
     void main() { pixel = vec4(color, 1.0); }`,
-};
+});
 
 // A line is a strip of two triangles, because WebGL draws thin ones only. `other` is its other end.
 const LINES = {
@@ -36,7 +37,7 @@ const LINES = {
 };
 
 const RINGS_M = [20, 40, 60, 80];
-const GROUND_M = -1.73; // of a sensor as high as that of the training
+const GROUND_SHARE = 0.1; // of the points lies below what is taken as the ground (asca_pillars/pictures/colors.py)
 const RING_COLOR = [0.55, 0.65, 0.75, 0.28];
 const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
 
@@ -44,14 +45,16 @@ export class Scene {
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {HTMLElement} labels lies over the canvas
+   * @param {{ramp: number[][], span_m: number}} heights colors (0..255) of points from the ground to `span_m` above it
    */
-  constructor(canvas, labels) {
+  constructor(canvas, labels, { ramp, span_m: span }) {
     this.canvas = canvas;
     this.labels = labels;
     this.camera = new OrbitCamera();
     this.gl = canvas.getContext("webgl2", { antialias: true });
     if (!this.gl) throw new Error("this browser does not give WebGL 2, which draws the scene");
-    this.points = { program: program(this.gl, POINTS), count: 0, buffer: this.gl.createBuffer() };
+    this.heights = { ramp: ramp.flat().map((value) => value / 255), span: [span], ground: [0] };
+    this.points = { program: program(this.gl, pointShaders(ramp.length)), count: 0, buffer: this.gl.createBuffer() };
     this.lines = { program: program(this.gl, LINES), count: 0, buffer: this.gl.createBuffer() };
     this.labeled = [];
     this.listen();
@@ -68,13 +71,15 @@ export class Scene {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.points.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, points, gl.STATIC_DRAW);
     this.points.count = points.length / 4;
-    const segments = [...rings(), ...boxes.flatMap(boxSegments)];
+    const ground = groundHeight(points);
+    this.heights.ground = [ground];
+    const segments = [...rings(ground), ...boxes.flatMap(boxSegments)];
     const vertices = Float32Array.from(segments.flatMap(segmentVertices));
     gl.bindBuffer(gl.ARRAY_BUFFER, this.lines.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, vertices, gl.STATIC_DRAW);
     this.lines.count = vertices.length / 11;
     this.labeled = [
-      ...RINGS_M.map((radius) => ({ place: [radius, 0, GROUND_M], text: `${radius} m`, name: "ring" })),
+      ...RINGS_M.map((radius) => ({ place: [radius, 0, ground], text: `${radius} m`, name: "ring" })),
       ...boxes.map(({ class: class_, score, color, box: [x, y, z, , , height] }) => ({
         place: [x, y, z + height / 2 + 0.3],
         text: `${class_} ${score.toFixed(2)}`,
@@ -114,7 +119,7 @@ export class Scene {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     const matrix = this.camera.matrix(width / Math.max(height, 1));
-    this.drawArrays(this.points, gl.POINTS, matrix, { ratio: [ratio] }, { point: 4 });
+    this.drawArrays(this.points, gl.POINTS, matrix, { ratio: [ratio], ...this.heights }, { point: 4 });
     const ofLines = { size: [canvas.width, canvas.height], width: [2 * ratio] };
     this.drawArrays(this.lines, gl.TRIANGLES, matrix, ofLines, { place: 3, other: 3, side: 1, tint: 4 });
     this.placeLabels(matrix, width, height);
@@ -127,7 +132,8 @@ export class Scene {
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
     gl.uniformMatrix4fv(gl.getUniformLocation(shader, "matrix"), false, matrix);
     for (const [name, value] of Object.entries(uniforms)) {
-      gl[`uniform${value.length}fv`](gl.getUniformLocation(shader, name), value);
+      const size = name === "ramp" ? 3 : value.length; // an array of colors
+      gl[`uniform${size}fv`](gl.getUniformLocation(shader, name), value);
     }
     const stride = 4 * Object.values(attributes).reduce((sum, size) => sum + size, 0);
     let offset = 0;
@@ -189,6 +195,15 @@ export function cssColor(color) {
   return `rgb(${color.map((value) => Math.round(value * 255)).join(" ")})`;
 }
 
+/** The height (m) that a tenth of the points lie below, as NumPy's percentile has it; 0 without points. */
+export function groundHeight(points) {
+  const heights = Float32Array.from({ length: points.length / 4 }, (_, row) => points[4 * row + 2]).sort();
+  if (heights.length === 0) return 0;
+  const place = GROUND_SHARE * (heights.length - 1);
+  const low = Math.floor(place);
+  return heights[low] + (place - low) * (heights[Math.min(low + 1, heights.length - 1)] - heights[low]);
+}
+
 function distance([x0, y0], [x1, y1]) {
   return Math.hypot(x1 - x0, y1 - y0);
 }
@@ -201,16 +216,16 @@ function label({ text, color, name = "" }) {
 }
 
 /** Rings around the sensor on the ground, and a line straight ahead. */
-function rings() {
+function rings(ground) {
   const steps = 96;
   const at = (radius, step) => {
     const angle = (step / steps) * 2 * Math.PI;
-    return [radius * Math.cos(angle), radius * Math.sin(angle), GROUND_M];
+    return [radius * Math.cos(angle), radius * Math.sin(angle), ground];
   };
   const circles = RINGS_M.flatMap((radius) =>
     Array.from({ length: steps }, (_, step) => [at(radius, step), at(radius, step + 1), RING_COLOR]),
   );
-  return [...circles, [[0, 0, GROUND_M], [RINGS_M.at(-1), 0, GROUND_M], RING_COLOR]];
+  return [...circles, [[0, 0, ground], [RINGS_M.at(-1), 0, ground], RING_COLOR]];
 }
 
 /** The twelve edges of a box, and an arrow on its roof that shows the heading. */
