@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from asca_deploy.around import ranges_around
 from asca_deploy.detect_scans import DetectedScan, repairs
 from asca_deploy.detector import Detector
-from asca_deploy.manifest import load_bundle
-from asca_deploy.open_model import RuntimeOptions, open_detector
+from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
 from asca_deploy.recordings.foxglove_file import FoxgloveFile, is_own_mcap
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
 from asca_deploy.recordings.rerun_file import RerunFile, is_own_rrd
@@ -33,8 +32,7 @@ from asca_deploy.recordings.results import (
 )
 from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz
 from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
-from asca_deploy.shipped import find_bundle
-from asca_deploy.tracker import WEAK_SHARE, Tracker
+from asca_deploy.tracker import Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
@@ -177,8 +175,8 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     mounting, said = scans.mounting(reading)
     for line in said:
         reporter.remark(line)
-    births = _thresholds(options.bundle, task.score)
-    least = WEAK_SHARE * min(births.values()) if task.track else task.score
+    births, weak = track_thresholds(options.bundle, task.score)
+    least = weak if task.track else task.score
     detector = open_detector(options, least, mounting, around=task.around)
     about = _about(task, reading, mounting, detector, topic.name, least)
     with Journal(task.out, about, detector.spec.class_names) as journal:
@@ -270,13 +268,6 @@ class _Run:
             self.troubles.append(str(one.trouble))
             self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.trouble))
             yield
-
-
-def _thresholds(bundle: str | Path | None, score: ScoreThresholds | None) -> dict[str, float]:
-    """The score of each class from which on a detection begins a track; ConfigError if it is none."""
-    spec = load_bundle(find_bundle(bundle)).spec
-    spec = spec if score is None else spec.with_score_threshold(score)
-    return {one.name: one.score_threshold for one in spec.classes}
 
 
 def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
