@@ -14,13 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.around import ranges_around
 from asca_deploy.detect_scans import DetectedScan, repairs
 from asca_deploy.detector import Detector
 from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
-from asca_deploy.recordings.foxglove_file import FoxgloveFile, is_own_mcap
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
-from asca_deploy.recordings.rerun_file import RerunFile, is_own_rrd
 from asca_deploy.recordings.results import (
     Found,
     JsonLines,
@@ -30,15 +27,14 @@ from asca_deploy.recordings.results import (
     said_of_stamps,
     tracked,
 )
-from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz
-from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
+from asca_deploy.recordings.sequence_files import SequenceFiles
+from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, claim, remove_companions
 from asca_deploy.tracker import Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.base.schema import to_dict
-from asca_pillars.base.writable_file import require_suffix, require_writable
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.detection.spec import ScoreThresholds
@@ -87,10 +83,7 @@ class _Task:
     track: bool
     odometry: str | None
     calib: Path | None
-    foxglove: Path | None
-    rerun: Path | None
-    video: Path | None = None
-    video_view: VideoView = "above"
+    files: SequenceFiles
 
 
 def detect_recording(
@@ -145,24 +138,19 @@ def detect_recording(
         track=track,
         odometry=odometry,
         calib=None if calib is None else Path(calib),
-        foxglove=None if foxglove is None else Path(foxglove),
-        rerun=None if rerun is None else Path(rerun),
-        video=None if video is None else Path(video),
-        video_view=video_view,
+        files=SequenceFiles(
+            foxglove=None if foxglove is None else Path(foxglove),
+            rerun=None if rerun is None else Path(rerun),
+            video=None if video is None else Path(video),
+            video_view=video_view,
+        ),
     )
     return _detect(task, reading, options, Reporter(progress, remark))
 
 
 def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporter: Reporter) -> RecordingResult:
     require("recordings")
-    if task.rerun is not None:
-        require("view")
-        require_suffix("--rerun", task.rerun, ".rrd")
-    if task.foxglove is not None:
-        require_suffix("--foxglove", task.foxglove, ".mcap")
-    inputs = (task.path, task.calib)
-    require_writable(task.foxglove, COMMAND, is_own_mcap, inputs)
-    require_writable(task.rerun, COMMAND, is_own_rrd, inputs)
+    task.files.check((task.path, task.calib))
     calibration = None if task.calib is None else read_calibration(task.calib)
     claim(task.out, {JOURNAL_FILE: is_journal})
     recording = open_recording(task.path)
@@ -197,18 +185,19 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{why}")
         if task.track:
             _check_times(times_ns, task, topic.name, poses, reporter)
-        results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
+        pose_at = None if poses is None else partial(_pose_of_scan, poses, mounting)
+        results = _with_points(tracked(journal, tracker, pose_at), scans if task.files.show_points else None)
+        opened = partial(task.files.open, detector=detector, times_ns=times_ns, pose_at=pose_at)
         scope = detector_scope(detector.spec, around=task.around)
-        video = _video(task, detector, scans, times_ns, poses)
-        written, classes = _write(task, results, scans, calibration, scope, about, video)
+        written, classes = _write(task, results, calibration, scope, about, opened)
         journal.remove()
     for line in repairs(run.kept):
         reporter.remark(line)
-    others = (None if task.calib is None else task.out / KITTI_FILE, task.foxglove, task.rerun, task.video)
+    kitti = [] if task.calib is None else [task.out / KITTI_FILE]
     return RecordingResult(
         written,
         {name: classes[name] for name in detector.spec.class_names},
-        (task.out / RUN_FILE, *(path for path in others if path is not None)),
+        (task.out / RUN_FILE, *kitti, *task.files.paths),
         1e3 * seconds / len(run.kept) if run.kept else None,
         (*sorted(filter(None, damages)), *run.skipped()),
         tuple(reporter.remarks),
@@ -319,32 +308,23 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
     return np.asarray(poses.at(time_ns) @ level)
 
 
-def _video(
-    task: _Task, detector: Detector, scans: RecordedScans, times_ns: Sequence[int], poses: Poses | None
-) -> Callable[[Path], RecordingVideo] | None:
-    """A function that opens the video, or None where there is none."""
-    if task.video is None:
-        return None
-    mounting = detector.mounting
-    return partial(
-        RecordingVideo,
-        rate_hz=recording_rate_hz(times_ns),
-        view=task.video_view,
-        ranges=ranges_around(detector.spec.ranges, detector.passes),
-        level=None if mounting.level.is_identity else mounting.level,
-        scans=scans.read(),
-        pose_at=None if poses is None else partial(_pose_of_scan, poses, mounting),
-    )
+def _with_points(
+    results: Iterator[Found], scans: RecordedScans | None
+) -> Iterator[tuple[Found, NDArray[np.float32] | None]]:
+    """Each result with the points of its scan, which is read once more; None without `scans`."""
+    again = iter(()) if scans is None else scans.read()
+    for found in results:
+        points = (one.scan.points for one in again if one.number == found.number and one.scan is not None)
+        yield found, None if scans is None else next(points)
 
 
 def _write(
     task: _Task,
-    results: Iterator[Found],
-    scans: RecordedScans,
+    results: Iterator[tuple[Found, NDArray[np.float32] | None]],
     calibration: Any,
     scope: DetectorScope,
     about: dict[str, Any],
-    video: Callable[[Path], RecordingVideo] | None,
+    opened: Callable[[ExitStack, ExitStack], list[ResultFile]],
 ) -> tuple[int, Counter[str]]:
     """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
     with ExitStack() as places, ExitStack() as handles:
@@ -355,27 +335,14 @@ def _write(
         if calibration is not None:
             kitti = places.enter_context(atomic_path(task.out / KITTI_FILE))
             files.append(KittiTracks(open_text(handles, kitti), calibration))
-        if task.foxglove is not None:
-            place = places.enter_context(atomic_path(task.foxglove))
-            foxglove = FoxgloveFile(handles.enter_context(place.open("wb")))
-            handles.callback(foxglove.finish)
-            files.append(foxglove)
-        if task.rerun is not None:
-            rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
-            handles.callback(rerun.finish)
-            files.append(rerun)
-        if task.video is not None and video is not None:
-            place = places.enter_context(atomic_path(task.video))
-            drawn = video(place)
-            handles.callback(drawn.finish)
-            files.append(drawn)
+        files += opened(places, handles)
         scans_written = 0
         classes: Counter[str] = Counter()
-        for found in results:
+        for found, points in results:
             scans_written += 1
             classes.update(found.detections.names)
             for file in files:
-                file.write(found)
+                file.write(found, points)
         handles.close()  # before the names are changed
     remove_companions(task.out, [ABOUT_FILE, *([] if calibration is None else [KITTI_FILE])])
     return scans_written, classes
