@@ -383,7 +383,7 @@ def test_nothing_readable_is_an_error_and_writes_nothing(tmp_path: Path) -> None
 
 def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="need a recording"):
-        detect([sample_scan_path()], out=tmp_path, track=True)
+        detect([sample_scan_path()], out=tmp_path, topic="/lidar")
     with pytest.raises(ConfigError, match="give one alone"):
         detect([drive, sample_scan_path()], out=tmp_path)
     with pytest.raises(ConfigError, match="--pictures: scans of a recording are not drawn"):
