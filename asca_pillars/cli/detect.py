@@ -71,6 +71,15 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            "--frame",
+            help="Of a recording: the vehicle's frame (base_link), x forward, y left, z up; points and boxes are taken "
+            "into it by /tf_static. --sensor-height is then the height of that frame.",
+            rich_help_panel="Recording",
+        ),
+    ] = None,
     track: Annotated[
         bool,
         typer.Option(
@@ -212,6 +221,7 @@ def detect(
                 recordings[0],
                 out,
                 topic=topic,
+                frame=frame,
                 track=track,
                 odometry=odometry,
                 calib=calib,
@@ -228,8 +238,8 @@ def detect(
             )
         _print_recording(recorded, console)
         return
-    if topic or odometry or calib:
-        raise ConfigError("--topic, --odometry and --calib need a recording (.mcap, .db3, .bag, .pcap)")
+    if topic or frame or odometry or calib:
+        raise ConfigError("--topic, --frame, --odometry and --calib need a recording (.mcap, .db3, .bag, .pcap)")
     if cluster is not None:
         from asca_deploy.detect_archive import detect_archive
         from asca_pillars.scans.find_scans import name_scans

@@ -13,7 +13,7 @@ def decoded(message: Message, kind: str) -> Any:
     Raises:
         Exception: it is damaged; the library lets struct's and NumPy's errors pass.
     """
-    store = _typestore(message.encoding)
+    store = typestore(message.encoding)
     if message.encoding == "ros1":
         return store.deserialize_ros1(message.data, kind)
     if message.encoding != "cdr":
@@ -41,8 +41,13 @@ def time_of(header: Any, message: Message) -> int | None:
 
 
 @cache
-def _typestore(encoding: Encoding) -> Any:
+def typestore(encoding: Encoding) -> Any:
     """The standard definitions; those types that are read here have not changed since ROS 1."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    if encoding != "ros1":
+        return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    name = "tf2_msgs/msg/TFMessage"  # ROS 1's common messages do not have it
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
+    return store

@@ -80,6 +80,7 @@ class _Task:
     score: ScoreThresholds | None
     around: bool
     topic: str | None
+    frame: str | None
     track: bool
     odometry: str | None
     calib: Path | None
@@ -91,6 +92,7 @@ def detect_recording(
     out: str | Path,
     *,
     topic: str | None = None,
+    frame: str | None = None,
     track: bool = False,
     odometry: str | None = None,
     calib: str | Path | None = None,
@@ -111,6 +113,8 @@ def detect_recording(
         path: of the recording: .mcap, .db3, .bag or the folder of a rosbag2.
         out: folder for detections.jsonl and recording.json.
         topic: of the scans; None: the only one of the recording.
+        frame: of the vehicle, x forward, y left, z up, such as base_link: the points are taken into it, by the
+            recording's /tf_static, and so are the boxes; None: they stay in the frame of the scans.
         track: give boxes identities and velocities over time.
         odometry: with `track`, the topic of the car's poses; None: velocities are as the car sees them.
         calib: KITTI calibration, for KITTI's tracking text in `out`.
@@ -135,6 +139,7 @@ def detect_recording(
         score=score,
         around=around,
         topic=topic,
+        frame=frame,
         track=track,
         odometry=odometry,
         calib=None if calib is None else Path(calib),
@@ -157,9 +162,11 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:
         raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
+    if task.frame is not None and (reading.pose is not None or reading.axes != "x-forward"):
+        raise ConfigError(f"--frame {task.frame}: says how the scans lie already; leave --axes and --pose out")
     poses = None if task.odometry is None else read_poses(recording, task.odometry)
     damages = set() if poses is None else {recording.damage}
-    scans = RecordedScans(recording, topic, reading.reflectance_scale)
+    scans = RecordedScans(recording, topic, reading.reflectance_scale, task.frame)
     mounting, said = scans.mounting(reading)
     for line in said:
         reporter.remark(line)
@@ -290,6 +297,7 @@ def _about(
         "recording": str(task.path),
         "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files],
         "topic": topic,
+        "frame": task.frame,
         "made_by": detector.made_by,
         "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         "runs_on": detector.runs_on,
