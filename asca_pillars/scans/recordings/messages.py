@@ -6,6 +6,13 @@ from typing import Any
 from asca_pillars.scans.recordings.decompression import ZSTD_MAGIC, decompress_zstd
 from asca_pillars.scans.recordings.recording import Encoding, Message
 
+_OTHER_TYPES = {
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",  # ROS 1's common messages do not have it
+    "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data",
+    "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets",
+}
+"""Types that are no part of the library's stores."""
+
 
 def decoded(message: Message, kind: str) -> Any:
     """A stored message of a type such as sensor_msgs/msg/PointCloud2, by ROS' own definitions.
@@ -45,9 +52,8 @@ def typestore(encoding: Encoding) -> Any:
     """The standard definitions; those types that are read here have not changed since ROS 1."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    if encoding != "ros1":
-        return get_typestore(Stores.ROS2_HUMBLE)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    name = "tf2_msgs/msg/TFMessage"  # ROS 1's common messages do not have it
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    for name, definition in _OTHER_TYPES.items():
+        if name not in store.types:
+            store.register(get_types_from_msg(definition, name))
     return store

@@ -5,6 +5,7 @@ from itertools import islice
 from typing import NamedTuple
 
 from asca_pillars.base.errors import ScanError
+from asca_pillars.base.extras import require
 from asca_pillars.geometry.rotations import transform_points
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
@@ -56,6 +57,8 @@ class RecordedScans:
         self._frame = frame
         self._transforms = Transforms() if frame is None else read_static_transforms(recording, frame)
         self._kind = kind_of_scans(topic.type) or "PointCloud2"  # of an unknown type
+        if self._kind == "Velodyne":
+            require("packets")
         if reflectance_scale == "auto":
             self.scale = common_reflectance_scale([cloud.points for cloud in self._first(16)])
         else:
