@@ -71,14 +71,41 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            "--frame",
+            help="Of a recording: the vehicle's frame (base_link), x forward, y left, z up; points and boxes are taken "
+            "into it by /tf_static. --sensor-height is then the height of that frame.",
+            rich_help_panel="Recording",
+        ),
+    ] = None,
     track: Annotated[
         bool,
         typer.Option(
             "--track",
-            help="In a recording: give boxes identities and velocities over time.",
+            help="In a recording, or a folder of scans in order: give boxes identities and velocities over time.",
             rich_help_panel="Recording",
         ),
     ] = False,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            "--rate",
+            metavar="HZ",
+            help="Of a folder of scans: scans per second. Default: 10.",
+            rich_help_panel="Recording",
+        ),
+    ] = None,
+    times: Annotated[
+        Path | None,
+        typer.Option(
+            "--times",
+            metavar="FILE",
+            help="Of a folder of scans, instead of --rate: the seconds of each scan, one in a line.",
+            rich_help_panel="Recording",
+        ),
+    ] = None,
     odometry: Annotated[
         str | None,
         typer.Option(
@@ -91,7 +118,7 @@ def detect(
         Path | None,
         typer.Option(
             "--foxglove",
-            help="Of a recording: also write the boxes as an MCAP for Foxglove.",
+            help="Of a recording or a folder: also write the boxes as an MCAP for Foxglove.",
             rich_help_panel="Recording",
         ),
     ] = None,
@@ -99,7 +126,7 @@ def detect(
         Path | None,
         typer.Option(
             "--rerun",
-            help="Of a recording: also write scans and boxes as an .rrd for the rerun viewer.",
+            help="Of a recording or a folder: also write scans and boxes as an .rrd for the rerun viewer.",
             rich_help_panel="Recording",
         ),
     ] = None,
@@ -150,6 +177,8 @@ def detect(
 
     asca detect drive.mcap --track --video drive.mp4 --video-view chase
 
+    asca detect drive1/ --track --rate 10 --video drive.mp4 --rerun drive.rrd
+
     asca detect /mnt/archive --out /mnt/boxes --cluster local
     """
     import logging
@@ -169,7 +198,7 @@ def detect(
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
-    view = require_video(video, video_view, [*(scans or ()), *([] if calib is None else [calib])])
+    view = require_video(video, video_view, [*(scans or ()), *(path for path in (calib, times) if path is not None)])
     recordings = [path for path in scans or () if is_recording(path)]
     if write is not None:
         from asca_pillars.data.importing.tool_labels import require_unchanged
@@ -178,6 +207,7 @@ def detect(
             raise ConfigError(f"--write {write}: labels belong to scan files, and {recordings[0]} is a recording")
         require_unchanged(out, write)
     if recordings:
+        _refuse_times(rate, times)
         if cluster is not None or len(scans or ()) > 1:
             raise ConfigError(f"{recordings[0]}: is a recording; give one alone, without --cluster")
         if pictures:
@@ -191,6 +221,7 @@ def detect(
                 recordings[0],
                 out,
                 topic=topic,
+                frame=frame,
                 track=track,
                 odometry=odometry,
                 calib=calib,
@@ -207,15 +238,18 @@ def detect(
             )
         _print_recording(recorded, console)
         return
-    if topic or track or odometry or foxglove or rerun or calib:
-        options_of_recordings = "--topic, --track, --odometry, --foxglove, --rerun and --calib"
-        raise ConfigError(f"{options_of_recordings} need a recording (.mcap, .db3, .bag)")
+    if topic or frame or odometry or calib:
+        raise ConfigError("--topic, --frame, --odometry and --calib need a recording (.mcap, .db3, .bag, .pcap)")
     if cluster is not None:
         from asca_deploy.detect_archive import detect_archive
         from asca_pillars.scans.find_scans import name_scans
 
         if video is not None:
             raise ConfigError(f"--video {video}: is not made with --cluster; leave one of them out")
+        if track or rate is not None or times or foxglove or rerun:
+            raise ConfigError(
+                "--track, --rate, --times, --foxglove and --rerun do not go with --cluster; leave them out"
+            )
         if pictures:
             raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
         paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
@@ -245,6 +279,11 @@ def detect(
             score=scores,
             around=around,
             pictures=pictures is not False,
+            track=track,
+            rate_hz=rate,
+            times=times,
+            foxglove=foxglove,
+            rerun=rerun,
             video=video,
             video_view=view,
             progress=bars,
@@ -252,6 +291,13 @@ def detect(
         )
     _write_labels(out, write, console)
     _print_scans(found, out, console)
+
+
+def _refuse_times(rate: float | None, times: Path | None) -> None:
+    """Times of scans go with folders alone."""
+    if rate is not None or times is not None:
+        option = f"--rate {rate:g}" if rate is not None else f"--times {times}"
+        raise ConfigError(f"{option}: is for folders of scans, and a recording has its times; leave it out")
 
 
 def _write_labels(out: Path, name: str | None, console: "Console") -> None:

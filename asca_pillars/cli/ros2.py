@@ -81,11 +81,9 @@ def ros2(
     import os
 
     from asca_deploy.detector import Detector
-    from asca_deploy.manifest import load_bundle
-    from asca_deploy.open_model import RuntimeOptions, open_detector
+    from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
     from asca_deploy.ros2.node import NodeSettings, Qos, run_node
-    from asca_deploy.shipped import find_bundle
-    from asca_deploy.tracker import WEAK_SHARE, Tracker
+    from asca_deploy.tracker import Tracker
     from asca_pillars.scans.mounting import Mounting
 
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are in the diagnostics
@@ -96,10 +94,9 @@ def ros2(
         topic=topic, reading=reading, qos=cast("Qos", qos), frame=frame, log_every=log_every, ros_args=ros_args or ()
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
-    scores, spec = read_scores(score), load_bundle(find_bundle(bundle)).spec
-    thresholds = spec if scores is None else spec.with_score_threshold(scores)
-    births = {one.name: one.score_threshold for one in thresholds.classes}
-    least = WEAK_SHARE * min(births.values()) if track else scores
+    scores = read_scores(score)
+    births, weak = track_thresholds(bundle, scores)
+    least = weak if track else scores
 
     def opened(mounting: Mounting) -> Detector:
         return open_detector(options, least, mounting, around=around)

@@ -5,7 +5,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.base.errors import ScanError
 from asca_pillars.geometry.rotations import of_quaternions
+from asca_pillars.scans.recordings.messages import decoded
+from asca_pillars.scans.recordings.recording import Recording, reason
+
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/msg/tfMessage", "tf/tfMessage")
+_STATIC = "tf_static"
 
 
 class Transforms:
@@ -48,6 +54,37 @@ class Transforms:
             matrix = step @ matrix
             found[frame] = matrix
         return found
+
+
+def read_static_transforms(recording: Recording, frame: str) -> Transforms:
+    """What a recording's `/tf_static` says, of any namespace.
+
+    Args:
+        recording: to read from.
+        frame: that is asked for later.
+
+    Raises:
+        ScanError: there is no such topic, none of its messages can be read, or they do not name the frame.
+    """
+    instead = "say how the scans lie by --axes or --pose instead of --frame"
+    topics = [
+        one.name
+        for one in recording.topics
+        if one.name.rpartition("/")[2] == _STATIC and one.type in TRANSFORM_TYPES and one.messages
+    ]
+    if not topics:
+        raise ScanError(f"{recording.path}: no messages on /{_STATIC} (tf2_msgs/msg/TFMessage); {instead}")
+    transforms, trouble = Transforms(), ""
+    for topic in topics:
+        for message in recording.messages(topic):
+            try:
+                transforms.add(decoded(message, TRANSFORM_TYPES[0]))
+            except Exception as error:  # the library lets struct's errors pass
+                trouble = f" ({reason(error)})"
+    if _plain(frame) not in transforms.frames:
+        known = ", ".join(transforms.frames)[:200] or f"no frame{trouble}"
+        raise ScanError(f"{recording.path}: {', '.join(topics)} names no {frame[:80]}; there is {known}, or {instead}")
+    return transforms
 
 
 def _plain(frame: str) -> str:

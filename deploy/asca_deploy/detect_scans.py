@@ -4,18 +4,23 @@ import errno
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
-from asca_deploy.open_model import RuntimeOptions, open_detector
+from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
+from asca_deploy.recordings.results import Found
+from asca_deploy.recordings.sequence_files import SequenceFiles
 from asca_deploy.result_files import ResultWriter
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import sample_scan_path
+from asca_deploy.tracker import Tracker
+from asca_deploy.tracks import Tracks
 from asca_pillars.base.errors import ScanError, printable
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.data.boxes.detector_scope import detector_scope
@@ -25,19 +30,26 @@ from asca_pillars.scans.find_scans import name_scans
 from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import ScanNotes
 from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.scan_times import require_one_folder, scan_times_ns
 
 _NUMBER = re.compile(r"\d[\d.,]*")
+FRAME_ID = "lidar"
+"""The frame of scan files, which name none, for viewers."""
 _PLAIN = RuntimeOptions()
 _AS_TRAINED = ScanSettings()
 
 
 @dataclass(frozen=True)
 class DetectedScan:
-    """One scan: its file, what was repaired while reading it, and its boxes with their report."""
+    """One scan: its file, what was repaired while reading it, and its boxes with their report.
+
+    `tracks` are the same boxes with identities and velocities, if they were asked for.
+    """
 
     path: Path
     notes: ScanNotes
     detections: ScanDetections
+    tracks: Tracks | None = None
 
 
 @dataclass(frozen=True)
@@ -79,6 +91,11 @@ def detect_scans(
     score: ScoreThresholds | None = None,
     around: bool = False,
     pictures: bool = True,
+    track: bool = False,
+    rate_hz: float | None = None,
+    times: str | Path | None = None,
+    foxglove: str | Path | None = None,
+    rerun: str | Path | None = None,
     video: str | Path | None = None,
     video_view: VideoView = "above",
     progress: Progress | None = None,
@@ -94,7 +111,12 @@ def detect_scans(
         score: report detections from this score on, or by class; None: the thresholds of the model.
         around: look in every direction, by turned passes.
         pictures: whether pictures are drawn into `out`.
-        video: an .mp4 of all scans, written with `out`; None makes none.
+        track: give boxes identities and velocities over time; the scans then lie in one folder, in order.
+        rate_hz: scans per second of that folder; None: 10.
+        times: instead of a rate, a text file with the seconds of each scan, one in a line.
+        foxglove: an .mcap to write for Foxglove.
+        rerun: an .rrd to write for the rerun viewer.
+        video: an .mp4 to write, boxes with their tracks.
         video_view: from above, or "chase" in 3D.
         progress: called after each scan.
         failed: called with a line for each scan that cannot be read or written, as soon as that is known.
@@ -105,24 +127,32 @@ def detect_scans(
     """
     chosen = [sample_scan_path()] if scans is None else [scans] if isinstance(scans, str | Path) else scans
     named = name_scans([Path(path) for path in chosen])
-    scan_input = ScanInput(reading, [path for path, _ in named])
-    detector = open_detector(options, score, scan_input.mounting, around=around)
+    paths = [path for path, _ in named]
+    files = SequenceFiles(
+        foxglove=None if foxglove is None else Path(foxglove),
+        rerun=None if rerun is None else Path(rerun),
+        video=None if video is None else Path(video),
+        video_view=video_view,
+    )
+    times = None if times is None else Path(times)
+    if track or rate_hz is not None or times or foxglove or rerun:
+        require_one_folder(paths)
+    times_ns = scan_times_ns(len(paths), rate_hz, times)
+    files.check([*map(Path, chosen), *paths, times])
+    births, weak = track_thresholds(options.bundle, score) if track else ({}, None)
+    scan_input = ScanInput(reading, paths)
+    detector = open_detector(options, weak if track else score, scan_input.mounting, around=around)
+    tracker = Tracker(birth_score=births) if track else None
     writer = None
     if out is not None:
         scope = detector_scope(detector.spec, around=around)
-        writer = ResultWriter(
-            Path(out),
-            [name for _, name in named],
-            pictures=pictures,
-            scope=scope,
-            video=None if video is None else Path(video),
-            video_view=video_view,
-        )
+        writer = ResultWriter(Path(out), [name for _, name in named], pictures=pictures, scope=scope)
     reporter = Reporter(progress if len(named) > 1 else None, failed)
     results: list[DetectedScan] = []
     unreadable = 0
-    with writer or nullcontext():
-        for path, name in reporter.track(named, "Detecting"):
+    with writer or nullcontext(), ExitStack() as places, ExitStack() as handles:
+        opened = files.open(places, handles, detector, times_ns)
+        for number, (path, name) in enumerate(reporter.track(named, "Detecting")):
             try:
                 scan = scan_input.read(path)
                 detections = detector(scan.points)
@@ -132,16 +162,24 @@ def detect_scans(
                 unreadable += 1
                 reporter.remark(printable(str(error)))
                 continue
-            results.append(DetectedScan(path, scan.notes, detections))
+            tracks = None
+            if tracker is not None:
+                tracks = tracker(detections, times_ns[number] * 1e-9)
+                detections = cast("ScanDetections", tracks.detections)  # a part of these
+            results.append(DetectedScan(path, scan.notes, detections, tracks))
+            found = Found(number, times_ns[number], FRAME_ID, detections, tracks)
+            for file in opened:
+                file.write(found, scan.points)
             try:
                 if writer is not None:
-                    writer(path, name, scan, detections)
+                    writer(path, name, scan, detections, tracks, None if times is None else times_ns[number])
             except OSError as error:
                 if error.errno != errno.ENAMETOOLONG:
                     raise
                 reporter.remark(printable(str(error)))
-    if not results:
-        raise ScanError(f"none of the {len(named)} scans can be read")
+        if not results:
+            raise ScanError(f"none of the {len(named)} scans can be read")
+        handles.close()  # before the names are changed
     remarks = (*scan_input.said, *repairs(results), *([] if writer is None else writer.remarks[:1]))
     return DetectedScans(tuple(results), detector, tuple(reporter.remarks), unreadable, scan.points, remarks)
 

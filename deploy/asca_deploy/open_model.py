@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
+from asca_deploy.manifest import load_bundle
 from asca_deploy.providers import Precision, Provider, arithmetic
+from asca_deploy.shipped import find_bundle
+from asca_deploy.tracker import WEAK_SHARE
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.extras import require
 from asca_pillars.base.system import check_threads
@@ -50,6 +53,25 @@ def open_detector(
         mounting=mounting,
         view="around" if around else "ahead",
     )
+
+
+def track_thresholds(bundle: str | Path | None, score: ScoreThresholds | None = None) -> tuple[dict[str, float], float]:
+    """The scores from which on detections of each class begin tracks, and from which on the detector is to report.
+
+    Args:
+        bundle: of the detector; None: the one that ships.
+        score: from which on boxes are wanted, or by class; None: the thresholds of the model.
+
+    Returns:
+        `Tracker`'s birth_score, and the detector's score threshold: WEAK_SHARE of the lowest of these.
+
+    Raises:
+        AscaError: the bundle cannot be read, or it is no such score.
+    """
+    spec = load_bundle(find_bundle(bundle)).spec
+    spec = spec if score is None else spec.with_score_threshold(score)
+    births = {one.name: one.score_threshold for one in spec.classes}
+    return births, WEAK_SHARE * min(births.values())
 
 
 def open_model(

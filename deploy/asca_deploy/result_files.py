@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.scan_detections import ScanDetections
+from asca_deploy.tracks import Tracks
 from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.base.files import atomic_path, write_json, write_text
 from asca_pillars.base.input_files import require_content
@@ -34,7 +35,6 @@ from asca_pillars.data.open_split import labels_of_scan
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page
-from asca_pillars.pictures.video import BoxVideo, VideoFile, VideoView
 from asca_pillars.pictures.visualize import draw_on_image, read_image, write_png
 from asca_pillars.scans.scan_reader import Scan
 
@@ -44,8 +44,6 @@ ABOUT_FILE = "recording.json"
 KITTI_FILE = "tracks.txt"
 UNREADABLE_FILE = "unreadable.jsonl"
 INDEX_FILE = "index.html"
-SCAN_RATE_HZ = 10.0
-"""Of the scans of a folder, which have no times: how fast their video runs."""
 MISSED_IOU = 0.1
 """A label that no box overlaps so far, seen from above, counts as missed on the page of pictures."""
 
@@ -113,28 +111,14 @@ class ResultWriter:
         names: of the scans' results, paths below `out` without endings.
         pictures: False writes no picture.
         scope: what the detector could find.
-        video: an MP4 of all scans; None: none is made.
-        video_view: "above" or "chase".
 
     Raises:
         OutputError: when the block is entered, if something else would be replaced.
     """
 
-    def __init__(
-        self,
-        out: Path,
-        names: Sequence[Path],
-        *,
-        pictures: bool,
-        scope: DetectorScope,
-        video: Path | None = None,
-        video_view: VideoView = "above",
-    ) -> None:
+    def __init__(self, out: Path, names: Sequence[Path], *, pictures: bool, scope: DetectorScope) -> None:
         self.out, self._names, self._pictures, self._scope = out, names, pictures, scope
-        self._video_path, self._video_view = video, video_view
-        self._video: BoxVideo | None = None
         self._cards: list[GalleryCard] = []
-        self._count = 0
         self._all_kept = True
         self._stack = ExitStack()
         self._written: set[str] = set()
@@ -164,15 +148,28 @@ class ResultWriter:
                 self._written.add(INDEX_FILE)
             remove_companions(self.out, self._written)
 
-    def __call__(self, path: Path, name: Path, scan: Scan, detections: ScanDetections) -> None:
+    def __call__(
+        self,
+        path: Path,
+        name: Path,
+        scan: Scan,
+        detections: ScanDetections,
+        tracks: Tracks | None = None,
+        time_ns: int | None = None,
+    ) -> None:
         """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too.
 
         Those of them that an earlier run wrote, and this one does not, are removed if the boxes are others now.
+        `tracks` are of the same boxes; the time is written if it is given.
         """
         if self._lines is None:
             self._lines = self._open()
         calibration = self._calibration(path)  # first: of several remarks a user sees the first one
         content = scan_content(path, scan, detections, self._scope)
+        if tracks is not None:
+            content["boxes"] = tracks.to_dicts()
+        if time_ns is not None:
+            content |= {"time_s": time_ns / 1e9, "time_ns": time_ns}
         line = as_line(content)
         kept = self._has_boxes(name, json.loads(line)["boxes"])
         self._all_kept &= kept
@@ -184,19 +181,10 @@ class ResultWriter:
             write_png(self._named(name, "_bev.png"), detections.plot(scan.points, labels=labels))
             written.add("_bev.png")
             self._cards.append(_card(name, detections, labels, content["warnings"]))
-        if self._video_path is not None:
-            self._add_to_video(self._video_path, scan, detections)
         if calibration is not None:
             written |= self._write_camera_view(path, name, detections, calibration)
         for ending in () if kept else _OF_A_SCAN.keys() - written:
             self._named(name, ending).unlink(missing_ok=True)
-
-    def _add_to_video(self, path: Path, scan: Scan, detections: ScanDetections) -> None:
-        if self._video is None:
-            file = self._stack.enter_context(VideoFile(self._stack.enter_context(atomic_path(path)), SCAN_RATE_HZ))
-            self._video = BoxVideo(file, self._video_view, detections.ranges, detections.level)
-        self._video.add(scan.points, detections, self._count / SCAN_RATE_HZ)
-        self._count += 1
 
     def _page(self) -> str:
         """The page of all pictures."""

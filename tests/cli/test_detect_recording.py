@@ -17,6 +17,8 @@ import pytest
 
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
+from scipy.spatial.transform import Rotation
+
 from asca_deploy import find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
 from asca_deploy.recordings import detect_recording as steps
@@ -30,7 +32,7 @@ from asca_pillars.data.kitti import KittiSplit
 from benchmarks.made_recordings import write_recording
 from tests.cli.short_drive import POINTS, SCANS
 from tests.in_process import run_here
-from tests.scans.recordings.cloud_recordings import laid_out, stamps, write_mcap
+from tests.scans.recordings.cloud_recordings import laid_out, stamps, transform_message, write_mcap
 from tests.scenes import write_dataset
 
 
@@ -85,6 +87,26 @@ def test_tracks_last_and_move(drive: Path, tmp_path: Path, capsys: pytest.Captur
     assert len(list(read_frames(tmp_path / "detections.jsonl"))) == SCANS, "other tools read the lines"
     counts = Counter(box["class"] for line in lines for box in line["boxes"])
     assert f"{SCANS} scans, in all {counts['Car']} Car, " in capsys.readouterr().out, "of what is written"
+
+
+def test_boxes_are_in_the_vehicles_frame(drive: Path, tmp_path: Path) -> None:
+    """Of a sensor that is tilted, which no box could be in the frame of."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    pose[:3, 3] = 0.5, 0, 1.0
+    tilted = POINTS.copy()
+    tilted[:, :3] = (POINTS[:, :3] - pose[:3, 3]) @ pose[:3, :3]
+    path = write_mcap(
+        tmp_path / "tilted.mcap",
+        {"/lidar": [(stamps(1)[0], laid_out(tilted))]},
+        transforms=[transform_message("base_link", "lidar", pose)],
+    )
+    (line,) = run(path, tmp_path / "tilted", frame="base_link")
+    straight = run(drive, tmp_path / "straight")[0]
+    assert line["frame_id"] == "base_link" and len(line["boxes"]) == len(straight["boxes"])
+    assert line["boxes"][0] == pytest.approx(straight["boxes"][0], abs=0.05)
+    with pytest.raises(ConfigError, match="--frame base_link: says how the scans lie already"):
+        run(path, tmp_path / "tilted", frame="base_link", axes="y-forward")
 
 
 def test_foxglove_file_is_read_back(drive: Path, tmp_path: Path) -> None:
@@ -383,7 +405,7 @@ def test_nothing_readable_is_an_error_and_writes_nothing(tmp_path: Path) -> None
 
 def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="need a recording"):
-        detect([sample_scan_path()], out=tmp_path, track=True)
+        detect([sample_scan_path()], out=tmp_path, topic="/lidar")
     with pytest.raises(ConfigError, match="give one alone"):
         detect([drive, sample_scan_path()], out=tmp_path)
     with pytest.raises(ConfigError, match="--pictures: scans of a recording are not drawn"):

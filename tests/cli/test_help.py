@@ -13,7 +13,17 @@ from asca_pillars.cli.main import app
 PANELS = {
     "Input": {"--bundle", "--data"},
     "Sensor": {"--sensor-height", "--axes", "--pose", "--reflectance-scale", "--columns", "--around"},
-    "Recording": {"--topic", "--track", "--odometry", "--foxglove", "--rerun", "--calib"},
+    "Recording": {
+        "--topic",
+        "--frame",
+        "--track",
+        "--rate",
+        "--times",
+        "--odometry",
+        "--foxglove",
+        "--rerun",
+        "--calib",
+    },
     "Output": {"--score", "--pictures", "--write"},
     "Speed": {"--provider", "--precision", "--threads", "--cluster"},
 }

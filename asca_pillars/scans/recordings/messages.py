@@ -6,6 +6,13 @@ from typing import Any
 from asca_pillars.scans.recordings.decompression import ZSTD_MAGIC, decompress_zstd
 from asca_pillars.scans.recordings.recording import Encoding, Message
 
+_OTHER_TYPES = {
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",  # ROS 1's common messages do not have it
+    "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data",
+    "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets",
+}
+"""Types that are no part of the library's stores."""
+
 
 def decoded(message: Message, kind: str) -> Any:
     """A stored message of a type such as sensor_msgs/msg/PointCloud2, by ROS' own definitions.
@@ -13,7 +20,7 @@ def decoded(message: Message, kind: str) -> Any:
     Raises:
         Exception: it is damaged; the library lets struct's and NumPy's errors pass.
     """
-    store = _typestore(message.encoding)
+    store = typestore(message.encoding)
     if message.encoding == "ros1":
         return store.deserialize_ros1(message.data, kind)
     if message.encoding != "cdr":
@@ -41,8 +48,12 @@ def time_of(header: Any, message: Message) -> int | None:
 
 
 @cache
-def _typestore(encoding: Encoding) -> Any:
+def typestore(encoding: Encoding) -> Any:
     """The standard definitions; those types that are read here have not changed since ROS 1."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    for name, definition in _OTHER_TYPES.items():
+        if name not in store.types:
+            store.register(get_types_from_msg(definition, name))
+    return store

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.extras import require
 from asca_pillars.scans.find_scans import visible_files
+from asca_pillars.scans.recordings.messages import decoded
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic, reason
+from asca_pillars.scans.records import StoredPoints
 
 VELODYNE, OUSTER = "velodyne/Packets", "ouster/Packets"
 _TOPIC = "/packets"
@@ -111,6 +113,25 @@ class PacketCapture(Recording):
                 ranges, times = scan.field("RANGE"), scan.packet_timestamp
                 points = np.column_stack([table(ranges).reshape(-1, 3), scan.field("REFLECTIVITY").reshape(-1) / 255.0])
                 yield int(times[times > 0].min()), points[ranges.reshape(-1) > 0].astype(np.float32)
+
+
+def velodyne_scan(message: Message) -> tuple[Any, StoredPoints]:
+    """Header and points of a stored velodyne_msgs/VelodyneScan, which holds the packets of a revolution.
+
+    Raises:
+        Exception: it is damaged, or its packets are.
+    """
+    import velodyne_decoder
+
+    scan = decoded(message, "velodyne_msgs/msg/VelodyneScan")
+    packets = velodyne_decoder.PacketVector()
+    for one in scan.packets:
+        stamp_s = one.stamp.sec + one.stamp.nanosec / 1e9
+        packets.append(velodyne_decoder.VelodynePacket(stamp_s, bytes(one.data)))
+    if not packets:
+        return scan.header, StoredPoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.dtype("<f4"))
+    _, points = _of_velodyne(velodyne_decoder.ScanDecoder(velodyne_decoder.Config()).decode(packets))
+    return scan.header, StoredPoints(points[:, :3], points[:, 3], np.dtype("<f4"))
 
 
 def _metadata_beside(path: Path) -> Path:

@@ -7,6 +7,7 @@ import numpy as np
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.messages import decoded, time_of
 from asca_pillars.scans.recordings.other_clouds import foxglove_cloud, livox_cloud, packed_points, point_cloud, posed
+from asca_pillars.scans.recordings.packet_files import velodyne_scan
 from asca_pillars.scans.recordings.recording import Message, reason
 from asca_pillars.scans.recordings.scan_types import ScanKind
 from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, select_fields
@@ -54,6 +55,8 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
 def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoints]:
     if kind == "Packets":
         return packed_points(message)
+    if kind == "Velodyne":
+        return velodyne_scan(message)
     if kind == "PointCloud":
         return point_cloud(message)
     if kind == "Livox":

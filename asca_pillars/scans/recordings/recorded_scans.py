@@ -5,15 +5,18 @@ from itertools import islice
 from typing import NamedTuple
 
 from asca_pillars.base.errors import ScanError
+from asca_pillars.base.extras import require
+from asca_pillars.geometry.rotations import transform_points
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
-from asca_pillars.scans.recordings.recording import Recording, Topic
+from asca_pillars.scans.recordings.recording import Message, Recording, Topic
 from asca_pillars.scans.recordings.scan_types import kind_of_scans
 from asca_pillars.scans.scan_input import said_of_scale
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, finite_scan
 from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
 from asca_pillars.scans.stored_scans import FolderScale, common_reflectance_scale, has_finite_point
+from asca_pillars.scans.transforms import Transforms, read_static_transforms
 
 SEARCHED_MESSAGES = 300
 """How far scans with points are looked for: half a minute at 10 Hz, in which a sensor starts."""
@@ -38,14 +41,24 @@ class RecordedScans:
         recording: to read from.
         topic: of point clouds.
         reflectance_scale: the stored value that is a reflectance of 1; auto: by the first scans with points, once.
+        frame: that the points are taken into, by the recording's static transforms; None: they stay in their own.
 
     Attributes:
         scale: what was decided.
+
+    Raises:
+        ScanError: there are no static transforms, or they do not name `frame`.
     """
 
-    def __init__(self, recording: Recording, topic: Topic, reflectance_scale: ReflectanceScale) -> None:
+    def __init__(
+        self, recording: Recording, topic: Topic, reflectance_scale: ReflectanceScale, frame: str | None = None
+    ) -> None:
         self.recording, self.topic = recording, topic
+        self._frame = frame
+        self._transforms = Transforms() if frame is None else read_static_transforms(recording, frame)
         self._kind = kind_of_scans(topic.type) or "PointCloud2"  # of an unknown type
+        if self._kind == "Velodyne":
+            require("packets")
         if reflectance_scale == "auto":
             self.scale = common_reflectance_scale([cloud.points for cloud in self._first(16)])
         else:
@@ -83,7 +96,7 @@ class RecordedScans:
                 )
                 return
             try:
-                cloud = read_point_cloud(message, self._place(number), self._kind)
+                cloud = self._cloud(number, message)
                 unreadable = 0
             except ScanError as error:
                 unreadable += 1
@@ -97,11 +110,24 @@ class RecordedScans:
     def _clouds_with_points(self) -> Iterator[PointCloud]:
         for number, message in enumerate(islice(self.recording.messages(self.topic.name), SEARCHED_MESSAGES)):
             try:
-                cloud = read_point_cloud(message, self._place(number), self._kind)
+                cloud = self._cloud(number, message)
             except ScanError:
                 continue  # named when its turn comes
             if has_finite_point(cloud.points):
                 yield cloud
+
+    def _cloud(self, number: int, message: Message) -> PointCloud:
+        cloud = read_point_cloud(message, self._place(number), self._kind)
+        if self._frame is None:
+            return cloud
+        matrix = self._transforms.between(cloud.frame_id, self._frame)
+        if matrix is None:
+            where = (
+                f"{self._place(number)}: no static transform leads from {cloud.frame_id[:80] or 'a frame without name'}"
+            )
+            raise ScanError(f"{where} to {self._frame}; there are {', '.join(self._transforms.frames)[:200]}")
+        points = cloud.points._replace(xyz=transform_points(cloud.points.xyz, matrix[:3, :3], matrix[:3, 3]))
+        return PointCloud(points, cloud.time_ns, self._frame)
 
     def _place(self, number: int) -> str:
         return f"{self.recording.path}, {self.topic.name}, message {number}"

@@ -14,14 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.around import ranges_around
 from asca_deploy.detect_scans import DetectedScan, repairs
 from asca_deploy.detector import Detector
-from asca_deploy.manifest import load_bundle
-from asca_deploy.open_model import RuntimeOptions, open_detector
-from asca_deploy.recordings.foxglove_file import FoxgloveFile, is_own_mcap
+from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
-from asca_deploy.recordings.rerun_file import RerunFile, is_own_rrd
 from asca_deploy.recordings.results import (
     Found,
     JsonLines,
@@ -31,16 +27,14 @@ from asca_deploy.recordings.results import (
     said_of_stamps,
     tracked,
 )
-from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz
-from asca_deploy.result_files import ABOUT_FILE, COMMAND, KITTI_FILE, RUN_FILE, claim, remove_companions
-from asca_deploy.shipped import find_bundle
-from asca_deploy.tracker import WEAK_SHARE, Tracker
+from asca_deploy.recordings.sequence_files import SequenceFiles
+from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, claim, remove_companions
+from asca_deploy.tracker import Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.base.schema import to_dict
-from asca_pillars.base.writable_file import require_suffix, require_writable
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.detection.spec import ScoreThresholds
@@ -86,13 +80,11 @@ class _Task:
     score: ScoreThresholds | None
     around: bool
     topic: str | None
+    frame: str | None
     track: bool
     odometry: str | None
     calib: Path | None
-    foxglove: Path | None
-    rerun: Path | None
-    video: Path | None = None
-    video_view: VideoView = "above"
+    files: SequenceFiles
 
 
 def detect_recording(
@@ -100,6 +92,7 @@ def detect_recording(
     out: str | Path,
     *,
     topic: str | None = None,
+    frame: str | None = None,
     track: bool = False,
     odometry: str | None = None,
     calib: str | Path | None = None,
@@ -120,6 +113,8 @@ def detect_recording(
         path: of the recording: .mcap, .db3, .bag or the folder of a rosbag2.
         out: folder for detections.jsonl and recording.json.
         topic: of the scans; None: the only one of the recording.
+        frame: of the vehicle, x forward, y left, z up, such as base_link: the points are taken into it, by the
+            recording's /tf_static, and so are the boxes; None: they stay in the frame of the scans.
         track: give boxes identities and velocities over time.
         odometry: with `track`, the topic of the car's poses; None: velocities are as the car sees them.
         calib: KITTI calibration, for KITTI's tracking text in `out`.
@@ -144,41 +139,39 @@ def detect_recording(
         score=score,
         around=around,
         topic=topic,
+        frame=frame,
         track=track,
         odometry=odometry,
         calib=None if calib is None else Path(calib),
-        foxglove=None if foxglove is None else Path(foxglove),
-        rerun=None if rerun is None else Path(rerun),
-        video=None if video is None else Path(video),
-        video_view=video_view,
+        files=SequenceFiles(
+            foxglove=None if foxglove is None else Path(foxglove),
+            rerun=None if rerun is None else Path(rerun),
+            video=None if video is None else Path(video),
+            video_view=video_view,
+        ),
     )
     return _detect(task, reading, options, Reporter(progress, remark))
 
 
 def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporter: Reporter) -> RecordingResult:
     require("recordings")
-    if task.rerun is not None:
-        require("view")
-        require_suffix("--rerun", task.rerun, ".rrd")
-    if task.foxglove is not None:
-        require_suffix("--foxglove", task.foxglove, ".mcap")
-    inputs = (task.path, task.calib)
-    require_writable(task.foxglove, COMMAND, is_own_mcap, inputs)
-    require_writable(task.rerun, COMMAND, is_own_rrd, inputs)
+    task.files.check((task.path, task.calib))
     calibration = None if task.calib is None else read_calibration(task.calib)
     claim(task.out, {JOURNAL_FILE: is_journal})
     recording = open_recording(task.path)
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:
         raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
+    if task.frame is not None and (reading.pose is not None or reading.axes != "x-forward"):
+        raise ConfigError(f"--frame {task.frame}: says how the scans lie already; leave --axes and --pose out")
     poses = None if task.odometry is None else read_poses(recording, task.odometry)
     damages = set() if poses is None else {recording.damage}
-    scans = RecordedScans(recording, topic, reading.reflectance_scale)
+    scans = RecordedScans(recording, topic, reading.reflectance_scale, task.frame)
     mounting, said = scans.mounting(reading)
     for line in said:
         reporter.remark(line)
-    births = _thresholds(options.bundle, task.score)
-    least = WEAK_SHARE * min(births.values()) if task.track else task.score
+    births, weak = track_thresholds(options.bundle, task.score)
+    least = weak if task.track else task.score
     detector = open_detector(options, least, mounting, around=task.around)
     about = _about(task, reading, mounting, detector, topic.name, least)
     with Journal(task.out, about, detector.spec.class_names) as journal:
@@ -199,18 +192,19 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{why}")
         if task.track:
             _check_times(times_ns, task, topic.name, poses, reporter)
-        results = tracked(journal, tracker, None if poses is None else partial(_pose_of_scan, poses, mounting))
+        pose_at = None if poses is None else partial(_pose_of_scan, poses, mounting)
+        results = _with_points(tracked(journal, tracker, pose_at), scans if task.files.show_points else None)
+        opened = partial(task.files.open, detector=detector, times_ns=times_ns, pose_at=pose_at)
         scope = detector_scope(detector.spec, around=task.around)
-        video = _video(task, detector, scans, times_ns, poses)
-        written, classes = _write(task, results, scans, calibration, scope, about, video)
+        written, classes = _write(task, results, calibration, scope, about, opened)
         journal.remove()
     for line in repairs(run.kept):
         reporter.remark(line)
-    others = (None if task.calib is None else task.out / KITTI_FILE, task.foxglove, task.rerun, task.video)
+    kitti = [] if task.calib is None else [task.out / KITTI_FILE]
     return RecordingResult(
         written,
         {name: classes[name] for name in detector.spec.class_names},
-        (task.out / RUN_FILE, *(path for path in others if path is not None)),
+        (task.out / RUN_FILE, *kitti, *task.files.paths),
         1e3 * seconds / len(run.kept) if run.kept else None,
         (*sorted(filter(None, damages)), *run.skipped()),
         tuple(reporter.remarks),
@@ -272,13 +266,6 @@ class _Run:
             yield
 
 
-def _thresholds(bundle: str | Path | None, score: ScoreThresholds | None) -> dict[str, float]:
-    """The score of each class from which on a detection begins a track; ConfigError if it is none."""
-    spec = load_bundle(find_bundle(bundle)).spec
-    spec = spec if score is None else spec.with_score_threshold(score)
-    return {one.name: one.score_threshold for one in spec.classes}
-
-
 def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
     """Say that stamps are out of order or the odometry is too short; ScanError if it is of another time."""
     if stamps := said_of_stamps(times):
@@ -310,6 +297,7 @@ def _about(
         "recording": str(task.path),
         "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files],
         "topic": topic,
+        "frame": task.frame,
         "made_by": detector.made_by,
         "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         "runs_on": detector.runs_on,
@@ -328,32 +316,23 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
     return np.asarray(poses.at(time_ns) @ level)
 
 
-def _video(
-    task: _Task, detector: Detector, scans: RecordedScans, times_ns: Sequence[int], poses: Poses | None
-) -> Callable[[Path], RecordingVideo] | None:
-    """A function that opens the video, or None where there is none."""
-    if task.video is None:
-        return None
-    mounting = detector.mounting
-    return partial(
-        RecordingVideo,
-        rate_hz=recording_rate_hz(times_ns),
-        view=task.video_view,
-        ranges=ranges_around(detector.spec.ranges, detector.passes),
-        level=None if mounting.level.is_identity else mounting.level,
-        scans=scans.read(),
-        pose_at=None if poses is None else partial(_pose_of_scan, poses, mounting),
-    )
+def _with_points(
+    results: Iterator[Found], scans: RecordedScans | None
+) -> Iterator[tuple[Found, NDArray[np.float32] | None]]:
+    """Each result with the points of its scan, which is read once more; None without `scans`."""
+    again = iter(()) if scans is None else scans.read()
+    for found in results:
+        points = (one.scan.points for one in again if one.number == found.number and one.scan is not None)
+        yield found, None if scans is None else next(points)
 
 
 def _write(
     task: _Task,
-    results: Iterator[Found],
-    scans: RecordedScans,
+    results: Iterator[tuple[Found, NDArray[np.float32] | None]],
     calibration: Any,
     scope: DetectorScope,
     about: dict[str, Any],
-    video: Callable[[Path], RecordingVideo] | None,
+    opened: Callable[[ExitStack, ExitStack], list[ResultFile]],
 ) -> tuple[int, Counter[str]]:
     """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
     with ExitStack() as places, ExitStack() as handles:
@@ -364,27 +343,14 @@ def _write(
         if calibration is not None:
             kitti = places.enter_context(atomic_path(task.out / KITTI_FILE))
             files.append(KittiTracks(open_text(handles, kitti), calibration))
-        if task.foxglove is not None:
-            place = places.enter_context(atomic_path(task.foxglove))
-            foxglove = FoxgloveFile(handles.enter_context(place.open("wb")))
-            handles.callback(foxglove.finish)
-            files.append(foxglove)
-        if task.rerun is not None:
-            rerun = RerunFile(places.enter_context(atomic_path(task.rerun)), scans.read())
-            handles.callback(rerun.finish)
-            files.append(rerun)
-        if task.video is not None and video is not None:
-            place = places.enter_context(atomic_path(task.video))
-            drawn = video(place)
-            handles.callback(drawn.finish)
-            files.append(drawn)
+        files += opened(places, handles)
         scans_written = 0
         classes: Counter[str] = Counter()
-        for found in results:
+        for found, points in results:
             scans_written += 1
             classes.update(found.detections.names)
             for file in files:
-                file.write(found)
+                file.write(found, points)
         handles.close()  # before the names are changed
     remove_companions(task.out, [ABOUT_FILE, *([] if calibration is None else [KITTI_FILE])])
     return scans_written, classes

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from asca_deploy.recordings.results import Found
 from asca_pillars.pictures.colors import class_shares
@@ -88,7 +89,7 @@ class FoxgloveFile:
         schema = self._writer.register_schema("foxglove.SceneUpdate", "jsonschema", json.dumps(SCHEMA).encode())
         self._channel = self._writer.register_channel(TOPIC, "json", schema)
 
-    def write(self, found: Found) -> None:
+    def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
         """One message."""
         data = json.dumps(scene_update(found)).encode()
         self._writer.add_message(self._channel, found.time_ns, data, found.time_ns, found.number)

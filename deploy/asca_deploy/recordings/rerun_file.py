@@ -1,7 +1,6 @@
 """Scans and boxes as a file that the rerun viewer opens: `rerun out.rrd`."""
 
 import errno
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 
 from asca_deploy.recordings.results import Found
 from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
-from asca_pillars.scans.recordings.recorded_scans import RecordedScan
 
 MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
 TIMELINE = "time"
@@ -36,24 +34,23 @@ class RerunFile:
 
     Args:
         path: to write to.
-        scans: those of the results, in the same order; others are passed over.
     """
 
-    def __init__(self, path: Path, scans: Iterator[RecordedScan]) -> None:
+    def __init__(self, path: Path) -> None:
         import rerun as rr
 
-        self._rr, self._scans = rr, scans
+        self._rr = rr
         self._stream = rr.RecordingStream(APPLICATION)
         self._stream.save(path)
         self._stream.send_blueprint(self._blueprint())
         self._failed = False
         self._ground_m: float | None = None
 
-    def write(self, found: Found) -> None:
+    def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
         """One scan with its boxes."""
+        assert points is not None, "it shows points"
         rr, stream = self._rr, self._stream
         stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
-        points = next(one.scan.points for one in self._scans if one.number == found.number and one.scan is not None)
         shown = points[:: -(-len(points) // MAX_POINTS) or 1]
         if self._ground_m is None and len(points):
             self._ground_m = ground_height(points[:, 2])  # once: colors do not flicker

@@ -35,8 +35,8 @@ class Found(NamedTuple):
 class ResultFile(Protocol):
     """Something that results are written to, one scan after the other."""
 
-    def write(self, found: Found) -> None:
-        """The next scan."""
+    def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
+        """The next scan, and its points (N, 4) where some file of the run draws them."""
 
 
 def tracked(
@@ -110,7 +110,7 @@ class JsonLines:
     def __init__(self, file: IO[str], recording: str, scope: DetectorScope) -> None:
         self._file, self._recording, self._detector = file, recording, scope.to_json()
 
-    def write(self, found: Found) -> None:
+    def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
         """One line."""
         boxes = found.detections.to_dicts() if found.tracks is None else found.tracks.to_dicts()
         line = {
@@ -131,7 +131,7 @@ class KittiTracks:
     def __init__(self, file: IO[str], calibration: Calibration) -> None:
         self._file, self._calibration = file, calibration
 
-    def write(self, found: Found) -> None:
+    def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
         """The lines of one scan."""
         boxes = found.detections
         objects = objects_from_boxes(boxes.boxes, boxes.names, self._calibration, DEFAULT_IMAGE_SIZE_WH, boxes.scores)

@@ -1,6 +1,6 @@
 """Videos of detections: a check before the work that one can be written, and that of a recording."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -14,7 +14,6 @@ from asca_pillars.base.writable_file import require_suffix, require_writable
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.video import SUFFIX, BoxVideo, VideoFile, VideoView, find_encoder, is_own_video
-from asca_pillars.scans.recordings.recorded_scans import RecordedScan
 
 _RATES_HZ = (1.0, 60.0)
 _USUAL_RATE_HZ = 10.0
@@ -40,14 +39,14 @@ def require_video(video: Path | None, view: str, inputs: Sequence[Path]) -> Vide
 
 
 def recording_rate_hz(times_ns: Sequence[int]) -> float:
-    """Scans per second of a recording, by the usual pause between two of them; 10 where that says nothing."""
+    """Scans per second of a recording or folder, by the usual pause between two of them; 10 where that says nothing."""
     steps = np.diff(np.sort(np.array(times_ns, np.int64)))
     steps = steps[steps > 0]
     return float(np.clip(1e9 / float(np.median(steps)), *_RATES_HZ)) if len(steps) else _USUAL_RATE_HZ
 
 
 class RecordingVideo:
-    """Draws each scan of a recording with its boxes and tracks; OSError if it cannot be written.
+    """Draws each scan of a sequence with its boxes and tracks; OSError if it cannot be written.
 
     Args:
         path: to write to.
@@ -55,7 +54,6 @@ class RecordingVideo:
         view: "above" or "chase".
         ranges: where the detector looked, level frame.
         level: from the scans to a level frame; None: they are level.
-        scans: those of the results, in the same order; others are passed over.
         pose_at: the pose of a scan at a time in nanoseconds, 4x4; None: it is not known.
     """
 
@@ -67,15 +65,14 @@ class RecordingVideo:
         view: VideoView,
         ranges: Ranges,
         level: FrameChange | None,
-        scans: Iterator[RecordedScan],
         pose_at: Callable[[int], NDArray[np.float64]] | None,
     ) -> None:
-        self._file, self._scans, self._pose_at = VideoFile(path, rate_hz), scans, pose_at
+        self._file, self._pose_at = VideoFile(path, rate_hz), pose_at
         self._video = BoxVideo(self._file, view, ranges, level)
 
-    def write(self, found: Found) -> None:
+    def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
         """One picture."""
-        points = next(one.scan.points for one in self._scans if one.number == found.number and one.scan is not None)
+        assert points is not None, "it shows points"
         ids = None if found.tracks is None else found.tracks.track_ids
         pose = None if self._pose_at is None else self._pose_at(found.time_ns)
         self._video.add(points, found.detections, found.time_ns / 1e9, ids, pose)

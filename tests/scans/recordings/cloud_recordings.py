@@ -7,10 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from asca_pillars.scans.recordings.messages import typestore
 from benchmarks.made_recordings import point_cloud2
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 START_NS = 1_700_000_000_000_000_000
 
 
@@ -74,6 +76,7 @@ def write_mcap(
     *,
     others: dict[str, str] | None = None,
     odometry: list[tuple[int, Any]] | None = None,
+    transforms: list[Any] | None = None,
     chunk_size: int = 2000,
     has_schema: bool = True,
     **options: Any,
@@ -106,8 +109,31 @@ def write_mcap(
             )
             for time_ns, message in odometry:
                 writer.add_message(channel, time_ns, bytes(one.serialize_cdr(message, ODOMETRY)), time_ns)
+        if transforms:
+            data, _ = one.generate_msgdef(TRANSFORMS, ros_version=2)
+            channel = writer.register_channel(
+                "/tf_static", "cdr", writer.register_schema(TRANSFORMS, "ros2msg", data.encode())
+            )
+            for message in transforms:
+                writer.add_message(channel, START_NS, bytes(one.serialize_cdr(message, TRANSFORMS)), START_NS)
         writer.finish()
     return path
+
+
+def transform_message(parent: str, child: str, matrix: NDArray[np.float64], *, ros1: bool = False) -> Any:
+    """A TFMessage with the pose (4, 4), metres, of the child in its parent."""
+    types = typestore("ros1" if ros1 else "cdr").types
+    x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
+    shift = types["geometry_msgs/msg/Vector3"](*matrix[:3, 3].tolist())
+    turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    head = {"seq": 0} if ros1 else {}
+    stamped = types["geometry_msgs/msg/TransformStamped"](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=parent, **head),
+        child_frame_id=child,
+        transform=types["geometry_msgs/msg/Transform"](translation=shift, rotation=turn),
+    )
+    return types[TRANSFORMS](transforms=[stamped])
 
 
 def odometry_message(

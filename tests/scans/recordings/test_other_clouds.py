@@ -146,4 +146,4 @@ def test_types_that_are_read() -> None:
     assert kind_of_scans("livox_ros_driver/CustomMsg") == kind_of_scans(LIVOX) == "Livox"
     assert kind_of_scans("foxglove.PointCloud") == "Foxglove"
     assert kind_of_scans("sensor_msgs/PointCloud") == "PointCloud"
-    assert kind_of_scans("sensor_msgs/msg/LaserScan") is None and kind_of_scans("velodyne_msgs/VelodyneScan") is None
+    assert kind_of_scans("sensor_msgs/msg/LaserScan") is None

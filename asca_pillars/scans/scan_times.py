@@ -1,0 +1,71 @@
+"""When the scans of a folder were taken: at a constant rate, or at the times that a file lists."""
+
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+from asca_pillars.base.errors import ConfigError, ScanError
+from asca_pillars.base.input_files import read_text
+
+RATE_HZ = 10.0
+"""Of scans whose rate nobody states."""
+_MAX_RATE_HZ = 1000.0
+_MAX_TIME_S = 9_000_000_000  # in 2255; more would be no seconds
+
+
+def require_one_folder(paths: Sequence[Path]) -> None:
+    """Refuse scans of several folders, whose order in time nobody knows, with a ConfigError."""
+    if len(folders := sorted({path.parent for path in paths})) > 1:
+        raise ConfigError(
+            f"{folders[0]} and {folders[1]}: with --track, --rate, --times, --foxglove or --rerun scans lie in one "
+            "folder, in the order of their times; give one of these"
+        )
+
+
+def scan_times_ns(count: int, rate_hz: float | None = None, times: Path | None = None) -> list[int]:
+    """The time of each of `count` scans, nanoseconds, ascending; with a rate, they begin at 0.
+
+    Args:
+        count: of the scans.
+        rate_hz: scans per second; None: RATE_HZ.
+        times: a text file with the seconds of each scan, one in a line.
+
+    Raises:
+        ConfigError: there is no such rate, or both are given.
+        ScanError: the file cannot be read, lists another number of times, or one that does not ascend.
+    """
+    if times is None:
+        rate = RATE_HZ if rate_hz is None else rate_hz
+        if not 0 < rate <= _MAX_RATE_HZ:
+            raise ConfigError(f"--rate {rate:g}: give scans per second, above 0 and at most {_MAX_RATE_HZ:g}")
+        return [round(number * 1e9 / rate) for number in range(count)]
+    if rate_hz is not None:
+        raise ConfigError(f"--rate {rate_hz:g} and --times {times}: give one of them")
+    stamps = _read_times(times)
+    if len(stamps) != count:
+        raise ScanError(f"{times}: {len(stamps)} times for {count} scans; list one for each, in their order")
+    return stamps
+
+
+def _read_times(path: Path) -> list[int]:
+    try:
+        lines = read_text(path, ScanError).split("\n")
+    except OSError as error:
+        raise ScanError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
+    except UnicodeDecodeError:
+        raise ScanError(f"{path}: is no text; list the seconds of each scan, one in a line") from None
+    stamps: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        if not (text := line.strip()):
+            continue
+        try:
+            seconds = Decimal(text)  # a float has too few digits for the nanoseconds of a clock
+        except InvalidOperation:
+            seconds = Decimal("NaN")
+        if seconds.is_nan() or not 0 <= seconds <= _MAX_TIME_S:
+            raise ScanError(f"{path}:{number}: {text[:40]!r} is no time; give seconds, 0 or more")
+        time_ns = round(seconds * 1_000_000_000)
+        if stamps and time_ns <= stamps[-1]:
+            raise ScanError(f"{path}:{number}: {text[:40]} is not after the time before it; list times that ascend")
+        stamps.append(time_ns)
+    return stamps

@@ -1,0 +1,136 @@
+"""`asca detect` of a folder of scans over time: the tracks and files are those of a recording of the same scans."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from asca_deploy.detect_scans import detect_scans
+from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
+from asca_pillars.cli.detect import detect
+from asca_pillars.pictures.video import BoxVideo
+from asca_pillars.scans.scan_reader import write_scan
+from tests.cli.short_drive import POINTS, SCANS
+from tests.scans.recordings.cloud_recordings import stamps
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The scans of the recording `drive`."""
+    for number in range(SCANS):
+        write_scan(tmp_path / "scans" / f"{number}.bin", POINTS - np.array([0.5 * number, 0, 0, 0], np.float32))
+    return tmp_path / "scans"
+
+
+def lines(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "detections.jsonl").read_text().splitlines()]
+
+
+def write_times(path: Path) -> Path:
+    path.write_text("".join(f"{time_ns / 1e9:.9f}\n" for time_ns in stamps(SCANS)))
+    return path
+
+
+def test_tracks_and_files_are_those_of_a_recording(folder: Path, drive: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
+    from mcap.reader import make_reader
+
+    messages: dict[Path, list[tuple[int, bytes]]] = {}
+    for path, times in ((folder, write_times(tmp_path / "times.txt")), (drive, None)):
+        foxglove = tmp_path / f"{path.stem}_boxes.mcap"
+        detect(
+            [path],
+            out=tmp_path / f"of_{path.stem}",
+            threads=1,
+            track=True,
+            times=times,
+            foxglove=foxglove,
+            pictures=False,
+        )
+        with foxglove.open("rb") as file:
+            messages[path] = [(one.log_time, one.data) for *_, one in make_reader(file).iter_messages()]
+    of_folder, of_drive = lines(tmp_path / "of_scans"), lines(tmp_path / "of_drive")
+    assert len(of_folder) == SCANS and of_folder[0]["boxes"]
+    for one, other in zip(of_folder, of_drive, strict=True):
+        assert one["time_s"] == pytest.approx(other["time_s"], abs=1e-6)
+        for box, same in zip(one["boxes"], other["boxes"], strict=True):
+            assert box == pytest.approx(same, abs=1e-3)
+    assert json.loads((tmp_path / "of_scans" / "4.json").read_text())["boxes"] == of_folder[4]["boxes"]
+    assert [time for time, _ in messages[folder]] == pytest.approx([time for time, _ in messages[drive]], abs=1000)
+    entities = json.loads(messages[folder][0][1])["entities"]
+    assert [one["id"] for one in entities] == [f"track-{box['track_id']}" for box in of_folder[0]["boxes"]]
+
+
+def test_velocities_follow_the_rate(folder: Path) -> None:
+    def speed(rate_hz: float | None) -> float:
+        found = detect_scans(folder, track=True, rate_hz=rate_hz)
+        tracks = found[-1].tracks
+        assert tracks is not None and found[-1].detections is tracks.detections
+        return float(np.median(tracks.velocities_mps[:, 0]))
+
+    assert speed(None) == pytest.approx(-5, abs=1)
+    assert speed(5) == pytest.approx(-2.5, abs=0.7)
+
+
+def test_without_track_nothing_changes_and_a_rate_writes_no_time(folder: Path, tmp_path: Path) -> None:
+    found = detect_scans(folder, tmp_path / "plain", pictures=False)
+    detect_scans(folder, tmp_path / "rated", pictures=False, rate_hz=5)
+    assert found[0].tracks is None
+    assert lines(tmp_path / "plain") == lines(tmp_path / "rated")
+    assert "time_s" not in lines(tmp_path / "rated")[0]
+
+
+def test_a_scan_that_cannot_be_read_keeps_its_time(folder: Path, tmp_path: Path) -> None:
+    (folder / "2.bin").write_bytes(b"torn")
+    found = detect_scans(folder, tmp_path / "out", track=True, times=write_times(tmp_path / "times.txt"))
+    assert found.unreadable == 1 and len(found) == SCANS - 1
+    assert [line["time_ns"] for line in lines(tmp_path / "out")] == pytest.approx(
+        [time_ns for number, time_ns in enumerate(stamps(SCANS)) if number != 2], abs=1000
+    )
+
+
+def test_the_video_shows_identities(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="needs pip install -e '.[video]'")
+    shown = []
+    draw = BoxVideo.draw
+
+    def drawn(self: BoxVideo, points: Any, detections: Any, time_s: float, ids: Any = None, pose: Any = None) -> Any:
+        shown.append((time_s, None if ids is None else ids.tolist()))
+        return draw(self, points, detections, time_s, ids, pose)
+
+    monkeypatch.setattr(BoxVideo, "draw", drawn)
+    found = detect_scans(folder, track=True, rate_hz=20, video=tmp_path / "a.mp4")
+    assert [time_s for time_s, _ in shown] == pytest.approx([0.05 * number for number in range(SCANS)])
+    assert [ids for _, ids in shown] == [one.tracks.track_ids.tolist() for one in found if one.tracks is not None]
+    assert (tmp_path / "a.mp4").stat().st_size
+
+
+def test_the_file_for_rerun_is_one(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="needs pip install -e '.[view]'")
+    from asca_deploy.recordings.rerun_file import is_own_rrd
+
+    detect([folder], out=tmp_path / "out", threads=1, track=True, rerun=tmp_path / "a.rrd", pictures=False)
+    assert is_own_rrd(tmp_path / "a.rrd")
+
+
+def test_what_does_not_fit_is_refused_before_the_work(folder: Path, drive: Path, tmp_path: Path) -> None:
+    write_scan(tmp_path / "more" / "1.bin", POINTS)
+    times = write_times(tmp_path / "times.txt")
+    (tmp_path / "short.txt").write_text("0\n")
+    cases: list[tuple[list[Path], dict[str, Any], type[AscaError], str]] = [
+        ([folder, tmp_path / "more"], {"track": True}, ConfigError, "scans lie in one folder"),
+        ([folder], {"rate": 0.0}, ConfigError, "--rate 0: give scans per second"),
+        ([folder], {"rate": 5.0, "times": times}, ConfigError, "give one of them"),
+        ([folder], {"times": tmp_path / "short.txt"}, ScanError, "1 times for 5 scans"),
+        ([folder], {"track": True, "cluster": "local"}, ConfigError, "do not go with --cluster"),
+        ([folder], {"foxglove": tmp_path / "a.bag"}, ConfigError, "viewers open .mcap files"),
+        ([folder], {"foxglove": drive}, OutputError, "did not write it"),
+        ([drive], {"rate": 5.0}, ConfigError, "--rate 5: is for folders of scans"),
+        ([drive], {"times": times}, ConfigError, "--times .*: is for folders of scans"),
+    ]
+    for paths, options, kind, said in cases:
+        with pytest.raises(kind, match=said):
+            detect(paths, out=tmp_path / "out", threads=1, **options)
+    assert not (tmp_path / "out").exists()
