@@ -135,6 +135,12 @@ class Detector:
             self._turns = turns_around(self.spec.ranges, camera_view=expected.camera_view)
         self._ranges = ranges_around(self.spec.ranges, self.passes)
         self._warned: set[str] = set()
+        self.made_by = {
+            "model": self.bundle.name,
+            "weights_sha256": weights_digest(self.bundle),
+            "version": own_version(),
+        }
+        """What its results name: the model, the SHA-256 of its weights, and the version of this package."""
         self.load_s = perf_counter() - start
         """Seconds that it took to open the bundle."""
 
@@ -142,15 +148,6 @@ class Detector:
     def runs_on(self) -> str:
         """Provider and arithmetic of the slowest network in words, such as "cpu int8"."""
         return f"{self.provider} {providers.arithmetic(self.bundle.precision, self.precision)}"
-
-    @property
-    def made_by(self) -> dict[str, str]:
-        """What its results name: the model, the SHA-256 of its weights, and the version of this package."""
-        return {
-            "model": self.bundle.name,
-            "weights_sha256": weights_digest(self.bundle),
-            "version": own_version(),
-        }
 
     def warm_up(self, points: int = 100_000, scans: int = 2) -> float:
         """Detect in made-up scans, so that the first real one takes no longer than the others.
