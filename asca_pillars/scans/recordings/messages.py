@@ -8,6 +8,7 @@ from asca_pillars.scans.recordings.recording import Encoding, Message
 
 _OTHER_TYPES = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",  # ROS 1's common messages do not have it
+    "ouster_sensor_msgs/msg/PacketMsg": "uint8[] buf",
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data",
     "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets",
 }

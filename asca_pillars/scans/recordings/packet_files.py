@@ -4,6 +4,7 @@ Ouster's by its maker's `ouster-sdk`, with the sensor's metadata in a `.json` be
 capture's or its beginning; Velodyne's by `velodyne-decoder`.
 """
 
+import math
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -20,6 +21,7 @@ from asca_pillars.scans.recordings.recording import Message, Recording, Topic, r
 from asca_pillars.scans.records import StoredPoints
 
 VELODYNE, OUSTER = "velodyne/Packets", "ouster/Packets"
+PACKET_MSG = "ouster_sensor_msgs/msg/PacketMsg"
 _TOPIC = "/packets"
 _VELODYNE_BYTES = 1206  # of a packet of points
 _LOOKED_AT = 1000
@@ -53,7 +55,7 @@ class PacketCapture(Recording):
         revolutions = self._velodyne() if self._type == VELODYNE else self._ouster()
         try:
             for time_ns, points in revolutions:
-                yield Message(time_ns, points.astype("<f4").tobytes(), "points")
+                yield _packed(time_ns, points)
                 count += 1
         except (ScanError, GeneratorExit):
             raise
@@ -108,11 +110,67 @@ class PacketCapture(Recording):
         table = core.XYZLut(source.sensor_info[0], use_extrinsics=False)
         for scans in source:
             for scan in scans:
-                if scan is None:
-                    continue
-                ranges, times = scan.field("RANGE"), scan.packet_timestamp
-                points = np.column_stack([table(ranges).reshape(-1, 3), scan.field("REFLECTIVITY").reshape(-1) / 255.0])
-                yield int(times[times > 0].min()), points[ranges.reshape(-1) > 0].astype(np.float32)
+                if scan is not None:
+                    yield _of_ouster(scan, table)
+
+
+class OusterPackets:
+    """The revolutions in a recording's topic of PacketMsg, by the metadata on the topic beside it.
+
+    Args:
+        recording: to read from.
+        topic: of the packets, such as /ouster/lidar_packets.
+
+    Attributes:
+        revolutions: about how many there are.
+
+    Raises:
+        ScanError: the metadata are not there, or cannot be read.
+    """
+
+    frame_id = "os_sensor"
+    """As the sensor's driver calls the frame of its points, for the packets name none."""
+
+    def __init__(self, recording: Recording, topic: Topic) -> None:
+        require("packets")
+        from ouster.sdk import core
+
+        self._recording, self._topic = recording, topic.name
+        name = f"{topic.name.rpartition('/')[0]}/metadata"
+        place = f"{recording.path}, {name}"
+        message = next(iter(recording.messages(name)), None) if name in {one.name for one in recording.topics} else None
+        if message is None:
+            raise ScanError(f"{place}: no metadata of the Ouster, which {topic.name} needs; record that topic, too")
+        try:
+            self._info: Any = core.SensorInfo(decoded(message, "std_msgs/msg/String").data)
+            self._format: Any = core.PacketFormat(self._info)
+        except Exception as error:  # the libraries have errors of their own
+            raise ScanError(f"{place}: no readable metadata of an Ouster ({reason(error)}); record it again") from None
+        packets = self._info.format.columns_per_frame / self._info.format.columns_per_packet
+        self.revolutions = math.ceil(topic.messages / packets)
+
+    def messages(self) -> Iterator[Message]:
+        """Revolutions as of `PacketCapture.messages`; packets that cannot be read are left out, like lost ones."""
+        from ouster.sdk import core
+
+        table = core.XYZLut(self._info, use_extrinsics=False)
+        batcher, frame, packets = core.FrameBatcher(self._info), core.LidarFrame(self._info), 0
+        for message in self._recording.messages(self._topic):
+            try:
+                payload = np.asarray(decoded(message, PACKET_MSG).buf, np.uint8)
+            except Exception:  # the library lets struct's and NumPy's errors pass
+                continue
+            if len(payload) < self._format.lidar_packet_size:
+                continue
+            packet = core.LidarPacket(self._format)
+            packet.buf[:] = payload[: len(packet.buf)]  # drivers append a byte
+            packet.host_timestamp = message.recorded_ns or 0
+            is_whole, packets = batcher.batch(packet, frame), packets + 1
+            if is_whole:
+                yield _packed(*_of_ouster(frame, table))
+                frame, packets = core.LidarFrame(self._info), 0
+        if packets:
+            yield _packed(*_of_ouster(frame, table))
 
 
 def velodyne_scan(message: Message) -> tuple[Any, StoredPoints]:
@@ -144,6 +202,17 @@ def _metadata_beside(path: Path) -> Path:
             f"beside it as {name}.json"
         )
     return max(beside, key=lambda one: len(one.stem))
+
+
+def _packed(time_ns: int, points: NDArray[np.float32]) -> Message:
+    return Message(time_ns or None, points.astype("<f4").tobytes(), "points")
+
+
+def _of_ouster(frame: Any, table: Any) -> tuple[int, NDArray[np.float32]]:
+    ranges, times = frame.field("RANGE"), frame.packet_timestamp
+    points = np.column_stack([table(ranges).reshape(-1, 3), frame.field("REFLECTIVITY").reshape(-1) / 255.0])
+    known = times[times > 0]
+    return int(known.min()) if len(known) else 0, points[ranges.reshape(-1) > 0].astype(np.float32)
 
 
 def _of_velodyne(scan: Any) -> tuple[int, NDArray[np.float32]]:

@@ -9,6 +9,7 @@ from asca_pillars.base.extras import require
 from asca_pillars.geometry.rotations import transform_points
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.recordings.packet_files import OusterPackets
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic
 from asca_pillars.scans.recordings.scan_types import kind_of_scans
@@ -39,7 +40,7 @@ class RecordedScans:
 
     Args:
         recording: to read from.
-        topic: of point clouds.
+        topic: of point clouds, or of an Ouster's packets.
         reflectance_scale: the stored value that is a reflectance of 1; auto: by the first scans with points, once.
         frame: that the points are taken into, by the recording's static transforms; None: they stay in their own.
 
@@ -57,8 +58,12 @@ class RecordedScans:
         self._frame = frame
         self._transforms = Transforms() if frame is None else read_static_transforms(recording, frame)
         self._kind = kind_of_scans(topic.type) or "PointCloud2"  # of an unknown type
+        self._packets: OusterPackets | None = None
         if self._kind == "Velodyne":
             require("packets")
+        if self._kind == "Ouster":
+            self._packets, self._kind = OusterPackets(recording, topic), "Packets"
+            self.topic = topic._replace(messages=self._packets.revolutions)
         if reflectance_scale == "auto":
             self.scale = common_reflectance_scale([cloud.points for cloud in self._first(16)])
         else:
@@ -87,7 +92,7 @@ class RecordedScans:
     def read(self, start: int = 0) -> Iterator[RecordedScan]:
         """All scans from message `start` on; what damage ends the recording early, `recording.damage` tells."""
         unreadable = 0
-        for number, message in enumerate(self.recording.messages(self.topic.name)):
+        for number, message in enumerate(self._messages()):
             if number < start:
                 continue
             if unreadable == MAX_UNREADABLE:
@@ -108,7 +113,7 @@ class RecordedScans:
         return islice(self._clouds_with_points(), count)
 
     def _clouds_with_points(self) -> Iterator[PointCloud]:
-        for number, message in enumerate(islice(self.recording.messages(self.topic.name), SEARCHED_MESSAGES)):
+        for number, message in enumerate(islice(self._messages(), SEARCHED_MESSAGES)):
             try:
                 cloud = self._cloud(number, message)
             except ScanError:
@@ -116,8 +121,13 @@ class RecordedScans:
             if has_finite_point(cloud.points):
                 yield cloud
 
+    def _messages(self) -> Iterator[Message]:
+        return self.recording.messages(self.topic.name) if self._packets is None else self._packets.messages()
+
     def _cloud(self, number: int, message: Message) -> PointCloud:
         cloud = read_point_cloud(message, self._place(number), self._kind)
+        if self._packets is not None:
+            cloud = cloud._replace(frame_id=self._packets.frame_id)
         if self._frame is None:
             return cloud
         matrix = self._transforms.between(cloud.frame_id, self._frame)

@@ -7,12 +7,11 @@ _REPLAY = "play the recording through the sensor's driver and record the PointCl
 _CONVERSIONS = (
     # None: no scans of a lidar in 3D.
     (r"sensor_msgs/(msg/)?(Multi\w*)?LaserScan|radar_\w*/.*", None),
-    (r"ouster_\w+/(msg/)?PacketMsg", f"{_REPLAY} (replay.launch of ouster_ros, topic /ouster/points)"),
     (r"foxglove_msgs/(msg/)?PointCloud", "record the PointCloud2 that it was made of"),
     (r".*(Scans?|Packets?|PacketMsg|UdpFrame|PointCloud\d?|CustomMsg)", _REPLAY),
 )
 
-ScanKind = Literal["PointCloud2", "PointCloud", "Livox", "Foxglove", "Packets", "Velodyne"]
+ScanKind = Literal["PointCloud2", "PointCloud", "Livox", "Foxglove", "Packets", "Velodyne", "Ouster"]
 _READ: tuple[tuple[str, ScanKind], ...] = (
     (r"sensor_msgs/(msg/)?PointCloud2", "PointCloud2"),
     (r"sensor_msgs/(msg/)?PointCloud", "PointCloud"),
@@ -20,6 +19,7 @@ _READ: tuple[tuple[str, ScanKind], ...] = (
     (r"foxglove\.PointCloud", "Foxglove"),
     (r"(velodyne|ouster)/Packets", "Packets"),
     (r"velodyne_msgs/(msg/)?VelodyneScan", "Velodyne"),
+    (r"ouster_\w+/(msg/)?PacketMsg", "Ouster"),
 )
 
 

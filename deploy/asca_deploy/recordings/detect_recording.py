@@ -167,6 +167,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     poses = None if task.odometry is None else read_poses(recording, task.odometry)
     damages = set() if poses is None else {recording.damage}
     scans = RecordedScans(recording, topic, reading.reflectance_scale, task.frame)
+    topic = scans.topic
     mounting, said = scans.mounting(reading)
     for line in said:
         reporter.remark(line)

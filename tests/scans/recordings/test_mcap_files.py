@@ -82,8 +82,6 @@ def test_a_topic_without_a_schema_that_holds_something_else(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("kind", "remedy"),
     [
-        ("ouster_ros/msg/PacketMsg", "ouster_ros"),
-        ("ouster_sensor_msgs/msg/PacketMsg", "ouster_ros"),
         ("foxglove_msgs/msg/PointCloud", "record the PointCloud2"),
         ("pandar_msgs/PandarScan", "driver"),
         ("rslidar_msg/msg/RslidarPacket", "driver"),

@@ -5,6 +5,7 @@
 
 import os
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,10 @@ pytest.importorskip("ouster.sdk", reason="needs pip install -e '.[packets]'")
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.messages import typestore
 from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
+from asca_pillars.scans.recordings.packet_files import PacketCapture
 from asca_pillars.scans.recordings.point_cloud2 import read_point_cloud
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.scans.recordings.recording import Encoding, Message
+from asca_pillars.scans.recordings.recording import Encoding, Message, Recording, Topic
 from asca_pillars.scans.recordings.scan_types import kind_of_scans
 
 START_S = 1_700_000_000
@@ -146,3 +148,49 @@ def test_real_captures_of_an_ouster_are_what_its_library_says(path: Path) -> Non
         assert one.scan is not None and np.array_equal(one.scan.points[:, :3], xyz)
         assert one.scan.points[:, 3].min() >= 0 and one.scan.points[:, 3].max() == 1.0
         assert one.time_ns > 1_600_000_000 * 10**9
+
+
+class PacketRecording(Recording):
+    """A recording of an Ouster's packets, as its driver publishes them."""
+
+    def __init__(self, metadata: str | None, packets: list[tuple[int, bytes]]) -> None:
+        self.path = Path("drive.mcap")
+        self.topics = [Topic("/ouster/lidar_packets", "ouster_sensor_msgs/msg/PacketMsg", len(packets))]
+        self._types, self._metadata, self._packets = typestore("cdr"), metadata, packets
+        if metadata is not None:
+            self.topics.append(Topic("/ouster/metadata", "std_msgs/msg/String", 1))
+
+    def messages(self, topic: str) -> Iterator[Message]:
+        if topic == "/ouster/metadata":
+            yield self._message(1, "std_msgs/msg/String", data=self._metadata)
+            return
+        for time_ns, payload in self._packets:
+            buf = np.frombuffer(payload + b"\0", np.uint8)
+            yield self._message(time_ns, "ouster_sensor_msgs/msg/PacketMsg", buf=buf)
+
+    def _message(self, time_ns: int, kind: str, **values: object) -> Message:
+        return Message(time_ns, bytes(self._types.serialize_cdr(self._types.types[kind](**values), kind)), "cdr")
+
+
+@pytest.mark.parametrize(("metadata", "said"), [(None, "no metadata of the Ouster"), ("{}", "no readable metadata")])
+def test_packets_of_an_ouster_in_a_recording_need_its_metadata(metadata: str | None, said: str) -> None:
+    recording = PacketRecording(metadata, [])
+    with pytest.raises(ScanError, match=f"/ouster/metadata: {said}"):
+        RecordedScans(recording, recording.point_cloud_topic(), "auto")
+
+
+@pytest.mark.skipif(not CAPTURES_THERE, reason="needs real captures: ASCA_OUSTER_CAPTURES")
+@pytest.mark.parametrize("path", CAPTURES_THERE, ids=lambda path: path.stem)
+def test_packets_of_an_ouster_in_a_recording_are_those_of_the_capture(path: Path) -> None:
+    beside = [one for one in path.parent.glob("*.json") if path.stem.startswith(one.stem)]
+    payloads = list(PacketCapture(path)._payloads())
+    longest = max(len(payload) for _, payload in payloads)  # the others are of its IMU, on another topic
+    packets = [(round(time_s * 1e9), payload) for time_s, payload in payloads if len(payload) == longest]
+    recording = PacketRecording(beside[0].read_text(), packets)
+    scans = RecordedScans(recording, recording.point_cloud_topic(), "auto")
+    found, expected = list(scans.read()), scans_of(path)
+    assert len(found) == len(expected) == scans.topic.messages
+    for one, same in zip(found, expected, strict=True):
+        assert one.scan is not None and same.scan is not None and one.frame_id == "os_sensor"
+        assert np.array_equal(one.scan.points, same.scan.points)
+        assert one.time_ns == pytest.approx(same.time_ns, abs=1000)
