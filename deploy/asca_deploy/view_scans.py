@@ -14,7 +14,7 @@ from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -207,7 +207,7 @@ def _handler(answer: Callable[[str], tuple[str, bytes] | None]) -> type[BaseHTTP
         timeout = 60
 
         def do_GET(self) -> None:
-            port = self.server.server_address[1]
+            _, port = cast(tuple[str, int], self.server.server_address)
             if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
                 self._send(HTTPStatus.FORBIDDEN, ".txt", b"asked for under another name")
                 return

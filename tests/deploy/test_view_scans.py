@@ -92,7 +92,7 @@ def test_the_page_gets_points_and_the_boxes_that_the_detector_finds(server: Scan
     assert len(found["detections"]) > len(fewer) and len(fewer) == len(expected) > 3  # more for the sliders
     expected = Detector(SMALL.bundle, threads=1, score_threshold=0.1)(POINTS)
     assert [one["class"] for one in found["detections"]] == list(expected.names)
-    np.testing.assert_array_equal(np.float32([one["box"] for one in found["detections"]]), expected.boxes)
+    np.testing.assert_array_equal(np.array([one["box"] for one in found["detections"]], np.float32), expected.boxes)
     assert found["save"]["boxes"] == expected.to_dicts()
     assert found["save"]["made_by"] == dict(expected.made_by)
     assert found["counts"]["points"] == len(POINTS) and found["timesMs"].keys() == expected.report.times_ms.keys()

@@ -41,7 +41,7 @@ def test_points_are_taken_into_the_frame(tmp_path: Path) -> None:
     half = np.linalg.inv(np.diag([-1.0, -1.0, 1.0, 1.0]))
     chain = [
         transform_message("base_link", "roof", POSE @ half),
-        transform_message("roof", "lidar", np.linalg.inv(half)),
+        transform_message("roof", "lidar", np.linalg.inv(half).astype(np.float64)),
     ]
     path = write_mcap(tmp_path / "a.mcap", {"/lidar": messages}, transforms=chain)
     for one in scans(path, "base_link").read():
