@@ -75,7 +75,12 @@ def test_scans_with_files_and_settings(bundle: Path, tmp_path: Path) -> None:
     settings = ScanSettings(axes="y-forward", reflectance_scale=1.0)
     options = RuntimeOptions(bundle=bundle, threads=1)
     found = detect_scans(str(tmp_path / "scan.bin"), tmp_path / "out", options=options, reading=settings, score=0.01)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"scan.json", "scan_bev.png", "detections.jsonl"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "scan.json",
+        "scan_bev.png",
+        "detections.jsonl",
+        "index.html",
+    }
     assert found.detector.mounting is not None and found.detector.mounting.axes == "y-forward"
     with pytest.raises(ScanError, match="nowhere"):
         detect_scans(tmp_path / "nowhere")

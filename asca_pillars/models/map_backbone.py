@@ -78,7 +78,7 @@ class MapBackbone(nn.Module):
         self.out_channels = upsample_channels * len(self.blocks)
 
     def forward(self, canvas: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> (B, out_channels, H / head_stride, W / head_stride)."""
+        """Unitless (B, C, H, W) -> (B, out_channels, h, w) with h = H / head_stride and w = W / head_stride."""
         maps, attention = [], self.attention or [nn.Identity()] * len(self.blocks)
         for block, attend, deblock in zip(self.blocks, attention, self.deblocks, strict=True):
             canvas = attend(block(canvas))
