@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
-from asca_deploy.recordings import detect_recording as steps
+from asca_deploy.recordings import sequence_files
 from asca_deploy.recordings.journal import JOURNAL_FILE
 from asca_deploy.recordings.rerun_file import is_own_rrd
 from asca_pillars.base.errors import ConfigError, OutputError
@@ -48,7 +48,7 @@ def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
 def test_an_rrd_of_others_is_not_replaced(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
 ) -> None:
-    monkeypatch.setattr(steps, "require", lambda extra: None)
+    monkeypatch.setattr(sequence_files, "require", lambda extra: None)
     with pytest.raises(ConfigError, match="choose such a name"):
         run(drive, tmp_path / "out", rerun=tmp_path / "boxes.mcap")
     (tmp_path / "mine.rrd").write_bytes(content)
@@ -86,7 +86,7 @@ def test_what_rerun_cannot_write_ends_the_run(
     made.blueprint = SimpleNamespace(Blueprint=nothing, Spatial3DView=nothing)
     monkeypatch.setitem(sys.modules, "rerun", made)
     monkeypatch.setitem(sys.modules, "rerun.blueprint", made.blueprint)
-    monkeypatch.setattr(steps, "require", lambda extra: None)
+    monkeypatch.setattr(sequence_files, "require", lambda extra: None)
     with pytest.raises(OSError, match=r"rerun cannot write \(File-writer .*is the disk full") as failure:
         run(drive, tmp_path / "out", rerun=tmp_path / "out.rrd")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {JOURNAL_FILE}

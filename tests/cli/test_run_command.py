@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from asca_pillars.base.errors import AscaError
+from asca_pillars.base.errors import ENVIRONMENT, INPUT, ScanError
 from asca_pillars.cli.run_command import run_command
 
 
@@ -24,16 +24,20 @@ def _script(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "line"),
+    ("error", "line", "code"),
     [
-        (AscaError("a.pcd: TYPE \x1b[2J\n"), r"asca: a.pcd: TYPE \x1b[2J\n"),
-        (MemoryError("Unable to allocate 46.6 GiB"), "asca: not enough memory (Unable to allocate 46.6 GiB); "),
-        (RecursionError("deep"), "asca: the input is nested too deeply"),
-        (OSError(28, "No space left on device", "runs/last.ckpt"), "asca: runs/last.ckpt: No space left on device"),
+        (ScanError("a.pcd: TYPE \x1b[2J\n"), r"asca: a.pcd: TYPE \x1b[2J\n", INPUT),
+        (
+            MemoryError("Unable to allocate 46.6 GiB"),
+            "asca: not enough memory (Unable to allocate 46.6 GiB); ",
+            ENVIRONMENT,
+        ),
+        (RecursionError("deep"), "asca: the input is nested too deeply", INPUT),
+        (OSError(28, "No space left on device", "a.ckpt"), "asca: a.ckpt: No space left on device", ENVIRONMENT),
     ],
 )
-def test_errors_are_one_line(error: Exception, line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
+def test_errors_are_one_line(error: Exception, line: str, code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match=str(code)):
         run_command(raising(error), "asca")
     printed = capsys.readouterr().err
     assert printed.startswith(line)
@@ -41,8 +45,8 @@ def test_errors_are_one_line(error: Exception, line: str, capsys: pytest.Capture
 
 
 def test_a_script_goes_by_its_own_name(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        run_command(raising(AscaError("no such folder")))
+    with pytest.raises(SystemExit, match=str(INPUT)):
+        run_command(raising(ScanError("no such folder")))
     assert capsys.readouterr().err == "memory: no such folder\n"
 
 
