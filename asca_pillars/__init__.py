@@ -12,7 +12,7 @@ called, or `evaluate` with a checkpoint.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from asca_pillars.base.installation import disable_telemetry
+from asca_pillars.base.telemetry import disable_telemetry
 
 if TYPE_CHECKING:
     from asca_deploy import Bundle, Detector, ScanDetections, ScanQueue, Tracker, Tracks, load_bundle

@@ -7,7 +7,6 @@ from asca_pillars.base.installation import install_command
 
 EXTRAS = {
     "train": ("torch", "lightning", "onnx", "onnxscript", "tensorboard"),
-    "sim": ("numba",),
     "openvino": ("openvino",),
     "eval": ("matplotlib",),
     "import": ("pyarrow",),

@@ -1,7 +1,6 @@
-"""How this package was installed, what came along, the commands that add to it, and what dependencies may report."""
+"""The installation of this package: its source tree, its bundles, and the commands that add extras to it."""
 
 import importlib.util
-import os
 import shlex
 from pathlib import Path
 
@@ -41,18 +40,3 @@ def shipped_bundles() -> dict[str, Path]:
     runtime = importlib.util.find_spec("asca_deploy")
     places = [] if runtime is None else runtime.submodule_search_locations or []
     return {path.parent.name: path.parent for place in places for path in Path(place).glob("bundles/*/bundle.json")}
-
-
-_SWITCHES = {"ORT_DISABLE_TELEMETRY": "1", "RAY_USAGE_STATS_ENABLED": "0"}
-_YES = ("1", "true", "yes", "on")  # in onnxruntime's reading
-
-
-def disable_telemetry() -> None:
-    """Refuse the reports of all dependencies, in the environment; what the user has set there stays."""
-    for name, value in _SWITCHES.items():
-        os.environ[name] = os.environ.get(name) or value
-
-
-def onnxruntime_may_report() -> bool:
-    """Whether the user wants onnxruntime's reports: ORT_DISABLE_TELEMETRY is set to 0."""
-    return os.environ["ORT_DISABLE_TELEMETRY"].lower() not in _YES

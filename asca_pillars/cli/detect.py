@@ -1,8 +1,9 @@
 """`asca detect`: scans or a recording in, tables, pictures, KITTI text and tracks out."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from asca_deploy.detect_archive import ArchiveResult
     from asca_deploy.detect_scans import DetectedScans
     from asca_deploy.recordings.detect_recording import RecordingResult
+    from asca_pillars.pictures.video import VideoView
 
 TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
 
@@ -41,10 +43,10 @@ TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame a
 def detect(
     scans: ScansArgument = None,
     *,
+    bundle: BundleOption = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.", rich_help_panel="Output")
     ] = Path("detections"),
-    bundle: BundleOption = None,
     score: ScoreOption = None,
     pictures: Annotated[
         bool | None,
@@ -160,8 +162,8 @@ def detect(
 
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 3.
 
-    A recording (.mcap, .db3, .bag, a rosbag2 folder) is detected scan by scan; OUT/detections.jsonl has a line for
-    each, with its time. After a kill the same command goes on where it was.
+    A recording (.mcap, .db3, .bag, a rosbag2 folder, a .pcap of Ouster or Velodyne) is detected scan by scan;
+    OUT/detections.jsonl has a line for each, with its time. After a kill the same command goes on where it was.
 
     With --cluster only OUT/detections.jsonl is written, and the same command goes on where a broken run stopped.
 
@@ -187,7 +189,6 @@ def detect(
 
     from asca_deploy import sample_scan_path
     from asca_deploy.open_model import RuntimeOptions
-    from asca_deploy.recordings.video import require_video
     from asca_pillars.cli.progress import Bars
     from asca_pillars.scans.recordings.open_recording import is_recording
 
@@ -198,7 +199,7 @@ def detect(
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     scores = read_scores(score)
-    view = require_video(video, video_view, [*(scans or ()), *(path for path in (calib, times) if path is not None)])
+    view = cast("VideoView", video_view)
     recordings = [path for path in scans or () if is_recording(path)]
     if write is not None:
         from asca_pillars.data.importing.tool_labels import require_unchanged
@@ -244,8 +245,9 @@ def detect(
         from asca_deploy.detect_archive import detect_archive
         from asca_pillars.scans.find_scans import name_scans
 
-        if video is not None:
-            raise ConfigError(f"--video {video}: is not made with --cluster; leave one of them out")
+        if video is not None or video_view != "above":
+            option = f"--video-view {video_view}" if video is None else f"--video {video}"
+            raise ConfigError(f"{option}: is not made with --cluster; leave one of them out")
         if track or rate is not None or times or foxglove or rerun:
             raise ConfigError(
                 "--track, --rate, --times, --foxglove and --rerun do not go with --cluster; leave them out"
@@ -290,7 +292,7 @@ def detect(
             failed=lambda line: print(f"asca: {line}", file=sys.stderr),
         )
     _write_labels(out, write, console)
-    _print_scans(found, out, console)
+    _print_scans(found, [path for path in (foxglove, rerun, video) if path is not None], out, console)
 
 
 def _refuse_times(rate: float | None, times: Path | None) -> None:
@@ -309,7 +311,7 @@ def _write_labels(out: Path, name: str | None, console: "Console") -> None:
         console.print(f"Labels to correct: {write_prelabels(out / RUN_FILE, name, out)}/", soft_wrap=True)
 
 
-def _print_scans(found: "DetectedScans", out: Path, console: "Console") -> None:
+def _print_scans(found: "DetectedScans", files: Sequence[Path], out: Path, console: "Console") -> None:
     """Print boxes or a line per scan, remarks and times; PartialError if some scans failed."""
     from asca_deploy.auto import summary
     from asca_pillars.cli import detect_tables as show
@@ -326,7 +328,7 @@ def _print_scans(found: "DetectedScans", out: Path, console: "Console") -> None:
     while len(reports) < TIMED_FRAMES:
         reports.append(detector(found.last_points).report)
     console.print(show.timing(reports[1:], detector))
-    console.print(f"Results: {out}/")
+    console.print(f"Results: {', '.join([f'{out}/', *map(str, files)])}", soft_wrap=True)
     if unwritten := len(found.failed) - found.unreadable:
         raise PartialError(f"results of {unwritten} of {asked} scans could not be written; they are named above")
     if found.unreadable:

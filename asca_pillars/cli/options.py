@@ -136,7 +136,8 @@ AroundOption = Annotated[
     bool,
     typer.Option(
         "--around",
-        help="Look in every direction: turned passes, merged. Costs a pass for each of them.",
+        help="Look in every direction: in one pass with a model of whole revolutions, else in turned passes that are "
+        "merged, each of which costs what a scan ahead costs.",
         rich_help_panel="Sensor",
     ),
 ]

@@ -104,7 +104,6 @@ def simulate(
 
     asca simulate data/sim --report --like data/kitti --bundle my_bundle
     """
-    require("sim")
     if report or like is not None:
         require("eval")
     from rich.console import Console

@@ -25,16 +25,21 @@ from asca_pillars.cli.options import (
 def view(
     scans: ScansArgument = None,
     *,
+    bundle: BundleOption = None,
     port: Annotated[
         int,
         typer.Option(
-            "--port", min=0, max=65535, help="Of this computer, to serve on. Default: a free one.", show_default=False
+            "--port",
+            min=0,
+            max=65535,
+            help="Port of 127.0.0.1 to serve on. Default: a free one.",
+            show_default=False,
+            rich_help_panel="Output",
         ),
     ] = 0,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Print the address only; open no browser.", rich_help_panel="Output")
     ] = False,
-    bundle: BundleOption = None,
     score: ScoreOption = None,
     provider: ProviderOption = "cpu",
     precision: PrecisionOption = None,
@@ -74,7 +79,8 @@ def view(
     with ScanServer(scans, port, options=options, reading=reading, score=read_scores(score), around=around) as server:
         for line in server.said:
             print(line)
-        print(f"{len(server.names)} scans: {server.address} (Ctrl-C ends)", flush=True)
+        count = len(server.names)
+        print(f"{count} scan{'s' if count != 1 else ''}: {server.address} (Ctrl-C ends)", flush=True)
         if not no_browser:  # in a thread: a browser of the terminal returns when it is left
             threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
         try:

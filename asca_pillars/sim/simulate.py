@@ -58,7 +58,6 @@ def simulate(
     Raises:
         AscaError: an argument cannot be used, or `out` holds something else.
     """
-    require("sim")
     if cluster is not None:
         require("cluster")
     if length is not None and sequences is None:

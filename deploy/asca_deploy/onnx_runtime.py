@@ -1,6 +1,6 @@
 """onnxruntime, which is imported here and nowhere else: its reports to its maker are off by then."""
 
-from asca_pillars.base.installation import disable_telemetry, onnxruntime_may_report
+from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
 
 disable_telemetry()
 

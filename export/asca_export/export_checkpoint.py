@@ -166,7 +166,6 @@ def read_or_simulate(
         paths = find_scans(folder)
         chosen = paths if len(paths) <= most else [paths[i * len(paths) // most] for i in range(most)]
         return [read_scan(path).points for path in chosen]
-    require("sim")
     from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
 
     config = SimulationConfig(field_of_view=view)

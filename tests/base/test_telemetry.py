@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from asca_deploy import sample_scan_path
-from asca_pillars.base.installation import disable_telemetry, onnxruntime_may_report
 from asca_pillars.base.schema import to_dict
+from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
 from tests.socket_filter import NOT_HERE
 from tests.test_layout import PACKAGES, ROOT, imports
 

@@ -5,6 +5,7 @@ one frame, M points, C channels, d attention width, N points of one pillar at mo
 connection of eq. (11), and so does the control without attention.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -54,14 +55,14 @@ class PaperAttention(nn.Module):
         return features + restored.T
 
 
-class _ChannelMixing(nn.Module):
+class _ChannelMixing(nn.Module, ABC):
     """Features mixed by a C x C matrix and added to themselves; `restore` has the bias."""
 
     restore: nn.Linear
 
+    @abstractmethod
     def mixing(self, features: Tensor) -> Tensor:
         """(C, C) of the pillars (P, C) of one frame, unitless."""
-        raise NotImplementedError
 
     def forward(self, features: Tensor) -> Tensor:
         """Unitless features (P, C) -> (P, C) for the pillars of one frame."""

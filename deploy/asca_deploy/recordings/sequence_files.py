@@ -13,7 +13,7 @@ from asca_deploy.detector import Detector
 from asca_deploy.recordings.foxglove_file import FoxgloveFile, is_own_mcap
 from asca_deploy.recordings.rerun_file import RerunFile, is_own_rrd
 from asca_deploy.recordings.results import ResultFile
-from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz
+from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz, require_video
 from asca_deploy.result_files import COMMAND
 from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
@@ -23,7 +23,7 @@ from asca_pillars.pictures.video import VideoView
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceFiles:
-    """Which of them are wanted; None: not that one."""
+    """The files to write; None: not that one."""
 
     foxglove: Path | None = None
     rerun: Path | None = None
@@ -32,12 +32,12 @@ class SequenceFiles:
 
     @property
     def paths(self) -> list[Path]:
-        """Of those that are wanted."""
+        """The files to write, in a fixed order."""
         return [path for path in (self.foxglove, self.rerun, self.video) if path is not None]
 
     @property
     def show_points(self) -> bool:
-        """Whether one of them draws the points of the scans."""
+        """True if one of them draws the points of the scans."""
         return self.rerun is not None or self.video is not None
 
     def check(self, inputs: Sequence[Path | None]) -> None:
@@ -46,6 +46,7 @@ class SequenceFiles:
         Raises:
             AscaError: a path has another suffix, is one of `inputs` or another program's file, or a library is missing.
         """
+        require_video(self.video, self.video_view, inputs)
         if self.rerun is not None:
             require("view")
             require_suffix("--rerun", self.rerun, ".rrd")

@@ -19,23 +19,21 @@ _RATES_HZ = (1.0, 60.0)
 _USUAL_RATE_HZ = 10.0
 
 
-def require_video(video: Path | None, view: str, inputs: Sequence[Path]) -> VideoView:
-    """The view that was asked for, after a look at whether the video can be written.
+def require_video(video: Path | None, view: str, inputs: Sequence[Path | None]) -> None:
+    """Make sure before the work that the video can be written.
 
     Raises:
         AscaError: there is no such view or no encoder, or `video` is another's file, an input, or no .mp4.
     """
-    known: dict[str, VideoView] = {name: name for name in get_args(VideoView)}
-    if view not in known:
-        raise ConfigError(f"--video-view {view}: give {' or '.join(known)}")
+    if view not in get_args(VideoView):
+        raise ConfigError(f"--video-view {view}: give {' or '.join(get_args(VideoView))}")
     if video is None:
         if view != "above":
             raise ConfigError(f"--video-view {view}: is of a video; give --video FILE.mp4, too")
-        return "above"
+        return
     require_suffix("--video", video, SUFFIX)
     find_encoder()
     require_writable(video, COMMAND, is_own_video, inputs)
-    return known[view]
 
 
 def recording_rate_hz(times_ns: Sequence[int]) -> float:
