@@ -53,4 +53,4 @@ class Reporter:
 
 
 SILENT = Reporter()
-"""Of work that nobody follows; for functions that only track."""
+"""Reports to nobody; for functions that only track."""

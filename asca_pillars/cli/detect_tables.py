@@ -1,4 +1,4 @@
-"""What `asca detect` prints: one scan's boxes or a line per scan, and the time of every stage."""
+"""Tables of `asca detect`: one scan's boxes or a line per scan, and the time of every stage."""
 
 import statistics
 from collections.abc import Sequence

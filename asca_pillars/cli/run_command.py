@@ -1,4 +1,4 @@
-"""How a command ends: what the user can mend is one line on stderr and the exit code of its kind."""
+"""The end of a command: an error that the user can fix is one line on stderr and the exit code of its kind."""
 
 import io
 import sys

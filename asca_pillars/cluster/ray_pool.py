@@ -65,7 +65,7 @@ class RayPool(Generic[Result]):
         self._limit, self._limit_until = 0, 0.0
 
     def has_room(self) -> bool:
-        """Whether to submit one more shard: each worker has one waiting, and the queue stays short."""
+        """Return whether one more shard is to be submitted: each worker has one waiting, and the queue stays short."""
         import ray
 
         if time.monotonic() >= self._limit_until:  # machines come and go

@@ -176,7 +176,7 @@ class Pool(Protocol[Result]):
     """Workers that do a job for one shard after another."""
 
     def has_room(self) -> bool:
-        """Whether to submit one more shard."""
+        """Return whether one more shard is to be submitted."""
 
     def submit(self, shard: Shard) -> None:
         """Begin a shard, or let it wait for a free worker."""

@@ -39,7 +39,7 @@ class LabeledSplit(Protocol):
 
     @property
     def has_camera(self) -> bool:
-        """Whether objects are labelled only where a camera sees."""
+        """True if objects are labelled only where a camera sees."""
 
     @property
     def mounting(self) -> Mounting:

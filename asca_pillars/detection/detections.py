@@ -136,7 +136,7 @@ def summed(counts: Sequence[ScanCounts]) -> ScanCounts:
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What happened to one scan on its way to the boxes."""
+    """Record of one scan on its way to the boxes."""
 
     times_ms: dict[str, float]
     """Wall time of each stage by name: "input" (check and conversion of the points), then those of the family."""

@@ -17,7 +17,7 @@ from asca_pillars.geometry.boxes import decode_boxes
 
 @dataclass(frozen=True)
 class ProposalSettings(Strict):
-    """How a first stage's head maps become proposals."""
+    """Settings by which a first stage's head maps become proposals."""
 
     score_threshold: float = 0.05
     """Of every class: the second stage judges again, and cannot bring back what is not proposed."""

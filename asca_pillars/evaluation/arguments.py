@@ -1,4 +1,4 @@
-"""What an evaluation is asked for, which wishes go together, and what it gives."""
+"""Arguments of an evaluation, checks of their combinations, and its result."""
 
 import math
 from collections.abc import Mapping

@@ -278,7 +278,7 @@ def _judged(frames: ScoredFrames, scores: dict[str, float]) -> gallery.Matches:
 
 
 def _made_by(folder: Path) -> dict[str, Any]:
-    """What an evaluation noted beside the predictions of its model; nothing where they are from elsewhere."""
+    """Read what an evaluation noted beside the predictions of its model; nothing where they are from elsewhere."""
     try:
         content = json.loads((folder / MADE_BY).read_text(encoding="utf-8"))
     except (OSError, ValueError):

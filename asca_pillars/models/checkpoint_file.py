@@ -19,11 +19,11 @@ from asca_pillars.scans.expected_input import ExpectedInput
 
 
 class CheckpointFile(NamedTuple):
-    """What a checkpoint of `asca train` holds."""
+    """Content of a checkpoint of `asca train`."""
 
     path: Path
     config: Config
-    """Of its training run."""
+    """Configuration of its training run."""
     weights: dict[str, Tensor]
     """The network's `state_dict`; with `train.ema` the averaged weights."""
     steps: int
@@ -95,7 +95,7 @@ def read_plain(path: Path) -> dict[str, Any]:
 
 
 def _library_of(content: Mapping[str, Any]) -> str | None:
-    """Whose training wrote a checkpoint that is not ours, where `asca import-weights` may know it."""
+    """Name the library whose training wrote a checkpoint, where `asca import-weights` may know it."""
     if "model_state" in content:
         return "OpenPCDet"
     return "mmdetection3d" if "meta" in content and "state_dict" in content else None

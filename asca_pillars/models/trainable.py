@@ -1,4 +1,4 @@
-"""What a family of detectors is to training, evaluation and checkpoints."""
+"""Interface of a family of detectors for training, evaluation and checkpoints."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ class Trainable(nn.Module, ABC):
     """
 
     preparation: Preparation
-    """How its batches are made."""
+    """Prepares its batches."""
 
     @abstractmethod
     def predict(self, batch: Any) -> Any:

@@ -21,10 +21,10 @@ CLASS_COLORS: dict[str, Rgb] = {
     "Cyclist": (70, 205, 255),
 }
 OTHER_COLORS: tuple[Rgb, ...] = ((150, 120, 255), (220, 238, 145), (240, 105, 200), (175, 140, 40))
-"""Of classes with other names: which one depends on the name alone."""
+"""Colors of classes with other names; the name alone decides which one."""
 
 HEIGHT_RAMP: tuple[Rgb, ...] = ((66, 104, 160), (84, 176, 168), (240, 226, 166))
-"""Of points from the ground to `HEIGHT_SPAN_M` above it: muted, so that boxes stand out."""
+"""Colors of points from the ground to `HEIGHT_SPAN_M` above it: muted, so that boxes stand out."""
 HEIGHT_SPAN_M = 4.0
 
 
@@ -50,7 +50,7 @@ def height_table() -> dict[str, Any]:
 
 
 def ground_height(z_m: NDArray[np.floating]) -> float:
-    """Where the color ramp begins: the height (m) that a tenth of the points (N,) lie below; 0 without points."""
+    """Height (m) at which the color ramp begins: the 10th percentile of the points' (N,); 0 without points."""
     return float(np.percentile(z_m, 10)) if len(z_m) else 0.0
 
 

@@ -80,7 +80,7 @@ class BoxLayer:
 
 @dataclass(frozen=True, eq=False)
 class Trail:
-    """Where a box was in the scans before."""
+    """Places of a box in the scans before."""
 
     places_m: NDArray[np.floating]
     """(N, 3) x, y, z of the floor's center, oldest first, in the frame of the picture."""
@@ -135,7 +135,7 @@ def draw_legend(texts: Texts, layers: Sequence[BoxLayer]) -> None:
 
 
 def draw_color_bar(texts: Texts) -> None:
-    """What the colors of the points mean, in the upper right corner of an oversampled canvas."""
+    """Draw the legend of the points' colors in the upper right corner of an oversampled canvas."""
     steps, width, height = 64, 10 * OVERSAMPLING, 76 * OVERSAMPLING
     right, top = texts.canvas.shape[1] - 16 * OVERSAMPLING, 16 * OVERSAMPLING
     if texts.canvas.shape[0] < top + height + 60 * OVERSAMPLING or texts.canvas.shape[1] < 400 * OVERSAMPLING:

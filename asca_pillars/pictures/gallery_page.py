@@ -20,7 +20,7 @@ class GalleryCard:
     values: Mapping[str, float]
     """Counts and scores by name, by which the page sorts; a card that lacks one, or whose is NaN, comes last."""
     classes: Mapping[str, int] = field(default_factory=dict)
-    """How many boxes of each class there are."""
+    """Number of boxes of each class."""
     remarks: Sequence[str] = ()
 
 

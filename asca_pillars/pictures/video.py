@@ -127,6 +127,12 @@ class VideoFile:
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._said)
 
 
+def require_view(view: str) -> None:
+    """Raise ConfigError unless there is such a `VideoView`."""
+    if view not in get_args(VideoView):
+        raise ConfigError(f"--video-view {view}: give {' or '.join(get_args(VideoView))}")
+
+
 class BoxVideo:
     """Draws scan after scan with its boxes into a video.
 
@@ -138,8 +144,7 @@ class BoxVideo:
     """
 
     def __init__(self, file: VideoFile, view: VideoView, ranges: Ranges, level: FrameChange | None = None) -> None:
-        if view not in get_args(VideoView):
-            raise ConfigError(f"--video-view {view}: give {' or '.join(get_args(VideoView))}")
+        require_view(view)
         self._file, self._view, self._ranges, self._level = file, view, ranges, level
         self._ground_m: float | None = None
         self._trails: dict[int, deque[tuple[float, NDArray[np.float64]]]] = {}

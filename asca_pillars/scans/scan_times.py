@@ -8,7 +8,7 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.input_files import read_text
 
 RATE_HZ = 10.0
-"""Of scans whose rate nobody states."""
+"""Rate of scans for which none is given."""
 _MAX_RATE_HZ = 1000.0
 _MAX_TIME_S = 9_000_000_000  # in 2255; more would be no seconds
 

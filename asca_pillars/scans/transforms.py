@@ -1,4 +1,4 @@
-"""How the frames of a vehicle lie to each other: ROS' tf, from its messages or from those of a recording."""
+"""Transforms between the frames of a vehicle: ROS' tf, from live messages or from those of a recording."""
 
 from typing import Any
 
@@ -57,7 +57,7 @@ class Transforms:
 
 
 def read_static_transforms(recording: Recording, frame: str) -> Transforms:
-    """What a recording's `/tf_static` says, of any namespace.
+    """Read the transforms of a recording's `/tf_static`, of any namespace.
 
     Args:
         recording: to read from.

@@ -74,12 +74,32 @@ class SaveOnInterrupt(Checkpoint):
         raise TrainingInterruptedError(f"interrupted and saved at step {trainer.global_step}; the same command goes on")
 
 
-class RunProgress(ProgressBar):
-    """One bar over all steps of the run, so that the time that is left is that of the run."""
+class RankProgress(ProgressBar):
+    """A bar that Lightning enables on the rank that prints, and disables on the others."""
 
     def __init__(self) -> None:
         super().__init__()
         self._enabled = True
+
+    @property
+    def is_enabled(self) -> bool:
+        """True if this rank prints."""
+        return self._enabled
+
+    def disable(self) -> None:
+        """Stay silent: called on the ranks that do not print."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Show progress: called on the rank that prints."""
+        self._enabled = True
+
+
+class RunProgress(RankProgress):
+    """One bar over all steps of the run, so that the time that is left is that of the run."""
+
+    def __init__(self) -> None:
+        super().__init__()
         self._bar = bars.Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -91,19 +111,6 @@ class RunProgress(ProgressBar):
             speed_estimate_period=600,
         )
         self._task = self._bar.add_task("Starting", total=None, loss="")
-
-    @property
-    def is_enabled(self) -> bool:
-        """Whether this rank prints."""
-        return self._enabled
-
-    def disable(self) -> None:
-        """Of the ranks that do not print."""
-        self._enabled = False
-
-    def enable(self) -> None:
-        """Of the rank that prints."""
-        self._enabled = True
 
     def on_sanity_check_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Show that something happens from the first loader process on."""
@@ -152,7 +159,7 @@ class RunProgress(ProgressBar):
             self._bar.start()
 
 
-class StepProgress(ProgressBar):
+class StepProgress(RankProgress):
     """Calls `progress` after each step of the run, and draws nothing.
 
     Args:
@@ -163,20 +170,6 @@ class StepProgress(ProgressBar):
     def __init__(self, progress: Progress | None, remark: Remark) -> None:
         super().__init__()
         self._progress, self._remark, self._total = progress, remark, 0
-        self._enabled = True
-
-    @property
-    def is_enabled(self) -> bool:
-        """Whether this rank tells."""
-        return self._enabled
-
-    def disable(self) -> None:
-        """Of the ranks that do not tell."""
-        self._enabled = False
-
-    def enable(self) -> None:
-        """Of the rank that tells."""
-        self._enabled = True
 
     def print(self, *args: Any, **_: Any) -> None:
         """Pass a line on."""

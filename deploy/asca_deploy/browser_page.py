@@ -34,7 +34,7 @@ START = "Open it from a file server: python -m http.server --directory {out}"
 ORT_FILES = ("ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm")
 """Of the package's `dist`: ONNX Runtime for the CPU alone, 14 MB."""
 ORT_LICENSE = "LICENSE-onnxruntime.txt"
-"""Of ONNX Runtime, which the package itself does not hold; it lies among our modules."""
+"""License of ONNX Runtime, which its package does not hold; it lies among our modules."""
 ORT_NOTICES = "ThirdPartyNotices-onnxruntime.txt"
 """Licenses of what is built into ONNX Runtime, from the installed one."""
 ORT_VERSION = "1.30.0"
@@ -104,7 +104,7 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
 
 
 def page_zip(out: Path) -> Path:
-    """Where the zip of the page in the folder `out` is: beside it."""
+    """Path of the zip of the page in the folder `out`: beside it."""
     folder = out.resolve()  # `.` has no name
     return folder.with_name(f"{folder.name}.zip")
 
@@ -134,7 +134,7 @@ def _write_zip(path: Path, page: Path) -> None:
 
 
 def _is_own_zip(path: Path) -> bool:
-    """Whether it is a zip of a page: the first of its files is one's `page.json`."""
+    """Return whether it is a zip of a page: the first of its files is one's `page.json`."""
     try:
         with zipfile.ZipFile(path) as archive:
             first = archive.infolist()[0]

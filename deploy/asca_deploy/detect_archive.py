@@ -60,7 +60,7 @@ class Counts(NamedTuple):
 
 @dataclass(frozen=True)
 class ArchiveResult:
-    """What `detect_archive` did.
+    """Result of `detect_archive`.
 
     Attributes:
         counts: of all scans.

@@ -185,7 +185,7 @@ def detect_scans(
 
 
 def repairs(results: Iterable[DetectedScan]) -> Iterator[str]:
-    """What was repaired, dropped or odd, each kind once, with the first scan that it concerns and how many others."""
+    """Yield what was repaired, dropped or odd, each kind once, with the first scan that it concerns and a count."""
     names: dict[str, list[str]] = defaultdict(list)
     for result in results:
         notes = result.notes

@@ -140,7 +140,7 @@ class Detector:
             "weights_sha256": weights_digest(self.bundle),
             "version": own_version(),
         }
-        """What its results name: the model, the SHA-256 of its weights, and the version of this package."""
+        """Origin of its results: the model, the SHA-256 of its weights, and the version of this package."""
         self.load_s = perf_counter() - start
         """Seconds that it took to open the bundle."""
 

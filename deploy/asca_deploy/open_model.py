@@ -24,7 +24,7 @@ from asca_pillars.scans.mounting import Mounting
 
 @dataclass(frozen=True, kw_only=True)
 class RuntimeOptions:
-    """Which model runs, and how. The arguments of `Detector` by the same names."""
+    """The model to run, and how. The arguments of `Detector` by the same names."""
 
     bundle: str | Path | None = None
     provider: str = "cpu"

@@ -256,7 +256,7 @@ class ResultWriter:
 def _card(
     name: Path, detections: ScanDetections, labels: NDArray[np.floating] | None, warnings: Sequence[str]
 ) -> GalleryCard:
-    """What the page of pictures says of a scan; `labels` are boxes (M, 7) in its frame."""
+    """Make the card of a scan on the page of pictures; `labels` are boxes (M, 7) in its frame."""
     values: dict[str, float] = {"boxes": len(detections)}
     if len(detections):
         values |= {"best score": float(detections.scores.max()), "lowest score": float(detections.scores.min())}

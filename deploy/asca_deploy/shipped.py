@@ -82,7 +82,7 @@ def sample_scan_path() -> Path:
 
 
 def about_bundle(folder: Path) -> dict[str, Any]:
-    """What a bundle is, as plain values; its graphs are compared with their digests.
+    """Describe a bundle as plain values; its graphs are compared with their digests.
 
     Raises:
         BundleError: it is missing, damaged or made for another version.

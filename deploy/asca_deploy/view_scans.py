@@ -171,7 +171,7 @@ class _Answers:
         return np.ascontiguousarray(points, "<f4").tobytes()
 
     def boxes(self, number: int) -> bytes:
-        """What the page shows of a scan, and as `save` what `asca detect` writes of it."""
+        """Content of the page for a scan; `save` is what `asca detect` writes of it."""
         with self._lock:
             scan = self._read(number)
             found = self._detector(scan.points)
@@ -200,7 +200,7 @@ def _json(content: Any) -> bytes:
 
 
 def _handler(answer: Callable[[str], tuple[str, bytes] | None]) -> type[BaseHTTPRequestHandler]:
-    """What answers requests: the suffix and the content for a path, or nothing for one that there is not."""
+    """Make the class that answers requests; `answer` gives suffix and content for a path, or None."""
 
     class Handler(BaseHTTPRequestHandler):
         server_version, sys_version = "asca", ""

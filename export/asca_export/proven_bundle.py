@@ -1,4 +1,4 @@
-"""What the exports of all families share: their options, and a bundle that is written once its graphs are proven."""
+"""Common parts of the exports of all families: options, and a bundle that is written once its graphs are proven."""
 
 import dataclasses
 import datetime
@@ -34,7 +34,7 @@ def _silent(_: str) -> None:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """How a checkpoint is exported.
+    """Options of the export of a checkpoint.
 
     Attributes:
         trained_on: what the weights have seen, in words, for the manifest.

@@ -139,7 +139,7 @@ def linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
 
 
 JOINED = f"{HEAD}.joined"
-"""What the head's product reads, by name."""
+"""Inputs of the head's product, by name."""
 
 
 def export_sparse_backbone(

@@ -39,7 +39,7 @@ _META, _KEYS = "meta.json", "key_id_map.json"
 _SHAPE = "cuboid_3d"
 _QUARTER = math.pi / 2
 _NAMESPACE = uuid.UUID("6c1de7d4-3f0e-4c52-9a2b-4f4d0c3e8a11")
-"""Of keys, so that the same boxes get the same ones again."""
+"""Namespace of keys, so that the same boxes get the same ones again."""
 
 
 def read_supervisely(source: Path, scans: Path, settings: ScanSettings) -> Imported:

@@ -1,4 +1,4 @@
-"""What the formats of labelling tools share: a file for each scan, found by its name, and pre-labels written safely."""
+"""Common parts of the formats of labelling tools: a file for each scan, found by its name, and safe pre-labels."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ WRITTEN_FILE = "prelabels.json"
 """Digests of the files that were written for labelling tools, so that corrected ones are not replaced."""
 COMMAND = "asca detect --write"
 COLORS = ("#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#42d4f4")
-"""Of classes, for tools that want them stated."""
+"""Colors of classes, for tools that want them stated."""
 _DECIMALS = 4
 _ANGLE_DECIMALS = 8  # of angles that are converted, so that the radians come back to their last digit
 _UPRIGHT_RAD = 0.01

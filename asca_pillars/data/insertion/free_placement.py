@@ -52,7 +52,7 @@ class Scene:
         self.obstacles = np.concatenate([self.obstacles, item.box[None]])
 
     def shows_all_with(self, item: StoredObject) -> bool:
-        """Whether most points of every object, `item` included, stay visible if `item` is added."""
+        """Return whether most points of every object, `item` included, stay visible if `item` is added."""
         seen = ~(self._hidden | self._owned_rays.entering(item.box[None]))
         if (np.count_nonzero(self._wanted & seen, axis=1) < self._enough).any():
             return False

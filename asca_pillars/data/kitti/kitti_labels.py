@@ -187,7 +187,7 @@ def parse_object(words: Sequence[str], place: str) -> KittiObject:
 
 
 def is_detection_text(text: str) -> bool:
-    """Whether a text holds detections as `labels_text` writes them, with scores, which labels do not have."""
+    """Return whether a text holds detections as `labels_text` writes them, with scores, which labels lack."""
     try:
         objects = [parse_object(line.split(), "") for line in text.splitlines()]
     except DatasetError:

@@ -87,7 +87,7 @@ _ALIGN_STD = 1e-3  # of the last weights: training starts at almost undeformed k
 
 
 class Surroundings(NamedTuple):
-    """What stands around K keypoints on one level; index N stands for nothing."""
+    """Neighbors of K keypoints on one level; index N stands for none."""
 
     features: Tensor
     """(N, C) of the level's voxels."""
@@ -96,7 +96,7 @@ class Surroundings(NamedTuple):
     keypoints: Tensor
     """(K, 3), metres."""
     indices: Sequence[Tensor]
-    """Of each radius (K, T) voxels."""
+    """(K, T) voxels per radius."""
     nearest: Tensor | None = None
     """(K, 3) the three nearest voxels."""
     nearest_weights: Tensor | None = None
@@ -139,7 +139,7 @@ class AuthorsDeformation(nn.Module):
         self.offset = nn.Linear(3 + channels, 3, bias=False)
 
     def forward(self, around: Surroundings) -> list[Tensor]:
-        """Of each radius (K, 3), metres."""
+        """(K, 3) per radius, metres."""
         shifted = []
         for index in around.indices:
             relative, found = _relative(around, index)

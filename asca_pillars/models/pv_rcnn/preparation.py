@@ -36,11 +36,11 @@ class VoxelBatch(NamedTuple, Generic[Array]):
     keypoints: Array
     """(K, 3)."""
     positions: tuple[Array, ...]
-    """Of each source (N, 3)."""
+    """(N, 3) per source."""
     ball_indices: tuple[Array, ...]
     """(K, samples), source by source and radius by radius."""
     nearest: tuple[Array, ...]
-    """Of each source (K, 3) voxels, (0, 3) where they are not asked for."""
+    """(K, 3) voxels per source, (0, 3) where they are not asked for."""
     nearest_weights: tuple[Array, ...]
     """(K, 3)."""
     bev_cells: Array
@@ -48,11 +48,11 @@ class VoxelBatch(NamedTuple, Generic[Array]):
     bev_weights: Array
     """(K, 4)."""
     scales: tuple[PointScale[Array], ...]
-    """Of raw points around keypoints."""
+    """Settings for raw points around keypoints."""
     frame_keypoints: tuple[int, ...]
     """Keypoints of each frame."""
     frame_rows: tuple[tuple[int, ...], ...]
-    """Of each source, how many of `positions` each frame has."""
+    """Number of `positions` in each frame, per source."""
 
 
 class LabeledVoxels(NamedTuple):
@@ -63,9 +63,9 @@ class LabeledVoxels(NamedTuple):
     keypoint_states: Tensor
     """(K,) int8: 1 in an object, 0 outside, -1 takes no part."""
     boxes: tuple[NDArray[np.float32], ...]
-    """Of each frame (M, 7), metres and radians, LiDAR frame."""
+    """(M, 7) per frame, metres and radians, LiDAR frame."""
     labels: tuple[NDArray[np.int64], ...]
-    """Of each frame (M,), or IGNORED."""
+    """(M,) per frame, or IGNORED."""
 
     def to(self, device: Any) -> "LabeledVoxels":
         """The same with its tensors on `device`."""

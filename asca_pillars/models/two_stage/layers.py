@@ -171,17 +171,17 @@ class RefineInputs(NamedTuple):
     bev: Tensor
     """(K, C) the first stage's map at the keypoints, see `bilinear_cells`."""
     ball_indices: tuple[Tensor, ...]
-    """Of each radius (K, T) points around the keypoints; N stands for nothing."""
+    """(K, T) points around the keypoints per radius; N stands for none."""
     grid_points: Tensor
     """(R * cells, 3) of the proposals."""
     grid_indices: tuple[Tensor, ...]
-    """Of each radius (R * cells, T) keypoints around the grid points; K stands for nothing."""
+    """(R * cells, T) keypoints around the grid points per radius; K stands for none."""
     roi_features: Tensor
     """(R, F) what else is known of each proposal."""
 
 
 class Refinements(NamedTuple):
-    """What the second stage says of R proposals and K keypoints."""
+    """Output of the second stage for R proposals and K keypoints."""
 
     confidence: Tensor
     """(R,) logits."""

@@ -50,7 +50,7 @@ class SetAbstraction(nn.Module):
         return self.grouped(positions, features, queries, indices).max(dim=1).values
 
     def grouped(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """What the MLP says of each point of each ball, (Q, T, out_channels).
+        """Output of the MLP for each point of each ball, (Q, T, out_channels).
 
         Args:
             positions: (N, 3) of the points, metres, in the frame of the queries.
@@ -68,7 +68,7 @@ class SetAbstraction(nn.Module):
         return self.after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape)
 
     def after_first(self, pairs: Tensor) -> Tensor:
-        """What the first layer gives -> what the last one gives, both (Q * T, channels)."""
+        """Outputs of the first layer -> those of the last one, both (Q * T, channels)."""
         pairs = torch.relu(self.norms[0](pairs))
         for layer, norm in zip(self.layers[1:], self.norms[1:], strict=True):
             pairs = torch.relu(norm(layer(pairs)))

@@ -1,4 +1,4 @@
-"""What a sparse neck reads: the active cells of its three levels, and a rulebook for each of its convolutions.
+"""Input of a sparse neck: the active cells of its three levels, and a rulebook for each of its convolutions.
 
 The neck is that of Table 1 (three blocks that halve the map, three upsamplings to the head's resolution), computed at
 active cells alone. Which cells are active is a rule:

@@ -75,7 +75,7 @@ class Convolution:
 
 
 def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convolution:
-    """Of a map seen from above: nothing happens along z."""
+    """For a bird's-eye map: nothing happens along z."""
     return Convolution((1, kernel, kernel), (1, stride, stride), (0, padding, padding))
 
 

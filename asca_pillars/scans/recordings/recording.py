@@ -9,7 +9,7 @@ from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.scan_types import conversion_of, kind_of_scans
 
 Encoding = Literal["cdr", "ros1", "json", "protobuf", "points"]
-"""How a message's fields are written: ROS 2's CDR, ROS 1's own, one of those of Foxglove's types, or points alone."""
+"""Encoding of a message's fields: ROS 2's CDR, ROS 1's own, one of Foxglove's types, or points alone."""
 
 
 UNKNOWN_TYPE = "unknown"
@@ -28,7 +28,7 @@ class Topic(NamedTuple):
 
     @property
     def is_point_cloud(self) -> bool:
-        """Whether it holds scans of a type that is read."""
+        """True if it holds scans of a type that is read."""
         return kind_of_scans(self.type) is not None
 
 

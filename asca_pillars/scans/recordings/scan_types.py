@@ -24,7 +24,7 @@ _READ: tuple[tuple[str, ScanKind], ...] = (
 
 
 def kind_of_scans(type_name: str) -> ScanKind | None:
-    """Which kind of scans messages of a type hold; None if they are not read as scans."""
+    """Return the kind of scans in messages of a type; None if they are not read as scans."""
     return next((kind for pattern, kind in _READ if re.fullmatch(pattern, type_name)), None)
 
 

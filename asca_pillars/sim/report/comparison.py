@@ -182,7 +182,7 @@ class Row:
 
     @property
     def within_noise(self) -> bool:
-        """Whether a bar is missed by no more than the noise of so little real data."""
+        """True if a bar is missed by no more than the noise of so little real data."""
         return self.within is False and self.noise is not None and self.away <= self.noise
 
 

@@ -116,7 +116,7 @@ class Occupied:
 
 @cached()
 def _is_free(row: tuple[float, float, float, float, float, float], rows: Floats, count: int) -> bool:
-    """Whether a footprint overlaps none of the first `count` (separating axes of two rectangles)."""
+    """Return whether a footprint overlaps none of the first `count` (separating axes of two rectangles)."""
     own = (row[2], row[3], row[4])
     for i in range(count):
         taken = (rows[i, 2], rows[i, 3], rows[i, 4])

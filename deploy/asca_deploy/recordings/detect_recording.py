@@ -51,7 +51,7 @@ _AS_TRAINED = ScanSettings()
 
 @dataclass(frozen=True)
 class RecordingResult:
-    """What `detect_recording` found and wrote.
+    """Result of `detect_recording`.
 
     Attributes:
         scans: with results.
@@ -73,7 +73,7 @@ class RecordingResult:
 
 @dataclass(frozen=True, kw_only=True)
 class _Task:
-    """What is made of a recording; the arguments of `detect_recording` by the same names."""
+    """Arguments of `detect_recording`, by the same names."""
 
     path: Path
     out: Path

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.writable_file import require_suffix, require_writable
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.pictures.video import SUFFIX, BoxVideo, VideoFile, VideoView, find_encoder, is_own_video
+from asca_pillars.pictures.video import SUFFIX, BoxVideo, VideoFile, VideoView, find_encoder, is_own_video, require_view
 
 _RATES_HZ = (1.0, 60.0)
 _USUAL_RATE_HZ = 10.0
@@ -25,8 +24,7 @@ def require_video(video: Path | None, view: str, inputs: Sequence[Path | None]) 
     Raises:
         AscaError: there is no such view or no encoder, or `video` is another's file, an input, or no .mp4.
     """
-    if view not in get_args(VideoView):
-        raise ConfigError(f"--video-view {view}: give {' or '.join(get_args(VideoView))}")
+    require_view(view)
     if video is None:
         if view != "above":
             raise ConfigError(f"--video-view {view}: is of a video; give --video FILE.mp4, too")

@@ -1,4 +1,4 @@
-"""How a node fares: counters and latencies, as a line of its log and as what its diagnostics say."""
+"""Health of a node: counters and latencies, as a line of its log and as diagnostics."""
 
 import threading
 from collections import Counter, deque
@@ -30,7 +30,7 @@ class Health:
     trouble: str | None = None
     """Why the last unreadable one was that."""
     warnings: tuple[str, ...] = ()
-    """Of the last answered scan."""
+    """Warnings of the last answered scan."""
     failure: str | None = None
     """Why the detector ended."""
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_LATENCIES))
@@ -63,7 +63,7 @@ class Health:
             self.warnings = warnings
 
     def summary(self) -> dict[str, Any]:
-        """What happened since the last call, and the counters since the start."""
+        """Return the events since the last call, and the counters since the start."""
         with self._lock:
             now, (since, answered) = monotonic(), self._since
             self._since = now, self.answered

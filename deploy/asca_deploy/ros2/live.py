@@ -37,7 +37,7 @@ Log = Callable[..., None]
 
 @dataclass(frozen=True)
 class _Taken:
-    """What belongs to a scan while it waits."""
+    """A scan while it waits."""
 
     stamp: Stamp
     at_s: float

@@ -1,4 +1,4 @@
-"""What the node publishes, as dicts with the fields of ROS' messages; nothing here needs ROS.
+"""Messages of the node, as dicts with the fields of ROS' messages; nothing here needs ROS.
 
 `filled` makes messages of them. Every box keeps the stamp and the frame of its scan. A field that a dict leaves out has
 the message's own default.

@@ -44,7 +44,7 @@ _STUCK_S = 10.0  # for one scan, without a watchdog
 
 @dataclass(frozen=True, kw_only=True)
 class NodeSettings:
-    """What `asca ros2` was asked for.
+    """Settings of `asca ros2`.
 
     Attributes:
         topic: of `sensor_msgs/PointCloud2`.
@@ -175,7 +175,7 @@ def _spin(rclpy: Any, node: "_Node", live: Live, stop: threading.Event) -> None:
 
 
 class _Node:
-    """What ROS sees: the subscription, which follows the publishers, and the answers."""
+    """Connection to ROS: the subscription, which follows the publishers, and the answers."""
 
     def __init__(self, rclpy: Any, settings: NodeSettings, live: Live, transforms: Transforms) -> None:
         self._rclpy, self._settings, self._live = rclpy, settings, live
@@ -197,7 +197,7 @@ class _Node:
         self.node.create_timer(_STATUS_S, self._tell)
 
     def publishers(self) -> list[Callable[[Stamp, ScanDetections | Tracks], None]]:
-        """What publishes the boxes of a scan."""
+        """Publisher of the boxes of a scan."""
         both = [self._publish(self._markers, marker_array), self._publish(self._detections, detection_array)]
         return [one for one in both if one is not None]
 

@@ -1,4 +1,4 @@
-"""What systemd wants to hear of a service (sd_notify(3)): that it is ready, that it lives, that it stops."""
+"""Notifications of systemd (sd_notify(3)): the service is ready, alive, stopping."""
 
 import os
 import socket

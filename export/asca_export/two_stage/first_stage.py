@@ -158,7 +158,7 @@ class BundleFirstStage:
 
 
 def is_checkpoint(source: str) -> bool:
-    """Whether the first stage of that name is a checkpoint, and no bundle."""
+    """Return whether the first stage of that name is a checkpoint, and no bundle."""
     return Path(source).suffix == Path(WEIGHTS_FILE).suffix or Path(source).is_file()
 
 

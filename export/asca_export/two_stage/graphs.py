@@ -30,7 +30,7 @@ class _Layers(nn.Module):
         self.out_channels = trained.out_channels
 
     def after_first(self, pairs: Tensor) -> Tensor:
-        """What the first layer gives -> what the last one gives before its shift, both (pairs, channels)."""
+        """Outputs of the first layer -> those of the last one before its shift, both (pairs, channels)."""
         for layer in self.layers[1:-1]:
             pairs = layer(torch.relu(pairs))
         return torch.relu(pairs) @ self.last.weight.T if len(self.layers) > 1 else pairs
@@ -41,7 +41,7 @@ class _Layers(nn.Module):
 
 
 class GatheredSetAbstraction(_Layers):
-    """Of balls whose points have been gathered. Points have fewer channels than the first layer gives."""
+    """For balls whose points have been gathered. Points have fewer channels than the first layer's output."""
 
     def forward(self, _positions: None, _features: None, _queries: Tensor, balls: Tensor) -> Tensor:
         """[p_j - q ; f_j] of each ball, (Q, T, 3 + C), zeros for nothing -> (Q, out_channels)."""
