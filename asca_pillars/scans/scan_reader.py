@@ -134,9 +134,11 @@ def finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
         points[:, 3], clipped = unit_reflectance(stored.reflectance, number)
         doubt = ambiguity(stored.reflectance, number) if by_values else None
         notes = ScanNotes(0, clipped, number, (*stored.remarks, *([doubt] if doubt else [])))
-    finite = np.isfinite(points).all(axis=1)
-    dropped = len(points) - int(finite.sum())
-    return Scan(points[finite] if dropped else points, replace(notes, dropped_points=dropped))
+    finite, dropped = np.isfinite(points), 0
+    if not finite.all():  # row by row is ten times slower
+        rows = finite.all(axis=1)
+        points, dropped = points[rows], int(len(rows) - rows.sum())
+    return Scan(points, replace(notes, dropped_points=dropped))
 
 
 def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:

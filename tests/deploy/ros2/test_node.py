@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: pip install -r tests/requirements-ros2.txt")
 
-PUBLISHER = Path(__file__).with_name("publisher.py")
+ROOT = Path(__file__).parents[3]
 SMALL = 10_000
 """Points whose message fits into the middleware's buffers, so that best effort loses none."""
 
@@ -49,8 +49,9 @@ def node(environment: dict[str, str], *arguments: str) -> Iterator[subprocess.Po
 
 
 def published(environment: dict[str, str], kind: str, count: int, points: int = SMALL) -> dict[str, Any]:
-    command: Sequence[str] = [sys.executable, str(PUBLISHER), kind, str(count), str(points)]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=90, check=True)
+    command = [sys.executable, "-m", "benchmarks.ros2_publisher", "--qos", kind.lower()]
+    command += ["--count", str(count), "--points", str(points)]
+    result = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=90, check=True)
     return json.loads(result.stdout)
 
 
