@@ -18,6 +18,7 @@ from asca_pillars.cli.options import (
     ScansArgument,
     SensorHeightOption,
     ThreadsOption,
+    TopicOption,
     scan_settings,
 )
 
@@ -84,9 +85,7 @@ def bench(
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
-    topic: Annotated[
-        str | None, typer.Option("--topic", help="Of a recording: the topic of its scans. Default: the only one.")
-    ] = None,
+    topic: TopicOption = None,
     json: JsonOption = None,
 ) -> None:
     """Time every stage from points to boxes: p50, p95, p99, FPS, cold start, memory, and the machine it ran on.

@@ -22,6 +22,7 @@ from asca_pillars.cli.options import (
     ScoreOption,
     SensorHeightOption,
     ThreadsOption,
+    TopicOption,
     VideoOption,
     VideoViewOption,
     read_scores,
@@ -65,14 +66,7 @@ def detect(
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            "--topic",
-            help="Of a recording: the topic of its scans. Default: the only one.",
-            rich_help_panel="Recording",
-        ),
-    ] = None,
+    topic: TopicOption = None,
     frame: Annotated[
         str | None,
         typer.Option(

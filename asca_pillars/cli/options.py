@@ -132,6 +132,14 @@ ColumnsOption = Annotated[
         rich_help_panel="Sensor",
     ),
 ]
+TopicOption = Annotated[
+    str | None,
+    typer.Option(
+        "--topic",
+        help="Of a recording: the topic of its scans. Default: the only one.",
+        rich_help_panel="Recording",
+    ),
+]
 AroundOption = Annotated[
     bool,
     typer.Option(
