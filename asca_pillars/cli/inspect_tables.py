@@ -107,6 +107,7 @@ def recorded(found: ScansInspection) -> list[Table | str]:
     lines: list[Table | str] = [
         f"{found.path}{of_topic}: {found.inspected} of {found.scans} scans measured",
         f"against {found.model}, which looks in {looks_in} m",
+        *map(printable, found.notes),
     ]
     if len(found.topics) > 1:
         topics = _table("Topics", "topic", "type", "messages")

@@ -78,6 +78,7 @@ class ScansInspection:
         ground_z_m: height of the ground near the sensor, in the model's frame; None too where it is not seen.
         inside_share: share of a scan's points within `ranges`, 0..1.
         height: of the sensor above the ground; None if it cannot be estimated, which is then among the findings.
+        notes: sentences about how a recording is read: that it was unpacked.
         findings: sentences about what is odd; those about the model's training name the option that mends it.
         problems: sentences about scans and parts of the recording that cannot be read.
     """
@@ -100,6 +101,7 @@ class ScansInspection:
     ground_z_m: Spread | None
     inside_share: Spread | None
     height: HeightEstimate | None
+    notes: tuple[str, ...]
     findings: tuple[str, ...]
     problems: tuple[str, ...]
 
@@ -185,6 +187,7 @@ def inspect_scans(
         ground_z_m=spread(np.array(measured.ground_z_m)),
         inside_share=spread(np.array(measured.inside)),
         height=height,
+        notes=recorded.recording.notes if recorded else (),
         findings=tuple(found),
         problems=(*([damage] if damage else []), *problems),
     )

@@ -1,5 +1,6 @@
 """Scans without labels: what is measured, that the warnings are the detector's, and what is refused."""
 
+import gzip
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -160,6 +161,13 @@ def test_a_recording_in_the_terminal(odd: Path) -> None:
     done = run_here("inspect", odd, "--topic", "/lidar")
     assert done.returncode == 3 and "sensor_msgs/msg/Imu" in done.stdout
     assert "0.8 s, 10 scans per second; frame lidar; fields x, y, z, intensity" in done.stdout
+
+
+def test_a_packed_recording_says_so(odd: Path) -> None:
+    packed = odd.with_suffix(".mcap.gz")
+    packed.write_bytes(gzip.compress(odd.read_bytes()))
+    said = invoke("inspect", packed, "--topic", "/rear")
+    assert f"{packed}: unpacked to " in said and f"warning: {packed}" not in said
 
 
 @pytest.mark.parametrize(

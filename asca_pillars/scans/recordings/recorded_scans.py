@@ -88,7 +88,7 @@ class RecordedScans:
         Raises:
             ConfigError, ScanError: as `ScanSettings.mounting`.
         """
-        said = [f"{self.topic.name}: {self.topic.messages} scans", *said_of_scale(self.scale)]
+        said = [*self.recording.notes, f"{self.topic.name}: {self.topic.messages} scans", *said_of_scale(self.scale)]
         mounting, estimate = reading.mounting(self.samples())
         if estimate is not None:
             said.append(f"sensor height: {estimate}")
