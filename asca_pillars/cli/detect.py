@@ -18,7 +18,7 @@ from asca_pillars.cli.options import (
     PrecisionOption,
     ProviderOption,
     ReflectanceScaleOption,
-    ScansArgument,
+    ScansOrRecordingArgument,
     ScoreOption,
     SensorHeightOption,
     ThreadsOption,
@@ -42,24 +42,9 @@ TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame a
 
 
 def detect(
-    scans: ScansArgument = None,
+    scans: ScansOrRecordingArgument = None,
     *,
     bundle: BundleOption = None,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.", rich_help_panel="Output")
-    ] = Path("detections"),
-    score: ScoreOption = None,
-    pictures: Annotated[
-        bool | None,
-        typer.Option(
-            "--pictures/--no-pictures",
-            help="Draw a bird's-eye picture of each scan; without, faster. Default: drawn, but not with --cluster.",
-            rich_help_panel="Output",
-        ),
-    ] = None,
-    provider: ProviderOption = "cpu",
-    precision: PrecisionOption = None,
-    threads: ThreadsOption = None,
     around: AroundOption = False,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
@@ -126,8 +111,6 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
-    video: VideoOption = None,
-    video_view: VideoViewOption = "above",
     calib: Annotated[
         Path | None,
         typer.Option(
@@ -136,6 +119,20 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.", rich_help_panel="Output")
+    ] = Path("detections"),
+    score: ScoreOption = None,
+    pictures: Annotated[
+        bool | None,
+        typer.Option(
+            "--pictures/--no-pictures",
+            help="Draw a bird's-eye picture of each scan; without, faster. Default: drawn, but not with --cluster.",
+            rich_help_panel="Output",
+        ),
+    ] = None,
+    video: VideoOption = None,
+    video_view: VideoViewOption = "above",
     write: Annotated[
         str | None,
         typer.Option(
@@ -145,6 +142,9 @@ def detect(
             rich_help_panel="Output",
         ),
     ] = None,
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.

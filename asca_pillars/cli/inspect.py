@@ -48,7 +48,9 @@ def inspect(
     ] = None,
     frames: Annotated[
         int,
-        typer.Option("--frames", "-n", min=1, help="Look at so many frames, evenly spaced.", rich_help_panel="Input"),
+        typer.Option(
+            "--frames", "-n", min=1, help="Look at so many frames, evenly spaced.", rich_help_panel="Input", metavar="N"
+        ),
     ] = 500,
     bundle: BundleOption = None,
     around: AroundOption = False,
@@ -75,15 +77,13 @@ def inspect(
             help="Also draw so many training frames from above, with their labels, as training sees them: objects "
             "inserted, augmented.",
             rich_help_panel="Output",
+            metavar="N",
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out",
-            "-o",
-            help="Folder for the pictures of --draw. Default: inspection.",
-            rich_help_panel="Output",
+            "--out", "-o", help="Folder for the pictures of --draw. Default: inspection.", rich_help_panel="Output"
         ),
     ] = None,
     json: JsonOption = None,
