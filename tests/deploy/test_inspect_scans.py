@@ -129,7 +129,8 @@ def odd(tmp_path: Path) -> Path:
     from tests.scans.recordings.cloud_recordings import clouds, laid_out, stamps, write_mcap
 
     times = [stamps(9)[number] for number in (0, 1, 2, 3, 6, 7, 8)]
-    messages = [(time_ns, laid_out(POINTS * np.array([1, 1, 1, 255], np.float32), time_ns=time_ns)) for time_ns in times]
+    bytewise = POINTS * np.array([1, 1, 1, 255], np.float32)
+    messages = [(time_ns, laid_out(bytewise, time_ns=time_ns)) for time_ns in times]
     messages.insert(2, (times[1] + 50, b"torn"))
     others = {"/imu": "sensor_msgs/msg/Imu"}
     return write_mcap(tmp_path / "odd.mcap", {"/lidar": messages, "/rear": clouds(2)}, others=others)
