@@ -60,7 +60,7 @@ def test_the_nearest_image_to_each_scan_is_shown(tmp_path: Path, capsys: pytest.
     """A camera of half the lidar's rate that ends early, and another one."""
     rerun = pytest.importorskip("rerun", reason="needs pip install -e '.[view]'")
     times, pixels = stamps(12), np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
-    stored = {}
+    stored: dict[int, bytes] = {}
     for time_ns in (times[0] + 1, times[2] + 1):
         _, picture = cv2.imencode(".jpg", pixels + len(stored))
         stored[time_ns] = picture.tobytes()
