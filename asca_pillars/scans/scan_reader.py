@@ -137,7 +137,7 @@ def finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
     finite, dropped = np.isfinite(points), 0
     if not finite.all():  # row by row is ten times slower
         rows = finite.all(axis=1)
-        points, dropped = points[rows], int(len(rows) - rows.sum())
+        points, dropped = points[rows], len(points) - int(rows.sum())
     return Scan(points, replace(notes, dropped_points=dropped))
 
 
