@@ -111,6 +111,14 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
+    image_topic: Annotated[
+        str | None,
+        typer.Option(
+            "--image-topic",
+            help="Of a recording, with --rerun: the topic of the camera images. Default: the first one.",
+            rich_help_panel="Recording",
+        ),
+    ] = None,
     calib: Annotated[
         Path | None,
         typer.Option(
@@ -222,6 +230,7 @@ def detect(
                 calib=calib,
                 foxglove=foxglove,
                 rerun=rerun,
+                image_topic=image_topic,
                 video=video,
                 video_view=view,
                 options=options,
@@ -233,8 +242,9 @@ def detect(
             )
         _print_recording(recorded, console)
         return
-    if topic or frame or odometry or calib:
-        raise ConfigError("--topic, --frame, --odometry and --calib need a recording (.mcap, .db3, .bag, .pcap)")
+    if topic or frame or odometry or calib or image_topic:
+        options_of = "--topic, --frame, --odometry, --image-topic and --calib"
+        raise ConfigError(f"{options_of} need a recording (.mcap, .db3, .bag, .pcap)")
     if cluster is not None:
         from asca_deploy.detect_archive import detect_archive
         from asca_pillars.scans.find_scans import name_scans
