@@ -51,7 +51,7 @@ def _onnx_makes_nothing_twice(tmp_path_factory: pytest.TempPathFactory) -> Itera
     if "torch" not in sys.modules:  # tests that do without need not wait for it
         yield
         return
-    from tests.kept_exports import exports_kept
+    from tests.helpers.kept_exports import exports_kept
 
     with pytest.MonkeyPatch.context() as patch, exports_kept(tmp_path_factory):
         with contextlib.suppress(ImportError):  # a torch that has it elsewhere: exports only take longer

@@ -74,7 +74,7 @@ from asca_pillars.data.insertion.free_space import find_free_space
 from asca_pillars.data.kitti.calibration import in_image
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.geometry.frame_change import FrameChange
-from tests.scenes import CALIBRATION
+from tests.helpers.scenes import CALIBRATION
 
 points = read_scan(sample_scan_path()).points
 found = Detector()(points)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.documentation import DOCS, Block, blocks, help_of, run, write_files
+from tests.helpers.documentation import DOCS, Block, blocks, help_of, run, write_files
 
 PAGES = {str(page.relative_to(DOCS)): page for page in sorted(DOCS.rglob("*.md"))}
 RECORDS = {"MODEL_CARD.md", "PERFORMANCE.md", "RESULTS.md"}

@@ -10,7 +10,7 @@ import pytest
 from asca_pillars.base.files import atomic_directory, atomic_path
 from asca_pillars.base.locks import recover
 from asca_pillars.base.own_files import require_replaceable
-from tests.bundle_folder import EXPORT, names, old_bundle
+from tests.helpers.bundle_folder import EXPORT, names, old_bundle
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="locks")
 

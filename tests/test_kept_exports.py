@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from tests.kept_exports import digest
+from tests.helpers.kept_exports import digest
 
 EXAMPLE = (torch.zeros(2, 3),)
 

@@ -2,28 +2,18 @@
 
 import ast
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-PACKAGES = (ROOT / "asca_pillars", ROOT / "deploy" / "asca_deploy", ROOT / "export" / "asca_export")
+from tests.helpers.package_imports import PACKAGES, ROOT, imports
+
 BLOCK = re.search(r"```text\n(.*?)```", (ROOT / "docs" / "ARCHITECTURE.md").read_text(encoding="utf-8"), re.DOTALL)
 assert BLOCK is not None
 LAYERS = [set(line.split("  ")[0].split()) for line in BLOCK[1].splitlines()]
 """Rooms of each layer: what is in one of them imports from those before it."""
 LAYER_OF = {room: number for number, layer in enumerate(LAYERS) for room in layer}
 NEEDS_TORCH = {"ablation", "asca_export", "cli", "models", "training"}
-
-
-def imports(path: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: imports are absolute"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def modules_read(path: Path, known: set[str]) -> set[str]:
@@ -114,3 +104,13 @@ def test_a_wrong_import_is_found(tmp_path: Path, place: str, line: str) -> None:
     path.parent.mkdir(parents=True)
     path.write_text(f"import numpy\nfrom asca_pillars.base.errors import AscaError\n{line}\n")
     assert len(upward(path, tmp_path / "asca_pillars")) == 1
+
+
+def test_tests_share_helpers_and_not_each_other() -> None:
+    shared = {
+        (path.relative_to(ROOT).as_posix(), name)
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for name in imports(path)
+        if re.search(r"^tests\..*\btest_\w+(\.\w+)?$", name) and path.stem not in name.split(".")
+    }
+    assert shared == set(), "move what both use to a module beside them, or to tests/helpers"

@@ -23,9 +23,9 @@ from tests.cli.short_drive import SCANS as DRIVE_SCANS
 from tests.cli.short_drive import write_drive
 from tests.deploy.conftest import make_scan, write_bundle
 from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.saved_checkpoint import save_checkpoint
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG
+from tests.helpers.saved_checkpoint import save_checkpoint
+from tests.helpers.scenes import write_dataset
+from tests.helpers.tiny_run import CONFIG
 
 
 class Steps:

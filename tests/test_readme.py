@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from asca_deploy import sample_scan_path
-from tests.documentation import help_of
+from tests.helpers.documentation import help_of
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

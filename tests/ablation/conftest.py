@@ -8,7 +8,7 @@ import pytest
 
 from asca_pillars.ablation import ablation_runs
 from asca_pillars.cli import ablate_steps
-from tests.in_process import run_here
+from tests.helpers.in_process import run_here
 
 
 @pytest.fixture

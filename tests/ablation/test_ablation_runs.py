@@ -20,8 +20,8 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.cli import ablate_steps
 from asca_pillars.cli.ablate import ablate
 from asca_pillars.config.tree import load_config, pillar_spec
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG
+from tests.helpers.scenes import write_dataset
+from tests.helpers.tiny_run import CONFIG
 
 
 @pytest.fixture

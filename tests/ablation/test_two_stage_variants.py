@@ -18,8 +18,8 @@ from asca_pillars.config.tree import load_config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.training.loop import train
+from tests.helpers.scenes import write_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SETTINGS, tiny_config
-from tests.scenes import write_dataset
 
 FEW_BALLS = dataclasses.replace(  # each takes its share of the export
     MODEL,

@@ -11,7 +11,7 @@ import pytest
 
 from asca_pillars.base.errors import OutputError
 from asca_pillars.base.files import atomic_directory, atomic_path, file_inside, portable_name, remove_directory
-from tests.bundle_folder import EXPORT, names, old_bundle
+from tests.helpers.bundle_folder import EXPORT, names, old_bundle
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:

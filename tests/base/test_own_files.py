@@ -25,7 +25,7 @@ from asca_pillars.base.own_files import (
     starting_with,
 )
 from asca_pillars.pictures.visualize import write_png
-from tests.bundle_folder import EXPORT, names, old_bundle
+from tests.helpers.bundle_folder import EXPORT, names, old_bundle
 
 REPORT = json_object("subject", "results", protocol="waymo")
 ABOUT = {"simulation.json": json_object("seed")}

@@ -6,7 +6,7 @@ import pytest
 
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import load_config
-from tests.config_files import refusal, write
+from tests.helpers.config_files import refusal, write
 
 
 def test_overrides_win(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ import yaml
 from asca_deploy import sample_scan_path
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
-from tests.socket_filter import NOT_HERE
-from tests.test_layout import PACKAGES, ROOT, imports
+from tests.helpers.package_imports import PACKAGES, ROOT, imports
+from tests.helpers.socket_filter import NOT_HERE
 
 FILTER = Path(__file__).parents[1] / "socket_filter.py"
 KEPT = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "OPENBLAS_CORETYPE")
@@ -198,8 +198,8 @@ def test_commands_of_the_runtime(fresh: Fresh, command: tuple[object, ...], resu
 
 def test_training_and_export(fresh: Fresh, tmp_path: Path) -> None:
     from tests.export.tiny import SCANS
-    from tests.scenes import write_dataset
-    from tests.training.test_loop import CONFIG
+    from tests.helpers.scenes import write_dataset
+    from tests.helpers.tiny_run import CONFIG
 
     data, scans = write_dataset(tmp_path / "data", 3), tmp_path / "scans"
     scans.mkdir()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.memory import CHUNK, CYCLE, crops, cycle_levels
-from tests.scenes import make_scene
+from tests.helpers.scenes import make_scene
 
 COUNTS = np.arange(CYCLE, 6 * CYCLE, CHUNK, dtype=np.float64)
 UPS_AND_DOWNS = 300 + np.abs(np.random.default_rng(0).normal(0, 2, len(COUNTS)))

@@ -12,8 +12,8 @@ from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
 from benchmarks.padded import PaddedDetector
-from tests.scenes import make_scene
-from tests.training.test_loop import CONFIG
+from tests.helpers.scenes import make_scene
+from tests.helpers.tiny_run import CONFIG
 
 
 def network(cpa: CpaReading) -> tuple:

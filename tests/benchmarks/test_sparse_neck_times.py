@@ -11,7 +11,7 @@ from asca_deploy.bundle import PillarBundle
 from asca_deploy.manifest import load_pillar_bundle
 from benchmarks.host_path import camera_view, host_path, report
 from benchmarks.sparse_neck import compare_views, export_both
-from tests.scenes import make_scene
+from tests.helpers.scenes import make_scene
 
 CONFIG = """
 name: tiny

@@ -7,7 +7,7 @@ import pytest
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
 from tests.cli.short_drive import write_drive
-from tests.scenes import write_dataset
+from tests.helpers.scenes import write_dataset
 
 
 @pytest.fixture

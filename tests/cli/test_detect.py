@@ -13,7 +13,7 @@ from asca_pillars.base.errors import OutputError, ScanError
 from asca_pillars.cli.detect import detect
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.scans.scan_reader import read_scan, write_scan
-from tests.scenes import write_dataset
+from tests.helpers.scenes import write_dataset
 
 POINTS = read_scan(sample_scan_path()).points[::10].copy()
 

@@ -5,7 +5,7 @@ import json
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from asca_pillars.base.installation import install_command
 from asca_pillars.cli.detect import detect
 from asca_pillars.cluster.shards import Outcome, Shard
 from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.cli.local_cluster import Here
 from tests.deploy.conftest import make_scan, write_bundle
 
 SCANS = 40
@@ -47,26 +48,6 @@ def alone(bundle: Path, scans: Path, tmp_path_factory: pytest.TempPathFactory) -
     with pytest.raises(ScanError, match="1 of 40"):
         detect([scans], out=out, bundle=bundle, threads=1, pictures=False)
     return (out / "detections.jsonl").read_bytes()
-
-
-class Here:
-    """Runs shards in this process instead of a cluster, and remembers which."""
-
-    def __init__(self) -> None:
-        self.begun: list[Shard] = []
-        self.job: Callable[[Shard], Any]
-        self.end: Callable[[Shard], Iterator[Outcome[Any]]] = lambda shard: iter([self.done(shard)])
-
-    def __call__(
-        self, job: Callable[[Shard], Any], shards: Sequence[Shard], address: str, **_: Any
-    ) -> Iterator[Outcome[Any]]:
-        self.job = job
-        for shard in shards:
-            self.begun.append(shard)
-            yield from self.end(shard)
-
-    def done(self, shard: Shard) -> Outcome[Any]:
-        return Outcome(shard, result=self.job(shard))
 
 
 @pytest.fixture

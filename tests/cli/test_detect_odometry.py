@@ -8,8 +8,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.base.errors import ConfigError, ScanError
-from tests.cli.short_drive import POINTS, SCANS
-from tests.cli.test_detect_recording import run
+from tests.cli.short_drive import POINTS, SCANS, run
 from tests.scans.recordings.cloud_recordings import laid_out, odometry_message, stamps, write_mcap
 
 

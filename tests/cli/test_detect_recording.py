@@ -30,10 +30,10 @@ from asca_pillars.cli.detect import detect
 from asca_pillars.data.boxes.box_records import read_frames
 from asca_pillars.data.kitti import KittiSplit
 from benchmarks.made_recordings import write_recording
-from tests.cli.short_drive import POINTS, SCANS
-from tests.in_process import run_here
+from tests.cli.short_drive import POINTS, SCANS, run
+from tests.helpers.in_process import run_here
+from tests.helpers.scenes import write_dataset
 from tests.scans.recordings.cloud_recordings import laid_out, stamps, transform_message, write_mcap
-from tests.scenes import write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +41,6 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     times = stamps(3)
     messages = [(times[0], laid_out(POINTS)), (times[1], b"torn"), (times[2], laid_out(POINTS))]
     return write_mcap(tmp_path_factory.mktemp("torn") / "torn.mcap", {"/lidar": messages})
-
-
-def run(path: Path, out: Path, **options: Any) -> list[dict[str, Any]]:
-    detect([path], out=out, threads=1, **options)
-    return [json.loads(line) for line in (out / "detections.jsonl").read_text().splitlines()]
 
 
 def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

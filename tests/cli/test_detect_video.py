@@ -16,8 +16,8 @@ from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.video import is_own_video
 from asca_pillars.scans.scan_reader import write_scan
 from tests.cli.short_drive import POINTS, SCANS
-from tests.gallery_cards import cards, sources, title
-from tests.pictures.test_video import needs_encoder
+from tests.helpers.gallery_cards import cards, sources, title
+from tests.helpers.video_encoder import needs_encoder
 
 
 def frames(path: Path) -> list[np.ndarray]:

@@ -15,19 +15,17 @@ import torch
 from numpy.testing import assert_allclose
 
 from asca_deploy import default_bundle_path
-from asca_deploy.evaluate import Protocol
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.base.errors import AscaError
 from asca_pillars.base.installation import install_command
-from asca_pillars.cli import eval as command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.scans.scan_reader import read_scan, write_scan
-from tests.gallery_cards import cards, title
-from tests.saved_checkpoint import save_checkpoint
-from tests.scenes import SPEC
-from tests.training.test_loop import CONFIG
+from tests.cli.eval_runs import evaluate, refusal
+from tests.helpers.gallery_cards import cards, title
+from tests.helpers.saved_checkpoint import save_checkpoint
+from tests.helpers.scenes import SPEC
+from tests.helpers.tiny_run import CONFIG
 
 BASE_INSTALL = """
 import sys
@@ -45,53 +43,6 @@ sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in s
 from asca_pillars.cli.eval import evaluate
 evaluate(predictions=Path("det"), labels=Path("gt"), out=Path("out"))
 """
-
-
-def evaluate(
-    model: Path | None = None,
-    *,
-    data: Path | None = None,
-    predictions: Path | None = None,
-    labels: Path | None = None,
-    out: Path,
-    json_path: Path | None = None,
-    gallery: int | None = 0,
-    compare: Path | None = None,
-    score: list[str] | None = None,
-    min_score: float = 0.05,
-    provider: str = "cpu",
-    precision: str | None = None,
-    threads: int | None = 1,
-    protocol: Protocol = "kitti",
-    split: str | None = None,
-) -> dict:
-    """Run the command; what it wrote as JSON."""
-    command.evaluate(
-        model,
-        data=data,
-        split=split,
-        predictions=predictions,
-        labels=labels,
-        out=out,
-        json=json_path,
-        gallery=gallery,
-        compare=compare,
-        score=score,
-        min_score=min_score,
-        protocol=protocol,
-        provider=provider,
-        precision=precision,
-        threads=threads if predictions is None else None,
-    )
-    return json.loads((out / ("report.json" if protocol == "kitti" else "waymo.json")).read_text())
-
-
-def refusal(tmp_path: Path, **arguments) -> str:
-    with pytest.raises(AscaError) as caught:
-        evaluate(**({"out": tmp_path / "out"} | arguments))
-    message = str(caught.value)
-    assert "\n" not in message and not (tmp_path / "out" / "report.json").exists()
-    return message.replace(f"{tmp_path}/", "")
 
 
 def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,9 +16,9 @@ from asca_pillars.evaluation.model import Model
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.earlier_evaluation import earlier_predictions
-from tests.in_process import invoke
-from tests.scenes import write_dataset
+from tests.helpers.earlier_evaluation import earlier_predictions
+from tests.helpers.in_process import invoke
+from tests.helpers.scenes import write_dataset
 
 
 @pytest.fixture

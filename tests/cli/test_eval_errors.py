@@ -10,7 +10,7 @@ from asca_pillars.base.errors import AscaError
 from asca_pillars.data.boxes.box_records import json_line, read_frames
 from asca_pillars.data.kitti import write_image_set
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.in_process import invoke
+from tests.helpers.in_process import invoke
 
 FILES = {"errors.html", "errors.json", "errors.md"}
 

@@ -8,8 +8,8 @@ import pytest
 
 from asca_deploy.evaluate import Protocol
 from asca_pillars.base.errors import OutputError
-from tests.cli.test_eval import evaluate, refusal
-from tests.earlier_evaluation import earlier_predictions
+from tests.cli.eval_runs import evaluate, refusal
+from tests.helpers.earlier_evaluation import earlier_predictions
 
 
 def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
-from tests.cli.test_eval import evaluate, refusal
+from tests.cli.eval_runs import evaluate, refusal
 
 
 def test_waymos_metric_of_labels_against_themselves(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from asca_pillars.models.checkpoint import load_checkpoint
-from tests.in_process import run_here
+from tests.helpers.in_process import run_here
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
 
 

@@ -22,9 +22,9 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.main import app
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.scans.scan_reader import read_scan, write_scan
-from tests.in_process import run_here
-from tests.scenes import make_scene, write_dataset
-from tests.training.test_loop import CONFIG
+from tests.helpers.in_process import run_here
+from tests.helpers.scenes import make_scene, write_dataset
+from tests.helpers.tiny_run import CONFIG
 
 WITHOUT_TORCH = """
 import sys

@@ -14,7 +14,7 @@ from asca_pillars.base import errors
 from asca_pillars.cli import doctor_checks
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.scans.scan_reader import write_scan
-from tests.in_process import run_here
+from tests.helpers.in_process import run_here
 
 DEPLOY = Path(__file__).parents[2] / "docs" / "guide" / "deploy.md"
 KINDS: dict[int, set[type[errors.AscaError]]] = {

@@ -17,8 +17,8 @@ from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.pictures.training_pictures import draw_training_frame
 from asca_pillars.pictures.visualize import class_color, read_image
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.in_process import invoke
-from tests.scenes import SPEC
+from tests.helpers.in_process import invoke
+from tests.helpers.scenes import SPEC
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))

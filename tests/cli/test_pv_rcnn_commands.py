@@ -9,12 +9,12 @@ import pytest
 from asca_deploy import detect_archive
 from asca_pillars.cli.detect import detect
 from asca_pillars.scans.scan_reader import write_scan
-from tests.cli.test_detect_archive import Here
-from tests.export.pv_rcnn.test_int8 import CALIBRATION, random_checkpoint
+from tests.cli.local_cluster import Here
+from tests.export.pv_rcnn.random_checkpoint import CALIBRATION, random_checkpoint
 from tests.export.tiny import SCANS
-from tests.in_process import run_here
-from tests.saved_checkpoint import save_checkpoint
-from tests.scenes import write_dataset
+from tests.helpers.in_process import run_here
+from tests.helpers.saved_checkpoint import save_checkpoint
+from tests.helpers.scenes import write_dataset
 
 
 def write_scans(folder: Path, scans: list[np.ndarray]) -> Path:

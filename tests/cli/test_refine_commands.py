@@ -12,8 +12,8 @@ from asca_pillars.cli.prepare import prepare
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.training.loop import train
 from tests.data.boxes.box_scenes import write_box_dataset
+from tests.helpers.scenes import write_dataset
 from tests.models.two_stage.tiny_refine import tiny_refine_config, write_first_stage
-from tests.scenes import write_dataset
 
 
 def test_prepare_computes_the_proposals_that_training_reads(tmp_path: Path) -> None:

@@ -19,8 +19,7 @@ from asca_deploy.recordings.rerun_file import is_own_rrd
 from asca_pillars.base.errors import ConfigError, OutputError, ScanError
 from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.colors import class_rgb
-from tests.cli.short_drive import SCANS
-from tests.cli.test_detect_recording import run
+from tests.cli.short_drive import SCANS, run
 from tests.scans.recordings.cloud_recordings import (
     clouds,
     compressed_image,

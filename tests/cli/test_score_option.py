@@ -11,7 +11,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.cli.options import read_scores
 from asca_pillars.evaluation.model import scores_by_class
 from asca_pillars.scans.scan_reader import read_scan
-from tests.in_process import run_here
+from tests.helpers.in_process import run_here
 
 BUNDLE = "asca_small_sim_int8"
 

@@ -20,9 +20,8 @@ from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.models.build import build_model
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import with_first_stage
-from tests.config_files import refusal, write
-
-CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+from tests.helpers.config_files import refusal, write
+from tests.helpers.shipped_configs import CONFIGS
 
 
 def test_defaults_are_the_paper_s() -> None:

@@ -13,7 +13,7 @@ from asca_pillars.data.augment import augment, flip_y, move_objects, rotate, sca
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import bev_intersection
-from tests.scenes import make_scene
+from tests.helpers.scenes import make_scene
 
 STILL = AugmentConfig(
     flip_probability=0,

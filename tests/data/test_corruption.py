@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.augment import FEWEST_POINTS, corrupt_objects, lose_reflectance
 from asca_pillars.geometry.boxes import points_in_boxes
-from tests.scenes import make_scene
+from tests.helpers.scenes import make_scene
 
 POINTS, BOXES, _ = make_scene(3)
 INSIDE = points_in_boxes(POINTS, BOXES)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from asca_pillars.data.frames import LabeledFrame, within_ranges
-from tests.scenes import GRID
+from tests.helpers.scenes import GRID
 
 
 def test_boxes_are_kept_by_their_center() -> None:

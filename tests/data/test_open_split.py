@@ -10,7 +10,7 @@ from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import labels_of_scan
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.scenes import write_dataset
+from tests.helpers.scenes import write_dataset
 
 
 def test_kitti(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.loop import train
-from tests.scenes import SPEC, write_dataset
+from tests.helpers.scenes import SPEC, write_dataset
 
 CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
 

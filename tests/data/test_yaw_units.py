@@ -15,8 +15,8 @@ from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.geometry.boxes import wrap_angle
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.in_process import invoke
-from tests.scenes import SPEC, write_dataset
+from tests.helpers.in_process import invoke
+from tests.helpers.scenes import SPEC, write_dataset
 
 CAR = "Car 0 0 0 500 100 600 200 2 1.8 4.5 -3 1.7 12 {yaw}"
 

@@ -30,7 +30,7 @@ from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.fuzz import damaged
 from benchmarks.fuzz_inputs import Kind, read_points, scan_seeds
 from tests.deploy import conftest as tiny
-from tests.scans import test_scan_reader as scan_files
+from tests.scans import scan_files
 from tests.scans.pcd_cases import CASES
 
 ROOT = Path(__file__).parents[2]

@@ -4,14 +4,12 @@ import json
 import os
 import re
 import shutil
-import time
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -25,12 +23,12 @@ from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_pillars.base.errors import BundleError, ConfigError, OutputError
 from asca_pillars.cli.main import app
 from asca_pillars.ops.pillar.prepare import PillarCounts
-from asca_pillars.pictures.colors import HEIGHT_RAMP, HEIGHT_SPAN_M, class_rgb, height_rgb
-from asca_pillars.pictures.visualize import class_color
+from asca_pillars.pictures.colors import HEIGHT_RAMP, HEIGHT_SPAN_M, class_rgb
 from asca_pillars.scans.ground_height import measured_mounting
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.deploy.chromium import CHROMIUM, Tab, file_server, open_tab
+from tests.deploy.page_driver import assert_drawn, failure, finished, move_slider, status
 
 ORT_WEB = os.environ.get("ASCA_ORT_WEB")
 """npm's package onnxruntime-web, a .tgz or its folder."""
@@ -39,6 +37,12 @@ SCORE_TOLERANCE = 0.02
 
 needs_ort_web = pytest.mark.skipif(not ORT_WEB, reason="needs ASCA_ORT_WEB, a .tgz of `npm pack onnxruntime-web`")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with open_tab(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
 
 
 @pytest.fixture
@@ -50,12 +54,6 @@ def made_up_package(tmp_path: Path) -> Path:
     for name in ORT_FILES:
         (folder / "dist" / name).write_bytes(b"code")
     return folder
-
-
-@pytest.fixture(scope="module")
-def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with open_tab(tmp_path_factory.mktemp("profile")) as tab:
-        yield tab
 
 
 @needs_ort_web
@@ -169,39 +167,6 @@ def set_sensor(tab: Tab, *, around: bool = False, axes: str = "", height: str = 
     tab.evaluate(f"(() => {{ const {names}; {fields}; sensor.dispatchEvent(new Event('change')); }})()")
 
 
-def finished(tab: Tab, scan: str) -> Any:
-    """What the link `Save boxes` gives, once the page has finished this scan."""
-    wait_for(tab, "done")
-    saved = json.loads(tab.evaluate("fetch(document.getElementById('save').href).then((file) => file.text())"))
-    assert saved["scan"] == scan
-    return saved
-
-
-def move_slider(tab: Tab, name: str, score: float) -> None:
-    slider = f"document.querySelector('#scores input[name={name}]')"
-    tab.evaluate(f"{slider}.value = {score}; {slider}.dispatchEvent(new Event('input'))")
-
-
-def failure(tab: Tab) -> str:
-    wait_for(tab, "failed")
-    return status(tab)
-
-
-def status(tab: Tab) -> str:
-    return str(tab.evaluate("document.getElementById('status').textContent"))
-
-
-def wait_for(tab: Tab, state: str) -> None:
-    time.sleep(0.1)  # a click is on its way
-    end = time.monotonic() + 200
-    found = None
-    while found not in ("done", "failed"):
-        assert time.monotonic() < end, "the page does not come to an end"
-        found = tab.evaluate("document.body?.dataset.state")
-        time.sleep(0.05)
-    assert found == state, tab.evaluate("document.getElementById('status').textContent")
-
-
 def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32], least: int = 4) -> None:
     expected = detector(points)
     assert len(expected) >= least
@@ -222,23 +187,6 @@ def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32], lea
     assert isinstance(expected.report.counts, PillarCounts)
     # The turned passes follow the ground, whose plane is found by other draws.
     assert saved["pillars"] == pytest.approx(expected.report.counts.pillars, rel=0 if detector.passes == 1 else 0.002)
-
-
-def assert_drawn(tab: Tab, path: Path, cars: int = 6) -> None:
-    """Points, boxes in the color of cars, and a label for each box."""
-    tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    tab.screenshot(path)
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    scene = picture[: int(tab.evaluate("document.getElementById('scene').clientHeight"))].astype(int)
-    ground, above = height_rgb(np.array([0.0, HEIGHT_SPAN_M]), 0.0)[:, ::-1] * 0.75  # of points that reflect nothing
-    for color in (ground, above):
-        assert (np.abs(scene - color).max(axis=2) < 14).sum() > 20
-    background, car = np.array([26, 20, 15]), np.array(class_color("Car"))  # blue, green, red
-    assert (np.abs(scene - background).max(axis=2) > 30).mean() > 0.02
-    assert (np.abs(scene - car).max(axis=2) < 12).sum() > 50
-    labels = tab.evaluate("document.getElementById('labels').innerText").split("\n")
-    assert sum(label.startswith("Car ") for label in labels) == cars
 
 
 def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_path: Path) -> None:

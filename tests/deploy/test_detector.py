@@ -14,7 +14,7 @@ from asca_pillars.base.errors import BundleError, ConfigError, ScanError
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.ops.pillar.prepare import PillarCounts
 from tests.deploy.conftest import STAGES, make_scan
-from tests.same_detections import same
+from tests.helpers.same_detections import same
 
 Points = NDArray[np.float32]
 

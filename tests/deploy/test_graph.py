@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,18 +11,9 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.providers import Provider
 from asca_pillars.base.errors import BundleError
 from tests.deploy.conftest import needs_openvino, sign
+from tests.deploy.spoiled_graph import respoil
 
 by_provider = pytest.mark.parametrize("provider", ["cpu", pytest.param("openvino", marks=needs_openvino)])
-
-
-def respoil(bundle: Path, graph: str, spoil: Callable[[onnx.ModelProto], None]) -> Path:
-    """Change a graph and sign it again, so that only its contents are wrong."""
-    good = load_pillar_bundle(bundle)
-    model = onnx.load(bundle / graph)
-    spoil(model)
-    onnx.save(model, bundle / graph)
-    sign(bundle, good)
-    return bundle
 
 
 def rename(model: onnx.ModelProto, old: str, new: str) -> None:

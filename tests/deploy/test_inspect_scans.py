@@ -15,8 +15,8 @@ from asca_pillars.cli.inspect import inspect
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
-from tests.in_process import invoke, run_here
-from tests.scenes import write_dataset
+from tests.helpers.in_process import invoke, run_here
+from tests.helpers.scenes import write_dataset
 
 POINTS = read_scan(sample_scan_path()).points[::4].copy()
 TURNED = np.column_stack([-POINTS[:, 1], POINTS[:, 0], POINTS[:, 2], POINTS[:, 3]])

@@ -18,22 +18,7 @@ from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import FEATURES
 from asca_pillars.ops.pillar.spec import PillarSpec
 from tests.deploy.conftest import sign
-
-
-def edit(bundle: Path, change: Callable[[dict[str, Any]], object]) -> Path:
-    """Change bundle.json by hand."""
-    data = json.loads((bundle / MANIFEST).read_text())
-    change(data)
-    (bundle / MANIFEST).write_text(json.dumps(data))
-    return bundle
-
-
-def assert_refused(bundle: Path, message: str) -> None:
-    with pytest.raises(BundleError, match=message) as caught:
-        load_pillar_bundle(bundle)
-    text = str(caught.value)
-    assert text.isprintable() and len(text) < 1500
-    assert str(bundle) in text  # whose fault it is
+from tests.deploy.edited_manifest import NOT_THE_GRAPHS, assert_refused, edit
 
 
 def test_round_trip(bundle_copy: Path) -> None:
@@ -74,9 +59,6 @@ def test_layout_of_a_uniform_grid_is_one_zone(tiny_bundle: Path) -> None:
     grid = PillarGrid(x_range_m=(3.0, 15.8), y_range_m=(-2.56, 1.28), v_max_m=0.16, zones=1)
     layout = bundle_to_json(replace(load_pillar_bundle(tiny_bundle), spec=PillarSpec(grid=grid)))["pillar"]["layout"]
     assert layout["x_zones"] == [{"start_m": 3.0, "pillar_m": 0.16, "pillars": 80}]
-
-
-NOT_THE_GRAPHS = r"`{}` is not the one that \w+\.onnx was exported with; .*export"
 
 
 @pytest.mark.parametrize(

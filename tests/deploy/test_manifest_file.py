@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from asca_deploy.bundle import MANIFEST, SCHEMA_VERSION
-from tests.deploy.test_manifest import assert_refused, edit
+from tests.deploy.edited_manifest import assert_refused, edit
 
 
 @pytest.mark.parametrize("version", [None, "1", 1.0, True, [1]])

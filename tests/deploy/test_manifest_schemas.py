@@ -18,7 +18,7 @@ from asca_deploy.manifest import graph_files, load_bundle, load_pillar_bundle
 from asca_deploy.shipped import shipped_bundles
 from asca_pillars.base.errors import BundleError
 from asca_pillars.base.schema import to_dict
-from tests.deploy.test_manifest import NOT_THE_GRAPHS, assert_refused, edit
+from tests.deploy.edited_manifest import NOT_THE_GRAPHS, assert_refused, edit
 
 
 def as_schema_2(folder: Path) -> Path:

@@ -13,8 +13,8 @@ from asca_pillars.base.errors import BundleError, ProviderError
 from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
 from tests.deploy.conftest import needs_openvino
-from tests.deploy.test_graph import respoil
-from tests.in_process import run_here
+from tests.deploy.spoiled_graph import respoil
+from tests.helpers.in_process import run_here
 
 
 def add_first(model: onnx.ModelProto, name: str, nodes: list[onnx.NodeProto], **constants: float) -> None:

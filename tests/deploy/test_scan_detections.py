@@ -9,8 +9,8 @@ import pytest
 from asca_deploy.scan_detections import ScanDetections
 from asca_pillars.detection.detections import FrameReport, ScanCounts
 from asca_pillars.geometry.ranges import Ranges
-from tests.cameras import make_calibration
-from tests.sent import sent
+from tests.helpers.cameras import make_calibration
+from tests.helpers.sent import sent
 
 REPORT = FrameReport({"input": 1.0}, 0.0, ScanCounts(500, 0, 0), 0, 0, 0, ())
 THREE = ScanDetections(

@@ -13,7 +13,7 @@ from asca_deploy.pillar.pipeline import CanvasBackbone, PillarPipeline
 from asca_deploy.stream import overlapped
 from asca_pillars.base.errors import ScanError
 from tests.deploy.conftest import make_scan
-from tests.same_detections import same
+from tests.helpers.same_detections import same
 
 Points = NDArray[np.float32]
 PATIENCE_S = 20  # only a test that fails waits so long

@@ -25,7 +25,7 @@ from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
 from tests.deploy.chromium import CHROMIUM, open_tab
-from tests.deploy.test_browser_page import assert_drawn, failure, finished, move_slider
+from tests.deploy.page_driver import assert_drawn, failure, finished, move_slider
 
 POINTS = read_scan(sample_scan_path()).points[::2].copy()
 SMALL = RuntimeOptions(bundle="asca_small_sparse_sim_int8", threads=1)

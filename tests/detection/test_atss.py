@@ -12,7 +12,7 @@ from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES, make_anchors
 from asca_pillars.detection.targets import Targets, assign_targets
 from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from tests.detection.test_targets import ANCHORS, CAR, COUNT, CYCLIST, PEDESTRIAN, labelled_boxes, places
+from tests.detection.anchor_scenes import ANCHORS, CAR, COUNT, CYCLIST, PEDESTRIAN, labelled_boxes, places
 
 # Cells of 1 m with centers at 0, 1, ..., 8 m.
 SQUARE = make_anchors(np.arange(9.0), np.arange(9.0), KITTI_CLASSES)

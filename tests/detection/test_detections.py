@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.detection.detections import Detection, Detections
-from tests.sent import sent
+from tests.helpers.sent import sent
 
 THREE = Detections(
     boxes=np.array([[3.0, -4.0, 0, 4, 2, 1.5, 0], [8, 6, 0, 1, 1, 2, 1], [-5, 12, 0, 2, 1, 2, 2]], np.float32),

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.detection.decode import rotated_nms
-from tests.geometry.test_overlap import bev_iou_twin, random_boxes
+from tests.geometry.overlap_oracles import bev_iou_twin, random_boxes
 
 
 def nms_twin(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> list[int]:

@@ -8,7 +8,7 @@ import pytest
 from asca_pillars.detection.decode import HeadMaps, PostProcess, decode
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.proposals import ProposalSettings, best_of_each_class, propose
-from tests.scenes import SPEC
+from tests.helpers.scenes import SPEC
 
 
 def found(labels: list[int], scores: list[float]) -> Detections:

@@ -6,21 +6,23 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES, make_anchors
+from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES
 from asca_pillars.detection.targets import Targets, assign_targets
 from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from asca_pillars.ops.pillar.grid import PillarGrid
-
-# Rectangular, asymmetric, both minima off zero. Head cells are 0.32 m along y and 0.64, 0.32, 0.16 m along x in
-# the zones that begin at 2.00, 4.56 and 7.12 m: 16 rows, 4 + 8 + 16 columns.
-GRID = PillarGrid(x_range_m=(2.0, 9.68), y_range_m=(-1.92, 3.2))
-ANCHORS = make_anchors(*GRID.head_centers_m(), KITTI_CLASSES)
-ROWS, COLUMNS, COUNT = 16, 28, 6
-CAR, PEDESTRIAN, CYCLIST = range(3)
-SIZES = {CAR: (3.9, 1.6, 1.56), PEDESTRIAN: (0.8, 0.6, 1.73), CYCLIST: (1.76, 0.6, 1.73)}
+from tests.detection.anchor_scenes import (
+    ANCHORS,
+    CAR,
+    COLUMNS,
+    COUNT,
+    CYCLIST,
+    PEDESTRIAN,
+    ROWS,
+    SIZES,
+    labelled_boxes,
+    places,
+)
 
 
 def assign(*labelled: tuple[int, list[float]]) -> Targets:
@@ -32,11 +34,6 @@ def box_at(row: int, column: int, label: int = PEDESTRIAN, dx: float = 0.0, yaw:
     """A box of its class's anchor size, `dx` beside the center of a head cell."""
     x, y = ANCHORS[row, column, 0, :2]
     return [x + dx, y, -0.9, *SIZES[label], yaw]
-
-
-def places(targets: Targets, state: int) -> set[tuple[int, ...]]:
-    """(row, column, anchor) wherever the state is this."""
-    return set(map(tuple, np.argwhere(targets.state == state).tolist()))
 
 
 def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
@@ -64,19 +61,6 @@ def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[
             excused = any(labels[box] == IGNORED and row[box] >= spec.negative_iou for box in range(len(boxes)))
             states.append(-1 if excused else 0)
     return states, matches
-
-
-@st.composite
-def labelled_boxes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
-    """Up to six boxes in and around the grid, about as large as one of the classes."""
-    labels = draw(st.lists(st.sampled_from([IGNORED, CAR, PEDESTRIAN, CYCLIST]), max_size=6))
-    boxes = []
-    for label in labels:
-        like = label if label != IGNORED else draw(st.sampled_from([CAR, PEDESTRIAN, CYCLIST]))
-        stretch = [draw(st.floats(0.6, 1.8)) for _ in range(3)]
-        center = draw(st.floats(-2.0, 14.0)), draw(st.floats(-5.0, 6.0)), draw(st.floats(-2.0, 0.5))
-        boxes.append([*center, *np.multiply(SIZES[like], stretch), draw(st.floats(-math.pi, 3.14))])
-    return np.array(boxes, np.float32).reshape(-1, 7), np.array(labels, np.int64)
 
 
 @settings(max_examples=40)

@@ -11,8 +11,8 @@ from asca_pillars.data.kitti.kitti_labels import KittiObject
 from asca_pillars.evaluation.gallery import Judged, most_different_frames, worst_frames, write_gallery
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches, matches_at_score
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
-from tests.gallery_cards import cards, sources, title
-from tests.scenes import GRID, write_dataset
+from tests.helpers.gallery_cards import cards, sources, title
+from tests.helpers.scenes import GRID, write_dataset
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 RED, MAGENTA, GREEN = (70, 70, 255), (255, 110, 255), (90, 230, 90)

@@ -9,7 +9,7 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
-from tests.scenes import make_scene, write_dataset
+from tests.helpers.scenes import make_scene, write_dataset
 
 CAR = "Car -1 -1 -1.57 600.00 150.00 650.00 200.00 1.50 1.60 3.90 1.00 1.70 20.00 -1.57"
 

@@ -18,14 +18,7 @@ from asca_pillars.evaluation.waymo import (
     mean_over_classes,
     waymo_detection,
 )
-
-NAMES = ("Vehicle", "Pedestrian", "Cyclist")
-SIZES = np.array([[4.6, 1.9, 1.7], [0.9, 0.8, 1.75], [1.8, 0.8, 1.75]])
-VEHICLE, PEDESTRIAN, CYCLIST = 0, 1, 2
-
-
-def box(x: float, y: float, label: int = VEHICLE, yaw: float = 0.0) -> list[float]:
-    return [x, y, 0.0, *SIZES[label], yaw]
+from tests.evaluation.waymo_objects import CYCLIST, NAMES, PEDESTRIAN, SIZES, VEHICLE, box, score_of
 
 
 def labelled(*boxes: list[float], label: int = VEHICLE, levels: list[int] | None = None) -> WaymoTruth:
@@ -38,18 +31,6 @@ def found(*scored: tuple[float, list[float]], label: int = VEHICLE) -> Detection
     boxes = np.array([item for _, item in scored], np.float32).reshape(-1, 7)
     scores = np.array([score for score, _ in scored], np.float32)
     return Detections(boxes, scores, np.full(len(scored), label), NAMES)
-
-
-def score_of(
-    truth: WaymoTruth | list[WaymoTruth],
-    detections: Detections | list[Detections],
-    level: int = 2,
-    range_m: tuple[float, float] = EVERYWHERE,
-    name: str = "Vehicle",
-) -> WaymoScore:
-    frames = truth if isinstance(truth, list) else [truth]
-    results = waymo_detection(frames, detections if isinstance(detections, list) else [detections])
-    return next(item for item in results if (item.class_name, item.level, item.range_m) == (name, level, range_m))
 
 
 def crowded_frames(seed: int, frames: int) -> tuple[list[WaymoTruth], list[Detections]]:

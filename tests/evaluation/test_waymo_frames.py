@@ -15,7 +15,7 @@ from asca_pillars.evaluation.waymo import evaluated_classes, upright_boxes, waym
 from asca_pillars.geometry.boxes import corners
 from asca_pillars.geometry.overlap import iou_3d
 from tests.evaluation.kitti.kitti_objects import CAR, DONT_CARE, beside, hit
-from tests.scenes import write_dataset
+from tests.helpers.scenes import write_dataset
 
 
 def scored(truth: list[KittiObject], found: list[KittiObject]) -> ScoredFrames:

@@ -12,7 +12,7 @@ from asca_pillars.evaluation.waymo import (
     WaymoTruth,
 )
 from asca_pillars.geometry.overlap import iou_3d
-from tests.evaluation.test_waymo import NAMES, PEDESTRIAN, VEHICLE, box, score_of
+from tests.evaluation.waymo_objects import NAMES, PEDESTRIAN, VEHICLE, box, score_of
 
 
 def naive(truth: list[WaymoTruth], detections: list[Detections], name: str, level: int) -> tuple[float, float] | None:

@@ -10,7 +10,7 @@ from asca_export.pillar.export import export_pillar_bundle
 from asca_export.proven_bundle import ExportOptions
 from asca_pillars.config.pillar import CpaReading
 from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.made_once import made_once
+from tests.helpers.made_once import made_once
 
 
 @pytest.fixture(scope="session")

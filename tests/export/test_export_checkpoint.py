@@ -9,7 +9,7 @@ from asca_export.export_checkpoint import open_source, run_environment
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.system import describe_environment
 from tests.export.tiny import tiny_checkpoint
-from tests.saved_checkpoint import save_checkpoint
+from tests.helpers.saved_checkpoint import save_checkpoint
 
 
 @pytest.fixture

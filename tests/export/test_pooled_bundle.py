@@ -15,7 +15,7 @@ from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.scan_detector import ScanDetector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
-from tests.scenes import SPEC
+from tests.helpers.scenes import SPEC
 
 POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled")).with_score_threshold(0.02)
 

@@ -20,18 +20,12 @@ from asca_pillars.base.errors import ConfigError, ProviderError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
-from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
-from tests.same_detections import same
-from tests.scenes import SPEC
+from tests.export.tiny import CALIBRATION, SCANS
+from tests.export.tiny_sparse import NOTHING, ONE_POINT, sparse_checkpoint
+from tests.helpers.same_detections import same
+from tests.helpers.scenes import SPEC
 
 STAGES = ("pillarize", "encode", "tables", "neck+head", "decode")
-NOTHING = np.empty((0, 4), np.float32)
-ONE_POINT = np.array([[10.0, 0.5, -1.0, 0.3]], np.float32)
-
-
-def sparse_checkpoint(rule: str) -> Checkpoint:
-    spec = SPEC.with_score_threshold(0.02)  # random weights are never sure of anything
-    return tiny_checkpoint("channel", spec, neck="sparse", active_cells=rule)
 
 
 @pytest.fixture(scope="module", params=["sub", "fine"])

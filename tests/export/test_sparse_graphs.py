@@ -31,7 +31,7 @@ from asca_pillars.models.pillar.preparation import Placement, batch_pillars
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder, NeckRulebooks, rulebook_inputs
 from asca_pillars.ops.pillar.prepare import Pillars
 from tests.export.tiny import NETWORK, SCANS, tiny_checkpoint
-from tests.scenes import SPEC
+from tests.helpers.scenes import SPEC
 
 
 def sparse_detector(rule: MaskRule) -> PillarDetector:

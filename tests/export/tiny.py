@@ -10,7 +10,7 @@ from asca_pillars.config.tree import Config
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
 from asca_pillars.ops.pillar.spec import PillarSpec
-from tests.scenes import SPEC, make_scene
+from tests.helpers.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
 SCANS = [make_scene(seed)[0] for seed in range(8)]

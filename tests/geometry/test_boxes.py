@@ -9,17 +9,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from asca_pillars.geometry.boxes import corners, footprints, points_in_boxes, wrap_angle
+from tests.geometry.drawn_boxes import random_boxes
 
 # A car at (10, 2), 4 m long and 2 m wide, heading forward, and the same heading left.
 FORWARD = [10.0, 2.0, -1.0, 4.0, 2.0, 1.5, 0.0]
 LEFT = [10.0, 2.0, -1.0, 4.0, 2.0, 1.5, math.pi / 2]
-
-
-def random_boxes(seed: int, count: int) -> np.ndarray:
-    """(count, 7) float32."""
-    rng = np.random.default_rng(seed)
-    low, high = [1.0, -8.0, -2.0, 0.3, 0.3, 0.5, -math.pi], [30.0, 4.0, 0.0, 6.0, 3.0, 3.0, math.pi]
-    return rng.uniform(low, high, (count, 7)).astype(np.float32)
 
 
 def test_footprints_by_hand() -> None:

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from asca_pillars.geometry.boxes import footprints, points_in_boxes, wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
-from tests.geometry.test_boxes import random_boxes
+from tests.geometry.drawn_boxes import random_boxes
 
 angles = st.floats(-10, 10)
 shifts = st.tuples(*[st.floats(-50, 50)] * 3)

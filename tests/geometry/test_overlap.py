@@ -4,11 +4,9 @@ import math
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.overlap import (
     aligned_bev_iou,
     bev_intersection,
@@ -18,32 +16,13 @@ from asca_pillars.geometry.overlap import (
     paired_bev_touch,
     paired_iou_3d,
 )
+from tests.geometry.overlap_oracles import bev_iou_twin, intersection_twin, moved, polygon, random_boxes
 
 # Places up to 70 m away, sizes from a thin plate to a lorry.
 CENTERS = st.tuples(st.floats(-70, 70), st.floats(-70, 70), st.floats(-2, 1))
 SIZES = st.tuples(*[st.sampled_from([1e-3, 0.6, 1.6, 4.0, 20.0]) | st.floats(0.01, 20)] * 3)
 YAWS = st.floats(-7, 7) | st.sampled_from([k * math.pi / 4 for k in range(-4, 5)] + [1e-320, 1e-9])
 BOXES = st.builds(lambda c, s, yaw: np.array([*c, *s, yaw]), CENTERS, SIZES, YAWS)
-
-
-def moved(box: np.ndarray, dx: float = 0, dy: float = 0, dz: float = 0, turn: float = 0) -> np.ndarray:
-    """The box, or boxes, moved in the LiDAR frame and turned."""
-    return box + np.array([dx, dy, dz, 0, 0, 0, turn])
-
-
-def polygon(box: np.ndarray) -> shapely.Polygon:
-    return shapely.Polygon(footprints(box[None].astype(np.float64))[0])
-
-
-def intersection_twin(a: np.ndarray, b: np.ndarray) -> float:
-    a, b = a.astype(np.float64), b.astype(np.float64)
-    # About the origin: at 70 m shapely's own rounding would be larger than ours.
-    return float(polygon(moved(a, *-a[:2])).intersection(polygon(moved(b, *-a[:2]))).area)
-
-
-def bev_iou_twin(a: np.ndarray, b: np.ndarray) -> float:
-    shared = intersection_twin(a, b)
-    return float(shared / (a[3] * a[4] + b[3] * b[4] - shared))
 
 
 def iou_3d_twin(a: np.ndarray, b: np.ndarray) -> float:
@@ -128,13 +107,6 @@ def test_overlaps_by_hand() -> None:
     assert iou_3d(unit, moved(unit, dx=1, dz=1))[0, 0] == pytest.approx(2 / 14)
     # One above the other.
     assert iou_3d(unit, moved(unit, dz=2))[0, 0] == 0.0
-
-
-def random_boxes(seed: int, count: int, spread_m: float) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    low = [30.0, -10.0, -1.5, 0.5, 0.5, 1.0, -math.pi]
-    high = [30.0 + spread_m, -10.0 + spread_m / 2, -0.5, 5.0, 2.5, 2.0, math.pi]
-    return rng.uniform(low, high, (count, 7)).astype(np.float32)
 
 
 def test_rows_are_a_and_columns_are_b() -> None:

@@ -15,7 +15,7 @@ from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.checkpoint_file import save_weights, weights_sha256
 from asca_pillars.models.openpcdet.import_checkpoint import read_foreign
 from asca_pillars.training.checkpoints import LAST, checkpoint_to_resume
-from tests.saved_checkpoint import checkpoint_content
+from tests.helpers.saved_checkpoint import checkpoint_content
 
 NARROW = Config(model=PillarModel(network=NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)))
 

@@ -14,9 +14,9 @@ from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.detection.targets import Targets
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pv_rcnn.network import build_pv_rcnn_detector
+from tests.helpers.scenes import SPEC
 from tests.models.pv_rcnn import tiny_pv_rcnn
 from tests.models.pv_rcnn.tiny_pv_rcnn import frame
-from tests.scenes import SPEC
 
 POST = PostProcess(nms_iou=0.1)
 

@@ -8,8 +8,8 @@ from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.models.scan_detector import ScanDetector
-from tests.scenes import make_scene
-from tests.training.test_loop import CONFIG
+from tests.helpers.scenes import make_scene
+from tests.helpers.tiny_run import CONFIG
 
 
 def test_scans_one_by_one_are_what_a_batch_of_them_gives() -> None:

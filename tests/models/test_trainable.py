@@ -15,11 +15,11 @@ from asca_pillars.models.build import build_model
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.models.trainable import Movable, Trainable
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
+from tests.helpers.scenes import SPEC, write_dataset
+from tests.helpers.second_device import SecondDevice, move_weights, on_gpu
+from tests.helpers.tiny_run import CONFIG, NETWORK
 from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, VARIANTS, batch, frame, tiny_detector
 from tests.models.two_stage.tiny_refine import opened_config, write_first_stage
-from tests.scenes import SPEC, write_dataset
-from tests.second_device import SecondDevice, move_weights, on_gpu
-from tests.training.test_loop import CONFIG, NETWORK
 
 PILLARS: dict[str, dict[str, Any]] = {
     **{f"CPA {cpa}": {"cpa": cpa} for cpa in ("none", "paper", "channel", "point", "linear")},

@@ -11,7 +11,7 @@ import pytest
 
 from asca_pillars.pictures.colors import class_rgb
 from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page
-from tests.gallery_cards import cards, sources
+from tests.helpers.gallery_cards import cards, sources
 
 EVIL = "\"><script>alert(1)</script>&amp; ' </title>"
 CARDS = [

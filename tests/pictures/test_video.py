@@ -15,12 +15,10 @@ from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures import video
 from asca_pillars.pictures.video import BoxVideo, VideoFile, is_own_video
 from asca_pillars.pictures.visualize import class_color
+from tests.helpers.video_encoder import needs_encoder
 
 RANGES = Ranges(x_m=(0.0, 40.0), y_m=(-20.0, 20.0), z_m=(-3.0, 1.0))
 POINTS = np.array([[30.0, 5, -1.7, 0], [10, -4, 0, 0], [20, 0, 1, 0]], np.float32)
-HAS_ENCODER = importlib.util.find_spec("imageio_ffmpeg") is not None or shutil.which("ffmpeg") is not None
-
-needs_encoder = pytest.mark.skipif(not HAS_ENCODER, reason="needs pip install -e '.[video]', or ffmpeg")
 
 
 class Kept:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.scans.test_scan_reader import POINTS, pcd
+from tests.scans.scan_files import POINTS, pcd
 
 XYZ = POINTS * np.array([1, 1, 1, 0], np.float32)
 _UNIT = np.array([1, 1, 1, 255], np.float32)

@@ -14,7 +14,7 @@ from asca_pillars.scans.arrays import points_from_array
 from asca_pillars.scans.ply import MAX_LISTS
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.scans.stored_scans import folder_reflectance_scale
-from tests.scans.test_scan_reader import POINTS, literal_lzf, npy, pcd, ply, read
+from tests.scans.scan_files import POINTS, literal_lzf, npy, pcd, ply, read
 
 RNG = np.random.default_rng(0)
 STREET = np.column_stack([RNG.uniform(-60, 60, (4000, 2)), RNG.uniform(-2, 3, 4000), RNG.beta(1, 3, 4000)]).astype("f4")

@@ -8,7 +8,7 @@ import pytest
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.pcd import lzf_decompress
 from tests.scans.pcd_cases import READ, REFUSED
-from tests.scans.test_scan_reader import literal_lzf, read
+from tests.scans.scan_files import literal_lzf, read
 
 
 @pytest.mark.parametrize("case", READ, ids=lambda case: case.name)

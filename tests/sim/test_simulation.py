@@ -14,7 +14,7 @@ from asca_pillars.geometry.overlap import bev_intersection
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.simulation import Frame, SimulationConfig, simulate, simulate_frame
 from asca_pillars.sim.world.scene import draw_scene
-from tests.sent import sent
+from tests.helpers.sent import sent
 
 CAMERA = SimulationConfig(field_of_view="camera")
 

@@ -10,9 +10,9 @@ from asca_pillars.config.tree import Precision, load_config
 from asca_pillars.training import module as bfloat16
 from asca_pillars.training.loop import train
 from asca_pillars.training.module import has_bfloat16, settled
-from tests.config.test_tree import CONFIGS
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG
+from tests.helpers.scenes import write_dataset
+from tests.helpers.shipped_configs import CONFIGS
+from tests.helpers.tiny_run import CONFIG
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,8 @@ from asca_pillars.training import loop
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loop import train
 from asca_pillars.training.run_folder import Seen, claim, measure_input
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG
+from tests.helpers.scenes import write_dataset
+from tests.helpers.tiny_run import CONFIG
 
 MODEL = CONFIG.model
 

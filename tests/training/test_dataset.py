@@ -22,7 +22,7 @@ from asca_pillars.models.pillar.preparation import LabeledPillars, PillarPrepara
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.dataset import Batch, Collate, Sample, open_dataset
-from tests.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
+from tests.helpers.scenes import CALIBRATION, GRID, SPEC, make_scene, write_dataset
 
 CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(train_set="train", val_set="val", workers=0))
 DONT_CARE = KittiObject("DontCare", -1, -1, -10, (500, 150, 540, 190), -1, -1, -1, -1000, -1000, -1000, -10)

@@ -12,8 +12,8 @@ from asca_pillars.base.errors import BundleError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.training.loop import train
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG, NETWORK
+from tests.helpers.scenes import write_dataset
+from tests.helpers.tiny_run import CONFIG, NETWORK
 
 STILL = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1, learning_rate=1e-12))
 OTHER = dataclasses.replace(CONFIG, model=PillarModel(network=dataclasses.replace(NETWORK, pillar_channels=8)))

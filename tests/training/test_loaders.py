@@ -16,7 +16,7 @@ from asca_pillars.config.tree import Config, TrainConfig
 from asca_pillars.training import loaders
 from asca_pillars.training.loaders import BatchLoader
 from asca_pillars.training.shared_batches import loader_context, start_loader_process
-from tests.scenes import SPEC, write_dataset
+from tests.helpers.scenes import SPEC, write_dataset
 from tests.training.failing_numbers import Numbers
 
 

@@ -17,9 +17,9 @@ import yaml
 
 from asca_pillars.base.errors import ScanError, TrainingError
 from asca_pillars.base.schema import to_dict
-from asca_pillars.config.pillar import CpaReading, NetworkConfig, PillarModel
+from asca_pillars.config.pillar import CpaReading, PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.config.tree import AugmentConfig, Config, DataConfig, TrainConfig
+from asca_pillars.config.tree import AugmentConfig, DataConfig
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.evaluation.recall import RecallRow, RecallTally
 from asca_pillars.models.build import build_model
@@ -32,15 +32,8 @@ from asca_pillars.training.callbacks import TrainingInterruptedError
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import syncs_statistics, train
 from asca_pillars.training.module import DetectionModule
-from tests.scenes import GROUND_Z_M, SPEC, write_dataset
-
-NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
-CONFIG = Config(
-    name="tiny",
-    model=PillarModel(spec=SPEC, network=NETWORK),
-    data=DataConfig(workers=0),
-    train=TrainConfig(epochs=2, batch_size=2, learning_rate=1e-3, checkpoint_steps=1),
-)
+from tests.helpers.scenes import GROUND_Z_M, SPEC, write_dataset
+from tests.helpers.tiny_run import CONFIG, NETWORK, with_train
 
 
 @pytest.mark.parametrize(
@@ -104,10 +97,6 @@ def test_run_folder_and_checkpoint(tmp_path: Path) -> None:
     assert load_checkpoint(last.with_name("weights.ckpt")).expected_input == checkpoint.expected_input
     assert checkpoint.config == CONFIG and checkpoint.steps == 4
     assert isinstance(checkpoint.detector, PillarDetector) and not checkpoint.detector.training
-
-
-def with_train(**changes: object) -> Config:
-    return dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, **changes))  # type: ignore[arg-type]
 
 
 def test_devices_that_do_not_exist_are_one_line(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.scans.scan_reader import read_scan
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.in_process import invoke
-from tests.training.test_loop import CONFIG
+from tests.helpers.in_process import invoke
+from tests.helpers.tiny_run import CONFIG
 
 
 def test_from_boxes_to_a_detector(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.training.loop import train
+from tests.helpers.scenes import write_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SPEC, tiny_config
-from tests.scenes import write_dataset
 
 
 def test_a_run_made_longer_is_the_longer_run(tmp_path: Path) -> None:

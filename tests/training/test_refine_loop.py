@@ -25,7 +25,8 @@ from asca_pillars.ops.two_stage.first_stage import propose_on
 from asca_pillars.ops.two_stage.rois import match_proposals
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
-from tests.models.two_stage.test_pillar_refiner import proposed_frame
+from tests.helpers.scenes import SPEC, write_dataset
+from tests.models.two_stage.small_refiner import proposed_frame
 from tests.models.two_stage.tiny_refine import (
     STILL_OBJECTS,
     opened_config,
@@ -33,7 +34,6 @@ from tests.models.two_stage.tiny_refine import (
     tiny_refine_model,
     write_first_stage,
 )
-from tests.scenes import SPEC, write_dataset
 
 
 @pytest.fixture

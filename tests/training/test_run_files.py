@@ -12,8 +12,8 @@ from asca_pillars.base.system import describe_environment
 from asca_pillars.config.tree import Config
 from asca_pillars.training.run_files import YAML_HEAD, require_own_run
 from asca_pillars.training.run_folder import Seen, claim
-from tests.in_process import run_here
-from tests.training.test_loop import CONFIG
+from tests.helpers.in_process import run_here
+from tests.helpers.tiny_run import CONFIG
 
 USERS = {
     "short": "# my third try\nname: exp1\ntrain: {epochs: 3}\n",

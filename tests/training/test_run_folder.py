@@ -12,8 +12,8 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.training.loop import train
 from asca_pillars.training.run_folder import Seen, claim
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG, with_train
+from tests.helpers.scenes import write_dataset
+from tests.helpers.tiny_run import CONFIG, with_train
 
 
 def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:

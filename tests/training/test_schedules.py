@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 from asca_pillars.config.tree import TrainConfig
 from asca_pillars.training.callbacks import weight_average
 from asca_pillars.training.module import DetectionModule, cooldown_start, warmup_stable_decay
-from tests.training.test_loop import with_train
+from tests.helpers.tiny_run import with_train
 
 EPOCHS, RANKS, FRAMES = 5, 3, 29
 STEPS = 4  # of an epoch: 29 frames are four whole batches of two on each of three ranks

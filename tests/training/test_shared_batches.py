@@ -17,9 +17,9 @@ from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.shared_batches import ShareCollated, SharedInputs, loader_context
+from tests.helpers.scenes import SPEC, write_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import tiny_config
 from tests.models.two_stage.tiny_refine import opened_config, write_first_stage
-from tests.scenes import SPEC, write_dataset
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
 

@@ -14,8 +14,8 @@ import yaml
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import TrainConfig
 from asca_pillars.models.checkpoint import load_checkpoint
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG
+from tests.helpers.scenes import write_dataset
+from tests.helpers.tiny_run import CONFIG
 
 ADDRESSES = ("127.0.0.2", "127.0.0.1")  # of the machine that the others meet at, and of another
 

@@ -1,4 +1,4 @@
-"""A made-up dataset with boxes in the LiDAR frame: the scenes of `tests.scenes`, without a camera."""
+"""A made-up dataset with boxes in the LiDAR frame: the scenes of `tests.helpers.scenes`, without a camera."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import numpy as np
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.kitti import write_image_set
 from asca_pillars.scans.scan_reader import write_scan
-from tests.scenes import make_scene
+from tests.helpers.scenes import make_scene
 
 
 def write_box_dataset(

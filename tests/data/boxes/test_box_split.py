@@ -25,7 +25,7 @@ from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.scenes import SPEC, make_scene, write_dataset
+from tests.helpers.scenes import SPEC, make_scene, write_dataset
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from asca_pillars.data.boxes.box_split import BoxSplit
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.in_process import invoke
+from tests.helpers.in_process import invoke
 
 
 def test_time_stamps_stay(tmp_path: Path) -> None:

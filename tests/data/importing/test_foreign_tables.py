@@ -15,9 +15,9 @@ from asca_pillars.data.importing.argoverse2 import read_argoverse2
 from asca_pillars.data.importing.imported import usable
 from asca_pillars.data.importing.nuscenes import read_nuscenes
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.data.importing.test_import import write_argoverse2, write_nuscenes
-from tests.data.importing.test_waymo_parquet import write_segment
-from tests.in_process import invoke
+from tests.data.importing.foreign_datasets import write_argoverse2, write_nuscenes
+from tests.data.importing.waymo_segment import write_segment
+from tests.helpers.in_process import invoke
 
 BOX = "[LiDARBoxComponent].box"
 CALIBRATION = "[LiDARCalibrationComponent]"

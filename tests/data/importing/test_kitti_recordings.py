@@ -13,7 +13,7 @@ from asca_pillars.data.importing.imported import usable
 from asca_pillars.data.importing.kitti_raw import read_kitti_raw
 from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
 from asca_pillars.geometry.boxes import points_in_boxes
-from tests.in_process import invoke
+from tests.helpers.in_process import invoke
 
 # The LiDAR's axes in the camera's: x right is -y, y down is -z, z ahead is x.
 CALIBRATION = """P2: 700 0 600 0 0 700 180 0 0 0 1 0

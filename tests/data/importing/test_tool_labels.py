@@ -17,7 +17,7 @@ from asca_pillars.data.importing.imported import Imported, usable
 from asca_pillars.data.importing.tool_labels import WRITTEN_FILE, ScanLabels, require_unchanged, write_prelabels
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
-from tests.in_process import invoke
+from tests.helpers.in_process import invoke
 
 BOX = np.array([[10.0, 1.0, -1.0, 4.1, 1.7, 1.5, 1.2]])
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiSplit, objects_from_boxes, write_calibration, write_image_set, write_labels
 from asca_pillars.scans.scan_reader import write_scan
-from tests.scenes import CALIBRATION, SIZES
+from tests.helpers.scenes import CALIBRATION, SIZES
 
 # Never exactly level or straight ahead, so that no ray is parallel to the sides of a box.
 ELEVATIONS_RAD = np.radians(np.concatenate([np.arange(-24, -9, 0.5), np.arange(-9, 2, 0.33)]) + 0.011)

@@ -13,23 +13,21 @@ from torch.utils.data import DataLoader
 
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.cli.prepare import prepare
-from asca_pillars.config.pillar import PillarModel
-from asca_pillars.config.tree import Config, DataConfig, InsertConfig
+from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
-from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares, prepare_inserter
+from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_labels, write_labels
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.boxes import footprints, points_in_boxes
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.dataset import Collate, open_dataset
 from asca_pillars.training.shared_batches import loader_context
+from tests.data.insertion.inserters import METHODS, config, open_inserter
 from tests.data.insertion.simple_streets import TYPES, write_streets
-from tests.scenes import SPEC
+from tests.helpers.scenes import SPEC
 
 FRAMES = 6
-METHODS = ("gt_aug", "rs_aug")
 
 
 @pytest.fixture(scope="module")
@@ -37,18 +35,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_streets(tmp_path_factory.mktemp("streets"), FRAMES)
 
 
-def config(method: str, **insert: object) -> Config:
-    base = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
-    changed = InsertConfig(method=method, **insert)  # type: ignore[arg-type]
-    return dataclasses.replace(base, augment=dataclasses.replace(base.augment, insert=changed))
-
-
 def inserter_of(root: Path, method: str, **insert: object) -> Inserter:
     return open_inserter(KittiSplit(root, "train"), config(method, **insert))
-
-
-def open_inserter(split: LabeledSplit, settings: Config) -> Inserter:
-    return prepare_inserter(split, settings.model.spec, settings.data, settings.augment.insert)
 
 
 def frame_of(root: Path, number: int) -> LabeledFrame:

@@ -12,9 +12,9 @@ from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects
 from asca_pillars.data.kitti import KittiSplit, write_image_set
 from asca_pillars.scans.scan_reader import write_scan
+from tests.data.insertion.inserters import METHODS, config, open_inserter
 from tests.data.insertion.simple_streets import TYPES, write_streets
-from tests.data.insertion.test_insert_objects import METHODS, config, open_inserter
-from tests.scenes import SPEC
+from tests.helpers.scenes import SPEC
 
 
 def write_boxes(street: Path, root: Path, sensor_m: tuple[float, float, float]) -> Path:

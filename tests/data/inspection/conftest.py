@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.scenes import write_dataset
+from tests.helpers.scenes import write_dataset
 
 FRAMES = 12
 

@@ -22,8 +22,8 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.in_process import invoke
-from tests.scenes import SPEC, make_scene
+from tests.helpers.in_process import invoke
+from tests.helpers.scenes import SPEC, make_scene
 
 MIRROR, QUARTER_TURN = np.array([1, 1, 1, 1, 1, 1, -1]), np.array([0, 0, 0, 0, 0, 0, np.pi / 2])
 WRONG: dict[str, Callable[[np.ndarray], np.ndarray]] = {

@@ -15,8 +15,8 @@ from asca_pillars.data.inspection.measurements import MatchOutcome, match
 from asca_pillars.detection.targets import assign_targets
 from asca_pillars.training.dataset import open_dataset
 from tests.data.inspection.conftest import FRAMES
-from tests.data.inspection.test_inspect_dataset import CONFIG
-from tests.scenes import SPEC
+from tests.data.inspection.inspected_data import CONFIG
+from tests.helpers.scenes import SPEC
 
 
 def test_outcomes_by_hand() -> None:

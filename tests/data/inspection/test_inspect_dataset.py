@@ -5,69 +5,38 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
-from asca_pillars.config.tree import Config, DataConfig, pillar_spec
+from asca_pillars.config.tree import Config, pillar_spec
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.data.inspection.findings import Finding, findings
-from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dataset
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.prepare import PillarLimits
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.scans.stored_scans import stored_points
 from asca_pillars.training.dataset import open_dataset
 from tests.data.inspection.conftest import FRAMES
-from tests.scenes import GRID, SIZES, SPEC, make_scene
-
-Points = NDArray[np.float32]
-CONFIG = Config(name="tiny", model=PillarModel(spec=SPEC), data=DataConfig(train_set="training", val_set="training"))
-
-
-def with_data(**changes: Any) -> Config:
-    return dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, **changes))
-
-
-def with_detector(**changes: Any) -> Config:
-    return dataclasses.replace(CONFIG, model=PillarModel(spec=dataclasses.replace(SPEC, **changes)))
-
-
-def with_grid(**changes: Any) -> Config:
-    return with_detector(grid=dataclasses.replace(GRID, **changes))
-
-
-def inspected(root: Path, config: Config, *, split: str | None = None, frames: int = 500) -> Inspection:
-    wanted = KittiSplit(root, config.data.train_set if split is None else split)
-    return inspect_dataset(wanted, pillar_spec(config), config.data, frames=frames)
-
-
-def found(root: Path, config: Config = CONFIG) -> list[Finding]:
-    return findings(inspected(root, config), pillar_spec(config), config.data.min_points)
-
-
-def change_scans(root: Path, change: Callable[[Points], object], every: int = 1) -> None:
-    for path in sorted((root / "training" / "velodyne").iterdir())[::every]:
-        points = stored_points(path)
-        change(points)
-        points.tofile(path)
-
-
-def change_files(root: Path, folder: str, change: Callable[[str], str]) -> None:
-    for path in (root / "training" / folder).iterdir():
-        path.write_text(change(path.read_text()))
+from tests.data.inspection.inspected_data import (
+    CONFIG,
+    Points,
+    change_files,
+    change_scans,
+    found,
+    inspected,
+    with_data,
+    with_detector,
+    with_grid,
+)
+from tests.helpers.scenes import GRID, SIZES, SPEC, make_scene
 
 
 def raise_sensor(root: Path, height_m: float) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.data.inspection.test_inspect_dataset import change_scans, found
+from tests.data.inspection.inspected_data import change_scans, found
 
 
 @pytest.mark.parametrize(

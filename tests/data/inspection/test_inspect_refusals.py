@@ -15,7 +15,7 @@ from asca_pillars.config.tree import Config, pillar_spec
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.kitti import KittiSplit
 from tests.data.inspection.conftest import FRAMES
-from tests.data.inspection.test_inspect_dataset import CONFIG, change_files, inspected, with_data, with_grid
+from tests.data.inspection.inspected_data import CONFIG, change_files, inspected, with_data, with_grid
 
 
 def refusal(root: Path, config: Config, tmp_path: Path) -> str:

@@ -26,9 +26,9 @@ from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.training.dataset import open_dataset
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.inspection.conftest import FRAMES
-from tests.data.inspection.test_proposal import SIZES, write_around
+from tests.data.inspection.sized_boxes import SIZES, write_around
+from tests.helpers.scenes import write_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, tiny_config
-from tests.scenes import write_dataset
 
 SHIPPED = [name for name, path in shipped_configs().items() if "kind: pv_rcnn" in path.read_text()]
 

@@ -13,7 +13,7 @@ from asca_pillars.data.kitti.calibration import (
     write_calibration,
 )
 from asca_pillars.geometry.boxes import corners
-from tests.cameras import assert_one_line, make_calibration
+from tests.helpers.cameras import assert_one_line, make_calibration
 
 
 def test_image_box_by_hand():

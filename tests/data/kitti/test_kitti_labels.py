@@ -16,7 +16,7 @@ from asca_pillars.data.kitti.kitti_labels import (
     read_labels,
     write_labels,
 )
-from tests.cameras import assert_one_line, make_calibration
+from tests.helpers.cameras import assert_one_line, make_calibration
 
 CAR = "Car 0.00 1 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57"
 DONT_CARE = "DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10"

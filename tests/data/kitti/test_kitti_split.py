@@ -20,7 +20,7 @@ from asca_pillars.data.kitti import (
     write_labels,
 )
 from asca_pillars.scans.scan_reader import read_scan
-from tests.cameras import assert_one_line
+from tests.helpers.cameras import assert_one_line
 
 BOX_FIELDS = ("height_m", "width_m", "length_m", "x_m", "y_m", "z_m", "rotation_y")
 

@@ -8,7 +8,7 @@ import pytest
 from asca_pillars.base.errors import DatasetError, OutputError, ScanError
 from asca_pillars.data.kitti import KittiSplit, write_image_set
 from asca_pillars.data.kitti.kitti_split import train_val_frames, write_train_val_lists
-from tests.in_process import invoke
+from tests.helpers.in_process import invoke
 
 # SHA-256 of OpenPCDet's data/kitti/ImageSets/train.txt and val.txt.
 DIGESTS = {

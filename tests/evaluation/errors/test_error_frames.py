@@ -11,7 +11,7 @@ from asca_pillars.data.kitti import KittiObject, KittiSplit, read_labels, write_
 from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
 from asca_pillars.evaluation.errors.error_frames import UNKNOWN_OCCLUSION, BoxErrorFrames, KittiErrorFrames
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.scenes import write_dataset
+from tests.helpers.scenes import write_dataset
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
 

@@ -12,7 +12,7 @@ from asca_pillars.evaluation.kitti.operating_point import (
     operating_points,
 )
 from asca_pillars.geometry.overlap import bev_iou, iou_3d
-from tests.evaluation.kitti.test_operating_point import NAMES, frame, item
+from tests.evaluation.kitti.scored_frames import NAMES, frame, item
 
 
 def camera_boxes(objects: list[KittiObject]) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.evaluation.tracking.tracking_metrics import Boxes, ClearMot, clear_mot, tracked_frame
-from tests.evaluation.tracking.test_hota import frame
+from tests.evaluation.tracking.tracked_frames import frame
 
 
 def of(*found: int | None) -> ClearMot:

@@ -8,14 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.evaluation.tracking.tracking_metrics import ALPHAS, TrackedFrame, hota
-
-
-def frame(objects: list[int], found: list[int], similarity: list | np.ndarray | None = None) -> TrackedFrame:
-    """Without a similarity equal numbers are equal boxes."""
-    if similarity is None:
-        similarity = np.equal.outer(np.array(objects, int), np.array(found, int)).astype(float)
-    table = np.asarray(similarity, float).reshape(len(objects), len(found))
-    return TrackedFrame(np.array(objects, np.int64), np.array(found, np.int64), table)
+from tests.evaluation.tracking.tracked_frames import frame
 
 
 def twin(frames: list[TrackedFrame]) -> list[float]:

@@ -21,7 +21,7 @@ from asca_pillars.evaluation.tracking.tracking_report import (
 )
 from asca_pillars.sim.sequences.sequence_files import simulate_sequences
 from asca_pillars.sim.simulation import load_simulation_config
-from tests.earlier_evaluation import earlier_predictions
+from tests.helpers.earlier_evaluation import earlier_predictions
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 

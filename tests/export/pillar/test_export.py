@@ -33,7 +33,7 @@ from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.measure_input import measure_expected_input
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.export.tiny import SCANS, tiny_checkpoint, tiny_detector
-from tests.scenes import SPEC
+from tests.helpers.scenes import SPEC
 
 Exports = Callable[[CpaReading], Path]
 READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point", "linear")

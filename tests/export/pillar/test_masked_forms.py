@@ -22,9 +22,9 @@ from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 from tests.deploy.conftest import needs_openvino
-from tests.export.test_sparse_bundle import NOTHING, ONE_POINT, sparse_checkpoint
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint, tiny_detector
-from tests.scenes import SPEC
+from tests.export.tiny_sparse import NOTHING, ONE_POINT, sparse_checkpoint
+from tests.helpers.scenes import SPEC
 
 RULES = ("sub", "fine")
 LEFT = [points[points[:, 1] > 4] for points in SCANS]

@@ -33,9 +33,9 @@ from asca_pillars.ops.two_stage.prepare import grid_neighbors
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS
-from tests.made_once import made_once
+from tests.helpers.made_once import made_once
+from tests.helpers.scenes import make_scene, write_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import EVERYTHING, MODEL, NETWORK, SETTINGS, SPEC, tiny_config, tiny_detector
-from tests.scenes import make_scene, write_dataset
 
 Trained = tuple[Checkpoint, Path]
 

@@ -11,7 +11,6 @@ import onnxruntime
 import pytest
 import torch
 from onnx import numpy_helper
-from torch import nn
 
 from asca_deploy import Detector
 from asca_deploy.bundle import KEYPOINTS, REFINE, PvRcnnBundle
@@ -27,29 +26,13 @@ from asca_export.pv_rcnn.voxel_forms import VoxelProducts, VoxelSample, scale_vo
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from tests.export.pv_rcnn.random_checkpoint import CALIBRATION, random_checkpoint
 from tests.export.tiny import SCANS
-from tests.made_once import made_once
+from tests.helpers.made_once import made_once
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SPEC, batch, frame, tiny_config, tiny_detector
 
-CALIBRATION = [points[:-1] for points in SCANS]  # ranges of random weights differ much from scene to scene
 LAYERS = 11 + 2 * 2 + 2 + 1
 """Of 12 products over voxels all but the first; the two blocks, their upsamplings, the head."""
-
-
-def random_checkpoint() -> Checkpoint:
-    """Random weights, normalized on two scans, that are sure enough of some boxes."""
-    detector = tiny_detector()
-    for module in detector.modules():
-        if isinstance(module, (nn.BatchNorm1d, nn.BatchNorm2d)):
-            module.momentum = 1.0
-    scans = batch(detector, frame(50), frame(51)).scans
-    with torch.no_grad():
-        first = detector.network.train().propose(scans)
-        detector.network.encode_keypoints(scans, first.levels, first.canvas)
-        for part in (detector.network.head.scores, detector.network.head.boxes):
-            part.weight.normal_(0, 0.02)
-    model = dataclasses.replace(MODEL, spec=SPEC.with_score_threshold(0.02))
-    return Checkpoint(tiny_config(model), detector.eval(), 0)
 
 
 def quantize(folder: Path, copy: Path) -> PvRcnnBundle:

@@ -30,11 +30,11 @@ from asca_pillars.models.two_stage.network import RefineDetector
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
-from tests.made_once import made_once
-from tests.models.two_stage.test_pillar_refiner import batch, small_refiner
+from tests.helpers.made_once import made_once
+from tests.helpers.saved_checkpoint import save_checkpoint
+from tests.helpers.scenes import SPEC, write_dataset
+from tests.models.two_stage.small_refiner import batch, small_refiner
 from tests.models.two_stage.tiny_refine import opened_config, tiny_refine_config, write_first_stage
-from tests.saved_checkpoint import save_checkpoint
-from tests.scenes import SPEC, write_dataset
 
 
 @pytest.fixture(scope="module")

@@ -27,11 +27,11 @@ from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from asca_pillars.ops.pillar.prepare import Pillars
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS
-from tests.models.openpcdet import test_import_pointpillars as openpcdet
-from tests.models.openpcdet import test_import_pv_rcnn as openpcdet_pv_rcnn
+from tests.models.openpcdet import small_pointpillars as openpcdet
+from tests.models.openpcdet import small_pv_rcnn as openpcdet_pv_rcnn
 from tests.models.openpcdet.foreign_networks import random_weights
 from tests.models.openpcdet.mmdetection3d_networks import PointPillars, PvRcnn, pillar_features, write_mmdetection3d
-from tests.models.openpcdet.test_import_pv_rcnn import Parts, assert_same_parts
+from tests.models.openpcdet.small_pv_rcnn import Parts, assert_same_parts
 
 GRID, SLOTS, NETWORK = openpcdet.GRID, openpcdet.SLOTS, openpcdet.NETWORK
 PUBLISHED = load_config("mmdetection3d_pointpillars_kitti").model.spec

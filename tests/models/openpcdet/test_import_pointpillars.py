@@ -11,37 +11,19 @@ import torch
 from asca_deploy.browser_page import write_page
 from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import BundleError, ConfigError, TrainingError
-from asca_pillars.config.pillar import NetworkConfig, PillarModel
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, load_config
 from asca_pillars.detection.decode import HeadMaps, PostProcess
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pillar.preparation import batch_pillars
-from asca_pillars.ops.pillar.grid import PillarGrid
-from asca_pillars.ops.pillar.prepare import PillarLimits, Pillars
-from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.ops.pillar.prepare import Pillars
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS
 from tests.models.openpcdet.foreign_networks import PointPillars, random_weights, write_foreign
+from tests.models.openpcdet.small_pointpillars import GRID, NETWORK, SLOTS, SPEC
 
-GRID = PillarGrid((4.8, 25.28), (-6.4, 8.96), (-3.0, 1.5), v_max_m=0.32, v_y_m=0.32, zones=1)
-SLOTS = 6
-SPEC = PillarSpec(
-    post=PostProcess(nms_iou=0.01, candidates=200, max_detections=60),
-    grid=GRID,
-    limits=PillarLimits(2000, SLOTS),
-    anchor_places="ends",
-    anchor_scores="every",
-)
-NETWORK = NetworkConfig(
-    cpa="none",
-    pillar_channels=12,
-    block_channels=(10, 12, 14),
-    block_convs=(1, 2, 1),
-    upsample_channels=8,
-    empty_slots=True,
-)
 CONFIG = Config(name="foreign", model=PillarModel(spec=SPEC, network=NETWORK))
 
 

@@ -11,7 +11,7 @@ from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.ops.pillar.grid import pool_pillars
-from tests.scenes import SPEC, make_scene
+from tests.helpers.scenes import SPEC, make_scene
 
 POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled"))
 NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(1, 1, 1), upsample_channels=8)

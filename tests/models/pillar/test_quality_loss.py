@@ -24,8 +24,8 @@ from asca_pillars.models.pillar.loss import (
 )
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import LabeledPillars, batch_pillars, batch_targets
-from tests.models.pillar.test_loss import COUNT, NO_TARGETS, batched, noisy_maps, perfect_maps, scene_targets
-from tests.scenes import SPEC, make_scene
+from tests.helpers.scenes import SPEC, make_scene
+from tests.models.pillar.loss_scenes import COUNT, NO_TARGETS, batched, noisy_maps, perfect_maps, scene_targets
 
 ONE, IOU = LossConfig(), LossConfig(score_target="iou")
 

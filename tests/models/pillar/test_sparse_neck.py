@@ -24,7 +24,7 @@ from asca_pillars.models.pillar.preparation import (
 )
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder
-from tests.scenes import SPEC, make_scene
+from tests.helpers.scenes import SPEC, make_scene
 
 NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(2, 1, 1), upsample_channels=8)
 RULES = ("sub", "fine")

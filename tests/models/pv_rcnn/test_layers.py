@@ -19,7 +19,7 @@ from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels
 from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, VARIANTS, batch, frame, tiny_detector
-from tests.ops.sparse.test_rulebooks import at_cells, dense
+from tests.ops.sparse.dense_volumes import at_cells, dense
 
 EVERY_ANCHOR = AnchorProposals(candidates=3000, nms_iou=0.95, count=3000)
 

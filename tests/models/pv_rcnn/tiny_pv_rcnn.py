@@ -16,7 +16,7 @@ from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, VoxelSetSettings
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
-from tests.scenes import make_scene
+from tests.helpers.scenes import make_scene
 
 SPEC = VoxelSpec(
     post=PostProcess(nms_iou=0.1),

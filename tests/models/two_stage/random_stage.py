@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, KeypointSettings
-from tests.scenes import SPEC
+from tests.helpers.scenes import SPEC
 
 SETTINGS = FirstStageSettings(keypoints=KeypointSettings(count=64))
 CHANNELS = 5

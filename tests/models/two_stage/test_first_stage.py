@@ -22,9 +22,9 @@ from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
 from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
+from tests.helpers.saved_checkpoint import save_checkpoint
+from tests.helpers.scenes import SPEC
 from tests.models.two_stage.tiny_refine import tiny_refine_model
-from tests.saved_checkpoint import save_checkpoint
-from tests.scenes import SPEC
 
 POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled"))
 

@@ -4,53 +4,26 @@ import numpy as np
 import pytest
 import torch
 
-from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
 from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, PillarRefiner, RoiHead
 from asca_pillars.models.two_stage.loss import refine_loss
 from asca_pillars.models.two_stage.network import refine
-from asca_pillars.models.two_stage.preparation import RefineBatch, collate_samples, collate_scans
+from asca_pillars.models.two_stage.preparation import collate_samples, collate_scans
 from asca_pillars.models.two_stage.sets import SetAbstraction
-from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.two_stage.first_stage import Proposed
 from asca_pillars.ops.two_stage.prepare import RefineSettings, refine_scan
 from tests.models.two_stage.drawn_samples import prepare_sample
-from tests.scenes import make_scene
-
-NAMES = ("Car", "Pedestrian", "Cyclist")
-LABELS = np.array([0, 0, 1, 2])
-SETTINGS = RefineSettings(grid_size=3, ball_samples=8, grid_samples=8)
-BEV_CHANNELS = 3
-
-
-def small_refiner(seed: int = 0) -> PillarRefiner:
-    torch.manual_seed(seed)
-    encode = KeypointEncoder([BallSource(1, 2, (8, 16))], BEV_CHANNELS, 16, weighting_channels=16)
-    head = RoiHead(
-        [SetAbstraction(16, (16, 16)) for _ in range(2)], 3, roi_channels=len(NAMES) + 4, hidden=32, dropout=0.0
-    )
-    return PillarRefiner(encode, head)
-
-
-def proposed_frame(seed: int) -> tuple[LabeledFrame, Proposed]:
-    """A scene with, for each of its boxes, three proposals not quite in its place, and one in none."""
-    points, boxes = make_scene(seed)[:2]
-    rng = np.random.default_rng(seed)
-    noise = rng.normal(0, 1, (3, len(boxes), 7)) * [0.15, 0.1, 0.1, 0.1, 0.05, 0.05, 0.1]
-    lost = np.array([[20, 6, -1, 4, 2, 1.5, 0.3]])
-    moved = np.concatenate([*(boxes + noise), lost]).astype(np.float32)
-    labels = np.append(np.tile(LABELS, 3), 0)
-    detections = Detections(moved, rng.uniform(0.1, 0.9, len(moved)).astype(np.float32), labels, NAMES)
-    keypoints = np.ascontiguousarray(points[farthest_points(points, 256), :3])
-    bev = rng.normal(size=(len(keypoints), BEV_CHANNELS)).astype(np.float32)
-    return LabeledFrame(f"{seed:06d}", points, boxes, LABELS), Proposed(detections, keypoints, bev)
-
-
-def batch(seeds: tuple[int, ...]) -> RefineBatch:
-    rng = np.random.default_rng(0)
-    return collate_samples([prepare_sample(*proposed_frame(seed), SETTINGS, 16, rng) for seed in seeds])
+from tests.models.two_stage.small_refiner import (
+    BEV_CHANNELS,
+    LABELS,
+    NAMES,
+    SETTINGS,
+    batch,
+    proposed_frame,
+    small_refiner,
+)
 
 
 def test_shapes() -> None:

@@ -14,8 +14,8 @@ from asca_pillars.models.two_stage.proposal_cache import ProposalCache
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings, propose_on
 from asca_pillars.scans.scan_reader import write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
+from tests.helpers.scenes import SPEC, write_dataset
 from tests.models.two_stage.random_stage import SETTINGS, RandomStage
-from tests.scenes import SPEC, write_dataset
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.models.two_stage.preparation import RefineSample, collate_samples, collate_scans
 from asca_pillars.ops.two_stage.first_stage import propose_on
 from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan, roi_features
+from tests.helpers.scenes import make_scene
 from tests.models.two_stage.drawn_samples import prepare_sample
 from tests.models.two_stage.random_stage import SETTINGS, RandomStage
-from tests.scenes import make_scene
 
 GEOMETRY = RefineSettings(ball_samples=6, grid_size=2, grid_samples=5)
 

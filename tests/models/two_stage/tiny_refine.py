@@ -11,7 +11,7 @@ from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings, KeypointSettings
 from asca_pillars.ops.two_stage.prepare import RefineSettings
 from tests.export.tiny import tiny_checkpoint
-from tests.saved_checkpoint import save_checkpoint
+from tests.helpers.saved_checkpoint import save_checkpoint
 
 REFINE = RefineConfig(
     seen=FirstStageSettings(ProposalSettings(quotas=(6, 6, 6), candidates=40), KeypointSettings(count=48)),

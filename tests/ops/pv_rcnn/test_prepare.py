@@ -10,7 +10,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, VoxelSetSettings, voxel_scan
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
-from tests.scenes import make_scene
+from tests.helpers.scenes import make_scene
 
 SPEC = VoxelSpec(grid=VoxelGrid((4.8, 24.0), (-6.4, 6.4), size_m=(0.2, 0.2, 0.1)), last_stride=1)
 SETTINGS = VoxelSetSettings(

@@ -8,7 +8,7 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD, VoxelRulebookBuilder
 from asca_pillars.ops.sparse.rulebooks import Convolution
-from tests.ops.sparse.test_rulebooks import at_cells, dense, random_cells
+from tests.ops.sparse.dense_volumes import at_cells, dense, random_cells
 
 SHAPE = (41, 18, 12)
 

@@ -13,6 +13,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
 from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
 from tests.ops.numpy_kernels import NumpyCellMap
+from tests.ops.sparse.dense_volumes import at_cells, dense, random_cells
 
 CONVOLUTIONS = (
     *PV_RCNN_STRIDED,
@@ -27,23 +28,6 @@ CONVOLUTIONS = (
 SHAPES = ((5, 8, 6), (1, 9, 4), (3, 3, 3), (63, 4, 3))
 
 seeds, shares = st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.3, 1.0])
-
-
-def random_cells(shape: Shape, share: float, seed: int) -> np.ndarray:
-    return np.flatnonzero(np.random.default_rng(seed).random(int(np.prod(shape))) < share)
-
-
-def dense(features: np.ndarray, cells: np.ndarray, shape: Shape) -> torch.Tensor:
-    """(N, C) at cells -> (1, C, nz, ny, nx)."""
-    z, y, x = shape
-    volume = np.zeros((y * x * z, features.shape[1]))
-    volume[cells] = features
-    return torch.from_numpy(volume.reshape(y, x, z, -1).transpose(3, 2, 0, 1)[None].copy())
-
-
-def at_cells(volume: torch.Tensor, cells: np.ndarray) -> np.ndarray:
-    """The inverse of `dense`."""
-    return volume[0].permute(2, 3, 1, 0).reshape(-1, volume.shape[1])[torch.from_numpy(cells)].numpy()
 
 
 @settings(max_examples=150, deadline=None)

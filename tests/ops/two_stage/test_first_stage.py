@@ -8,8 +8,8 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.proposals import ProposalSettings
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, KeypointSettings, propose_on
+from tests.helpers.scenes import SPEC, make_scene
 from tests.models.two_stage.random_stage import CHANNELS, SETTINGS, RandomStage
-from tests.scenes import SPEC, make_scene
 
 
 def test_quotas_and_suppression() -> None:

@@ -10,7 +10,7 @@ from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_f
 from asca_pillars.data.kitti import write_labels as write_label_file
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.report.reference import Sensor
-from tests.scenes import CALIBRATION
+from tests.helpers.scenes import CALIBRATION
 
 GROUND_Z_M, WALL_M, COLUMNS = -1.70, 30.0, 360
 SENSOR = Sensor(tuple(np.linspace(2.0, -24.0, 64).tolist()), (0.2,) * 32 + (0.12,) * 32, COLUMNS)

@@ -11,7 +11,7 @@ from asca_pillars.sim.report.label_statistics import COLUMNS, WINDOW_RETURNS, fi
 from asca_pillars.sim.report.reference import CLASSES, Fit, kitti_reference
 from asca_pillars.sim.report.scan_statistics import ScanRecord
 from asca_pillars.sim.report.tables import fits_table
-from tests.scenes import CALIBRATION
+from tests.helpers.scenes import CALIBRATION
 
 
 def flank(box: list[float], share_of_windows: float) -> np.ndarray:

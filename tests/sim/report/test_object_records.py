@@ -6,7 +6,7 @@ import pytest
 from asca_pillars.data.kitti import KittiObject, objects_from_boxes
 from asca_pillars.detection.detections import Detections
 from asca_pillars.sim.report.like_for_like import record_objects, seen_objects
-from tests.scenes import CALIBRATION
+from tests.helpers.scenes import CALIBRATION
 
 NAMES = ("Car", "Pedestrian")
 BOX = np.array([[20.0, 0.0, -1.0, 4.0, 2.0, 2.0, np.pi / 2]], np.float32)

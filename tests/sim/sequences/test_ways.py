@@ -15,7 +15,7 @@ from asca_pillars.sim.sequences.moving_scene import (
     held_footprints,
 )
 from asca_pillars.sim.world.placement import ON_FOOT
-from tests.geometry.test_overlap import polygon
+from tests.geometry.overlap_oracles import polygon
 
 
 def scene(seed: int, duration_s: float = 8.0):

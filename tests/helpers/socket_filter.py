@@ -1,6 +1,6 @@
 """Runs a command that dies of SIGSYS when it, or a process that it starts, opens a socket to the network.
 
-    python tests/socket_filter.py COMMAND...
+    python tests/helpers/socket_filter.py COMMAND...
 
 The kernel does that (seccomp), so that native code is seen as well as Python's. Netlink sockets are what the C library
 opens before it looks a host name up. Needs Linux on x86_64 or aarch64; exits with NOT_HERE elsewhere.

@@ -22,14 +22,14 @@ from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.made_recordings import point_cloud2
 from tests.data.boxes.box_scenes import write_box_dataset
+from tests.helpers.saved_checkpoint import save_checkpoint
+from tests.helpers.scenes import write_dataset
+from tests.helpers.tiny_run import CONFIG
 from tests.models.openpcdet import mmdetection3d_networks
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
-from tests.saved_checkpoint import save_checkpoint
 from tests.scans.recordings.cloud_recordings import stamps, store, write_mcap
-from tests.scenes import write_dataset
-from tests.training.test_loop import CONFIG
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 _BLOCK = re.compile(
     r"(?: *<!-- not run: (?P<reason>[^\n]+?) -->\n)?(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)\n(?P=indent)```",
     re.DOTALL,

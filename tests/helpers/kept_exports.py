@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.made_once import made_once
+from tests.helpers.made_once import made_once
 
 
 @contextmanager
