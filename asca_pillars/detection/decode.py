@@ -18,18 +18,18 @@ from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes
 KERNELS = "asca_pillars.geometry.nms_kernels"
 
 LEAST_LOGIT = -1e3
-"""Of anything that can be reported: a score of 0 in every type. Cells that a masked neck never looks at lie below."""
+"""Least logit of a detection; its score is 0 in every type. A masked neck's inactive cells lie below."""
 
 MOST = 2**31 - 1
-"""Of anything that is counted in settings: what an index of 32 bits can name."""
+"""Upper bound of counts in settings: the largest 32-bit index."""
 
 
 @dataclass(frozen=True)
 class PostProcess(Strict):
-    """How head maps become detections."""
+    """Settings for decoding head maps into detections."""
 
     nms_iou: float = 0.01
-    """Of two boxes of a class whose footprints overlap more than this, the better one stays."""
+    """Of two boxes of a class with a higher BEV IoU, NMS keeps the better one."""
     candidates: int = 1000
     """Best boxes of each class that enter the suppression."""
     max_detections: int = 100
@@ -47,7 +47,7 @@ Map = TypeVar("Map")
 
 
 class HeadMaps(NamedTuple, Generic[Map]):
-    """What the head says of one scan (NumPy arrays) or of a batch of them (tensors, with a leading axis B).
+    """Outputs of the head for one scan (NumPy arrays), or for a batch (tensors, with a leading axis B).
 
     Channels are anchor-major, A anchors as in `make_anchors`. Where the head computes at active cells alone, there
     are rows (M, channels) instead of maps (channels, H, W), one for each of these cells.

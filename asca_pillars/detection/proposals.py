@@ -20,7 +20,7 @@ class ProposalSettings(Strict):
     """Settings by which a first stage's head maps become proposals."""
 
     score_threshold: float = 0.05
-    """Of every class: the second stage judges again, and cannot bring back what is not proposed."""
+    """Score threshold of every class: the second stage rescores proposals, and cannot recover missing ones."""
     nms_iou: float = 0.7
     """Boxes of a class that overlap less are both proposed."""
     candidates: int = 300
@@ -77,7 +77,7 @@ def best_of_each_class(detections: Detections, quotas: Sequence[int]) -> Detecti
 
 @dataclass(frozen=True)
 class AnchorProposals(Strict):
-    """How head maps become proposals, whatever their class; the defaults are PV-RCNN's in use.
+    """Settings for decoding head maps into proposals of any class; the defaults are PV-RCNN's at inference.
 
     Attributes:
         candidates: anchors that enter the suppression, by the best of their scores.

@@ -15,14 +15,14 @@ from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, encode_boxes, poin
 from asca_pillars.geometry.overlap import aligned_bev_iou
 
 Assigner = Literal["overlap", "atss"]
-"""What makes an anchor positive, see `assign_targets`."""
+"""Rule that makes an anchor positive, see `assign_targets`."""
 
 _NEAREST = 9  # k of ATSS, which its authors found to matter little
 
 
 @dataclass(frozen=True)
 class Targets:
-    """What the head should say of one frame's anchors.
+    """Training targets of one frame's anchors.
 
     Attributes:
         state: (H, W, A) int8: 1 positive, 0 negative, -1 takes no part in the loss.
@@ -179,7 +179,7 @@ def _nearest_cells(
 def _ignored(
     anchors: NDArray[np.float32], classes: Sequence[ClassSpec], boxes: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Where anchors (H, W, A) overlap one of `boxes`, which are IGNORED, by the `negative_iou` of their class."""
+    """Return a mask of anchors (H, W, A) that overlap one of the IGNORED `boxes` by their class's `negative_iou`."""
     ignored = np.zeros(anchors.shape[:3], dtype=bool)
     for box in boxes:
         for class_index, spec in enumerate(classes):

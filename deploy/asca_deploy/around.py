@@ -29,11 +29,11 @@ from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.scans.ground_height import fit_ground_plane
 
 CAMERA_FIELD_RAD = math.pi / 4
-"""To each side of a camera's view: KITTI's sees 41 degrees to each side, and a car there is often cut."""
+"""Half the assumed field of view of a camera: KITTI's sees 41 degrees to each side, and a car there is often cut."""
 SEAM_MARGIN_RAD = math.radians(10)
-"""How far beyond its own sector a pass still reports, for the neighbour may place the center on the other side."""
+"""Margin beside a pass's sector in which it still reports boxes: the next pass may place the center differently."""
 GROUND_POINTS = 10_000
-"""Of a scan that its ground is looked for in: the normal is then that of all points to some hundredths of a degree."""
+"""Points of a scan that its ground is fitted to: the normal then differs by some hundredths of a degree."""
 _HALF_TURN_RAD = math.pi
 _STEP_RAD = math.radians(1)
 
@@ -64,11 +64,11 @@ def _fitting_range(reach_m: float, pillar_m: float) -> float:
 
 
 def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...]:
-    """What each pass turns the scan by; the first one by nothing.
+    """Return the turn of the scan for each pass; the first one is the identity.
 
-    As few passes as show every direction, and the margin beside each sector, as far as the model sees ahead or to its
-    nearer side, whichever is less, and, for a model trained on a camera's view, within that view. A model that looks
-    all around takes one.
+    There are as few passes as cover every direction, and the margin beside each sector, as far as the model sees
+    ahead or to its nearer side, whichever is less, and, for a model trained on a camera's view, within that view. A
+    model that looks all around takes one.
 
     Args:
         ranges: of the model.
@@ -111,7 +111,7 @@ def about_ground(turns: Sequence[FrameChange], points: NDArray[np.float32]) -> t
 
 
 def ranges_around(ranges: Ranges, passes: int) -> Ranges:
-    """Where the passes look together."""
+    """Return the ranges that the passes cover together."""
     if passes == 1:
         return ranges
     reach = max(abs(end) for end in (*ranges.x_m, *ranges.y_m))
@@ -149,7 +149,7 @@ def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: f
 
 
 def _sees(ranges: Ranges, half_sector_rad: float, distance_m: float) -> bool:
-    """Whether a model sees so far in every direction of the sector around straight ahead, and of its margins."""
+    """Return whether a model sees to `distance_m` in every direction of the sector ahead and of its margins."""
     angles = np.arange(0, min(half_sector_rad + SEAM_MARGIN_RAD, _HALF_TURN_RAD), _STEP_RAD)
     x, y = distance_m * np.cos(angles), distance_m * np.sin(angles)
     (x_min, x_max), (y_min, y_max) = ranges.x_m, ranges.y_m

@@ -1,4 +1,4 @@
-"""From a scan to boxes without PyTorch: what every family of detectors shares around its pipeline."""
+"""Detector without PyTorch, with the steps around the pipeline that all detector families share."""
 
 import logging
 import weakref
@@ -55,14 +55,14 @@ class _Frame(NamedTuple):
     start: float
     laps: Laps
     usable: UsablePoints
-    """In the model's frame."""
+    """Points in the model's frame."""
     turns: tuple[FrameChange, ...]
-    """Of the passes."""
+    """Turn of each pass."""
     counts: list[ScanCounts]
-    """Of each pass so far."""
+    """Counts of each pass prepared so far."""
     warnings: list[InputWarning]
     source: Any
-    """What the caller gave."""
+    """The points as the caller gave them."""
 
 
 class Detector:
@@ -176,7 +176,7 @@ class Detector:
 
     @property
     def passes(self) -> int:
-        """How often the network runs for a scan: once, or in every direction with `view="around"`."""
+        """Number of passes of the network per scan: 1, or as many as `view="around"` needs."""
         return len(self._turns)
 
     def __call__(self, points: NDArray[Any]) -> ScanDetections:
@@ -242,7 +242,7 @@ class Detector:
         return _Frame(start, [("input", perf_counter())], usable, turns, [], warnings, points)
 
     def _prepare(self, frame: _Frame, turn: FrameChange) -> Any:
-        """All of one pass before the slowest network; the first one compares the scan with those of the training."""
+        """Prepare one pass for the slowest network; in the first pass, check the scan against the expected input."""
         points = frame.usable.points if turn.is_identity else turn.points(frame.usable.points)
         frame.laps.append(("input", perf_counter()))
         prepared = self.pipeline.prepare(points, frame.laps)

@@ -1,4 +1,4 @@
-"""What a family of detectors has to bring along to be run by `Detector`."""
+"""Interface between `Detector` and the families of detectors."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol, TypeAlias, TypeVar
@@ -18,7 +18,7 @@ class Prepared(Protocol):
 
     @property
     def counts(self) -> ScanCounts:
-        """What became of its points."""
+        """Counts of the scan's points."""
 
 
 P = TypeVar("P", bound=Prepared)
@@ -41,13 +41,13 @@ class Pipeline(Protocol[P, R]):
 
     @property
     def network_stages(self) -> Sequence[str]:
-        """Those of them that are spent in graphs."""
+        """Names of the stages that run a graph."""
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> P:
-        """(N, 4) finite x, y, z in metres, LiDAR frame, and reflectance 0..1 -> the input of the slowest network."""
+        """Prepare the slowest network's input: (N, 4) finite x, y, z in metres, LiDAR frame, reflectance 0..1."""
 
     def infer(self, prepared: P, laps: Laps) -> R:
         """Run the slowest network; each prepared scan may be given once."""
 
     def finish(self, raw: R, laps: Laps) -> Detections:
-        """What the network answered -> boxes."""
+        """Decode the network's output into boxes."""

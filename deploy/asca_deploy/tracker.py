@@ -1,4 +1,4 @@
-"""From boxes of single scans to objects that last: constant velocity, one-to-one matching, births and deaths by score.
+"""Multi-object tracking: constant velocity, one-to-one matching, births and deaths by score.
 
 Each track is a Kalman filter over position and velocity on the ground, with white acceleration (Bar-Shalom, Li,
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.3); x and y share one covariance, for neither

@@ -94,14 +94,14 @@ class ChannelLinear(_ChannelMixing):
 
 
 class ChannelAttention(_ChannelMixing):
-    """The same C x C attention with projections per pillar, so that order and number of pillars do not matter.
+    """Channel attention (C x C) with projections per pillar, which depends on neither order nor number of pillars.
 
     Queries and keys are normalised along the pillars (cross-covariance attention, XCiT, arXiv 2106.09681), which
     keeps the logits' scale the same for a frame of ten pillars and one of ten thousand.
 
     Every product of queries and keys is one of pairs of channels summed over the pillars, so the channels' Gram matrix
-    holds all that the attention needs to know of the frame, and the projections act on it instead of on P pillars: two
-    products with the pillars where the textbook form has six.
+    suffices for the attention, and the projections act on it instead of on P pillars: two products with the pillars
+    where the textbook form has six.
     """
 
     def __init__(self, channels: int) -> None:

@@ -75,7 +75,7 @@ def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossCon
 
 
 def states_by_class(state: Tensor, scores: int) -> Tensor:
-    """What each of an anchor's class logits should say: (..., A) -> (anchors, scores), as `TargetBatch.state`.
+    """Return the training state of each class logit: (..., A) -> (anchors, scores), as `TargetBatch.state`.
 
     With one score it is the anchor's own. With one for each class a positive anchor is a negative of the others.
     """

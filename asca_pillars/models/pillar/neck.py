@@ -25,7 +25,7 @@ class RPNNeck(MapBackbone):
 
 
 class SparseRPNNeck(MapBackbone):
-    """The same neck, computed at active cells alone; its weights have the names and shapes of `RPNNeck`'s.
+    """`RPNNeck` computed at active cells only; its weights have the same names and shapes.
 
     Batch normalization is over active cells. A convolution's missing inputs are zero, and so are the upsampled values
     of a level at head cells where only another level is active.
@@ -56,7 +56,7 @@ class SparseRPNNeck(MapBackbone):
         return torch.cat(maps, dim=1)
 
     def forward_dense(self, canvas: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:
-        """The same function by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
+        """Compute `forward` by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):

@@ -23,11 +23,11 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 
 
 class PillarOutputs(NamedTuple):
-    """What the network says of B frames.
+    """Outputs of the network for B frames.
 
     Attributes:
         maps: head maps, or rows of the active head cells of a sparse neck, see `SSDHead`.
-        neck: the tables that say which cells those are; None for maps.
+        neck: the rulebooks with the indices of these cells; None for maps.
     """
 
     maps: HeadMaps[Tensor]
@@ -75,7 +75,7 @@ class PillarDetector(Trainable):
         return self.read_head(self.head_input(batch), batch)
 
     def head_input(self, batch: PillarBatch) -> Tensor:
-        """What the neck hands to the head: unitless (B, C, H, W), with a sparse neck (M, C) at active head cells."""
+        """Return the neck's output: unitless (B, C, H, W), with a sparse neck (M, C) at active head cells."""
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)

@@ -20,7 +20,7 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 
 
 class Placement(NamedTuple):
-    """What the neck is told of where a frame's pillars stand.
+    """Positions of a frame's pillars on the map, as the neck takes them.
 
     Attributes:
         pooling: of a pooled map; None where pillars and cells are the same.
@@ -71,7 +71,7 @@ class LabeledPillars(NamedTuple):
     targets: TargetBatch
 
     def to(self, device: Any) -> "LabeledPillars":
-        """The same with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         moved: LabeledPillars = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
         return moved
 
@@ -108,7 +108,7 @@ class PillarPreparation:
         )
 
     def place(self, pillars: Pillars) -> Placement:
-        """What the neck reads besides the features: tables of indices (M, 9), and where pillars go on the map."""
+        """Return the map cells of the pillars and, for a sparse neck, the rulebooks: indices (M, 9)."""
         grid = self.spec.grid
         pooling = map_cells(pillars.cells, grid)
         if self.active_cells is None:

@@ -31,7 +31,7 @@ _MOST_PILLARS = 1 << 17  # along one axis
 
 
 class GridTables(NamedTuple):
-    """What turns a point into a cell: the x range in slices of the finest depth, whose borders include every column's.
+    """Lookup tables from points to cells: x in slices of the finest depth, whose borders include every column's.
 
     Borders are float32, as the points are.
     """
@@ -67,8 +67,8 @@ class PillarGrid(Strict):
     zones: int = 3
     """K, the number of pillar depths."""
     map: Literal["warped", "pooled"] = "warped"
-    """What the neck reads. `warped`: a column for every pillar along x, as the paper prints it. `pooled`: columns as
-    deep as the second zone's pillars everywhere, see `map_pooling`. With one zone both are the same."""
+    """Map that the neck reads. `warped`: a column for every pillar along x, as the paper prints it. `pooled`: columns
+    as deep as the second zone's pillars everywhere, see `map_pooling`. With one zone both are the same."""
 
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):
@@ -121,7 +121,7 @@ class PillarGrid(Strict):
 
     @property
     def pools(self) -> bool:
-        """Whether the map is another one than the pillars' own."""
+        """True if the map differs from the grid of pillars."""
         return self.map == "pooled" and self.zones > 1
 
     @cached_property
@@ -140,7 +140,7 @@ class PillarGrid(Strict):
 
     @cached_property
     def map_copies(self) -> NDArray[np.int64]:
-        """In how many columns of the pooled map each column of pillars stands, (nx,)."""
+        """Number of columns of the pooled map that each column of pillars covers, (nx,)."""
         return np.where(np.arange(self.nx) < self._first_zone_columns, 2, 1)
 
     @cached_property
@@ -266,7 +266,7 @@ class MapCells(NamedTuple, Generic[Array]):
 
 
 def map_cells(cells: NDArray[np.int64], grid: PillarGrid) -> MapCells[NDArray[np.int64]] | None:
-    """Where pillars at these cells (P,) of the grid, ascending, stand on the map; None where both are the same."""
+    """Return the map cells of pillars at ascending grid cells (P,); None where map and grid are the same."""
     if not grid.pools:
         return None
     rows, columns = np.divmod(cells, grid.nx)
@@ -308,7 +308,7 @@ _PILLAR_TOLERANCE = 1e-3
 
 
 def fits(span_m: tuple[float, float], pillar_m: float, zones: int = 1) -> bool:
-    """Whether each of `zones` equal parts of a range is a multiple of NECK_STRIDE of the first one's pillars.
+    """Return whether each of `zones` equal parts of a range is a multiple of NECK_STRIDE of the first one's pillars.
 
     Columns double from zone to zone, so the map has an odd multiple (2^K - 1) of the first zone's columns,
     and the neck's stride must divide these. Then every zone also holds a multiple of HEAD_STRIDE columns,
@@ -320,7 +320,7 @@ def fits(span_m: tuple[float, float], pillar_m: float, zones: int = 1) -> bool:
 
 
 def x_advice(span_m: tuple[float, float], v_max_m: float, zones: int) -> str:
-    """Why an x range does not fit, and the nearest ranges, pillar depth and numbers of zones that do."""
+    """Explain why an x range does not fit, with the nearest ranges, pillar depth and numbers of zones that do."""
     step_m = NECK_STRIDE * zones * v_max_m
     advice = f"x_range_m {_nearest_ranges(span_m, step_m)}, or v_max_m {_nearest_size(span_m, v_max_m, zones)}"
     working = [str(k) for k in range(1, MAX_ZONES + 1) if fits(span_m, v_max_m, k)]
@@ -333,7 +333,7 @@ def x_advice(span_m: tuple[float, float], v_max_m: float, zones: int) -> str:
 
 
 def y_advice(span_m: tuple[float, float], v_y_m: float) -> str:
-    """Why a y range does not fit, and the nearest ranges and pillar width that do."""
+    """Explain why a y range does not fit, with the nearest ranges and pillar width that do."""
     step_m = NECK_STRIDE * v_y_m
     return (
         f"y_range_m {_show(span_m)} must be a multiple of {step_m:.7g} m "

@@ -52,10 +52,10 @@ class LevelRulebooks(NamedTuple, Generic[Array]):
 
 
 class NeckRulebooks(NamedTuple, Generic[Array]):
-    """Of one scan (NumPy), or of a batch (tensors), whose rows follow one another frame by frame."""
+    """Rulebooks of the neck for one scan (NumPy), or for a batch (tensors), whose rows follow frame by frame."""
 
     levels: tuple[LevelRulebooks[Array], ...]
-    """From the finest to the coarsest."""
+    """Levels from the finest to the coarsest."""
     head_cells: Array
     """(H,) flat index of the active cells on the head's map, of a batch counted through the maps of its frames."""
     frame_rows: tuple[int, ...]
@@ -167,7 +167,7 @@ def stack_neck_rulebooks(
 
 
 def rulebook_inputs(tables: NeckRulebooks[Array]) -> dict[str, Array]:
-    """What a graph of the neck can ask for, by the names of its inputs; it takes what its layers read."""
+    """Return the rulebooks by the names of a neck graph's inputs; a graph takes those that its layers read."""
     return {
         f"{kind}_{number}": getattr(level, kind)
         for number, level in enumerate(tables.levels)

@@ -32,7 +32,7 @@ class PillarSpec(DetectorSpec):
 
     @property
     def ranges(self) -> Ranges:
-        """Where objects are looked for."""
+        """Detection ranges."""
         return self.grid.ranges
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -40,7 +40,7 @@ class PillarSpec(DetectorSpec):
         return self.grid.head_centers_m()
 
     def anchor_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where anchors stand: x of the head map's columns (W,), y of its rows (H,), metres, LiDAR frame."""
+        """Return anchor centers in metres, LiDAR frame: x of the head map's columns (W,), y of its rows (H,)."""
         if self.anchor_places == "cells":
             return self.head_centers_m()
         rows, columns = self.grid.head_shape
@@ -48,7 +48,7 @@ class PillarSpec(DetectorSpec):
 
     @property
     def scores_per_anchor(self) -> int:
-        """How many scores each anchor has."""
+        """Number of scores of each anchor."""
         return len(self.classes) if self.anchor_scores == "every" else 1
 
     def pillarize(self, points: NDArray[np.float32]) -> Pillars:

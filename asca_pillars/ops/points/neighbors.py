@@ -23,7 +23,7 @@ _ROUNDING = 1e-3  # of a column: how far float32 may misplace a point that stand
 
 
 def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, samples: int) -> NDArray[np.int32]:
-    """For each query the indices of up to `samples` points nearer than the radius: (N, 3), (Q, 3) -> (Q, samples).
+    """Return up to `samples` indices of points within the radius of each query: (N, 3), (Q, 3) -> (Q, samples).
 
     A ball of fewer points has them as they are stored, then its first one again and again; one without any has N.
 
@@ -138,9 +138,10 @@ class PointScale(NamedTuple, Generic[Array]):
     groups: Array
     """(M, samples) what is around each, see `ball_query`."""
     nearest: Array
-    """Of each position of the scale before the three nearest of these, (_, 3); of the finest scale (0, 3)."""
+    """Indices of the three nearest of these for each position of the next finer scale, (_, 3); (0, 3) for the
+    finest."""
     nearest_weights: Array
-    """Likewise inverse distances, sum 1."""
+    """Normalized inverse distances to `nearest`, sum 1."""
 
 
 def point_scales(

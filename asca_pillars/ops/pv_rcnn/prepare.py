@@ -1,4 +1,4 @@
-"""What the host computes for PV-RCNN of one scan: voxels, tables, keypoints and their neighbors (sections 3.1, 3.2)."""
+"""Host computation of PV-RCNN for one scan: voxels, rulebooks, keypoints and their neighbors (3.1, 3.2)."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def _are_radii(radii_m: Sequence[float]) -> bool:
 
 @dataclass(frozen=True)
 class SourceBalls(Strict):
-    """What voxel set abstraction aggregates of one source around a keypoint.
+    """Balls of one source that voxel set abstraction aggregates around a keypoint.
 
     Attributes:
         source: raw points, or the voxels of a level of the backbone.
@@ -113,11 +113,11 @@ class VoxelSetSettings(GridSettings):
 
     @property
     def nearest_wanted(self) -> bool:
-        """Whether the three nearest voxels of a keypoint are asked for."""
+        """True if the three nearest voxels of a keypoint are needed."""
         return self.deform == "paper"
 
     def places(self, each: SourceBalls) -> int:
-        """How many places around which this source is looked at; 0: the keypoint itself."""
+        """Return the number of shifted positions per keypoint for this source; 0: the keypoint's own position."""
         if each not in self.deformed:
             return 0
         return 1 if self.deform == "paper" else len(each.radii_m)
@@ -135,18 +135,18 @@ class VoxelScan(NamedTuple):
     keypoints: NDArray[np.float32]
     """(K, 3), metres, LiDAR frame."""
     positions: tuple[NDArray[np.float32], ...]
-    """Of each source, the (N, 3) that its indices count: points, or centers of voxels; metres."""
+    """Positions (N, 3) that the indices of each source refer to: points, or voxel centers; metres."""
     ball_indices: tuple[tuple[NDArray[np.int32], ...], ...]
-    """Of each source and radius (K, samples)."""
+    """Ball indices (K, samples) for each source and radius."""
     nearest: tuple[NDArray[np.int32], ...]
-    """Of each source (K, 3) voxels, see `three_nearest`; (0, 3) where they are not asked for."""
+    """Nearest voxels (K, 3) for each source, see `three_nearest`; (0, 3) where they are not needed."""
     nearest_weights: tuple[NDArray[np.float32], ...]
     bev_cells: NDArray[np.int32]
     """(K, 4) flat indices into the map seen from above, see `bilinear_cells`."""
     bev_weights: NDArray[np.float32]
     """(K, 4)."""
     scales: tuple[PointScale[NDArray[Any]], ...]
-    """Of raw points around keypoints, the finest first; none where they are not asked for."""
+    """Scales of raw points around keypoints, finest first; empty where they are not needed."""
     counts: ScanCounts
 
 

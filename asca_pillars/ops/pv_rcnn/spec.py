@@ -51,7 +51,7 @@ class VoxelSpec(DetectorSpec):
 
     @property
     def ranges(self) -> Ranges:
-        """Where objects are looked for."""
+        """Detection ranges."""
         return Ranges(*self.grid.ranges_m)
 
     @cached_property
@@ -81,7 +81,7 @@ class VoxelSpec(DetectorSpec):
 
     @property
     def scores_per_anchor(self) -> int:
-        """How many scores each anchor has: one for every class."""
+        """Number of scores of each anchor: one per class."""
         return len(self.classes)
 
     @property
@@ -95,7 +95,7 @@ class VoxelSpec(DetectorSpec):
         return self.level_shapes[-1][1:]
 
     def map_places_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where the map's features stand: x of its columns (W,), y of its rows (H,), metres, LiDAR frame.
+        """Return the positions of the map's features: x of its columns (W,), y of its rows (H,), metres, LiDAR frame.
 
         A strided convolution with padding 1 centers its output on the first of its voxels, so a cell stands at its
         lower end.
@@ -105,7 +105,7 @@ class VoxelSpec(DetectorSpec):
         return self.grid.x_range_m[0] + step_x * columns, self.grid.y_range_m[0] + step_y * rows
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where anchors stand: x of the head map's columns (W,), y of its rows (H,), metres, LiDAR frame."""
+        """Return anchor centers in metres, LiDAR frame: x of the head map's columns (W,), y of its rows (H,)."""
         rows, columns = self.map_shape
         if self.anchor_places == "ends":
             return np.linspace(*self.grid.x_range_m, columns), np.linspace(*self.grid.y_range_m, rows)
@@ -114,5 +114,5 @@ class VoxelSpec(DetectorSpec):
         return x + half[0], y + half[1]
 
     def rulebook_builder(self, *, training: bool = False) -> VoxelRulebookBuilder:
-        """Of this detector's levels; for one thread at a time."""
+        """Return a builder of rulebooks for this detector's levels; for one thread at a time."""
         return VoxelRulebookBuilder(self.grid.shape, self.strided, training=training)

@@ -109,7 +109,7 @@ class VoxelGrid(Strict):
         return cells
 
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which points (M, >= 3), metres, LiDAR frame, lie in a voxel: (M,)."""
+        """Return a mask (M,) of the points (M, >= 3), metres, LiDAR frame, that lie in a voxel."""
         lows_m, highs_m = (np.array(ends, np.float32) for ends in zip(*self.ranges_m, strict=True))
         return np.asarray(((points[:, :3] >= lows_m) & (points[:, :3] < highs_m)).all(axis=1))
 

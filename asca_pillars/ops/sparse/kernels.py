@@ -23,7 +23,7 @@ _LINKS = (given(types.int64, 2),) * 3
 
 @inner
 def bits_set(mask: np.uint64) -> Any:
-    """How many are set."""
+    """Return the number of set bits."""
     mask = mask - ((mask >> np.uint64(1)) & np.uint64(0x5555555555555555))
     mask = (mask & np.uint64(0x3333333333333333)) + ((mask >> np.uint64(2)) & np.uint64(0x3333333333333333))
     mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)

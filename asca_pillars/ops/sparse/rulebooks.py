@@ -22,7 +22,7 @@ Shape = tuple[int, int, int]
 
 
 class Links(NamedTuple):
-    """What each tap joins a cell of one lattice with on another, axis by axis.
+    """Cells of two lattices that each tap of a convolution joins, per axis.
 
     Tap (kz, ky, kx) joins cell (z, y, x) with (links.z[z, kz], links.y[y, ky], links.x[x, kx]), or with nothing where
     one of them is -1.
@@ -66,16 +66,16 @@ class Convolution:
         return math.prod(self.kernel)
 
     def inputs(self, outputs: Shape, inputs: Shape) -> Links:
-        """From an output to the inputs that it reads, on lattices of these shapes."""
+        """Return the links from an output cell to the input cells that it reads, on lattices of these shapes."""
         return _links(self, outputs, inputs, backward=False)
 
     def outputs(self, inputs: Shape, outputs: Shape) -> Links:
-        """From an input to the outputs that read it."""
+        """Return the links from an input cell to the output cells that read it."""
         return _links(self, inputs, outputs, backward=True)
 
 
 def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convolution:
-    """For a bird's-eye map: nothing happens along z."""
+    """Return a convolution on a bird's-eye-view map, of kernel size 1 along z."""
     return Convolution((1, kernel, kernel), (1, stride, stride), (0, padding, padding))
 
 
@@ -106,7 +106,7 @@ class Columns(NamedTuple):
 
 
 class CellMap:
-    """Which cells of a lattice are active; made once, its memory is kept from scan to scan.
+    """Active cells of a lattice; made once, its memory is reused from scan to scan.
 
     Changing the active cells clears only the columns that were in use.
 
@@ -194,16 +194,16 @@ class Join(NamedTuple):
     source: CellMap
     target: CellMap
     inputs: Links
-    """From the cells of `target` to those of `source` that they read."""
+    """Links from the cells of `target` to the cells of `source` that they read."""
     outputs: Links
-    """From the cells of `source` to those of `target` that read them."""
+    """Links from the cells of `source` to the cells of `target` that read them."""
 
     def table(self) -> NDArray[np.int32]:
-        """What the convolution reads: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
+        """Return the rulebook of the convolution: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
         return self.target.table(self.source, self.inputs)
 
     def inverse(self) -> NDArray[np.int32]:
-        """What its backward pass reads: (cells of `source`, K) rows of `target`."""
+        """Return the rulebook of the backward pass: (cells of `source`, K) rows of `target`."""
         return self.source.table(self.target, self.outputs)
 
 

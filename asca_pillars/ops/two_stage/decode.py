@@ -13,7 +13,7 @@ from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.ops.two_stage.rois import decode_refinement
 
 Scores = Literal["second", "both"]
-"""Whose score a refined box has: the second stage's, or the geometric mean of its own and of its proposal's."""
+"""Score of a refined box: the second stage's, or the geometric mean of that and the proposal's."""
 
 
 def refined_scores(proposals: Detections, confidence: NDArray[np.float32], scores: Scores) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""What the host computes for the second stage of one scan: neighbours of keypoints and of the grids of proposals."""
+"""Host computation of the second stage for one scan: neighbors of keypoints and of the proposals' grid points."""
 
 import math
 from concurrent.futures import Executor
@@ -57,8 +57,8 @@ class GridNeighbors(NamedTuple):
     points: NDArray[np.float32]
     """(R * cells, 3), metres, LiDAR frame."""
     indices: tuple[NDArray[np.int32], ...]
-    """Of each radius (R * cells, samples), or of each cell of a cube the nearest (R * cells, T, 3); the number of
-    keypoints stands for nothing."""
+    """Ball indices (R * cells, samples) for each radius, or the nearest in each cell of a cube (R * cells, T, 3); the
+    number of keypoints marks an empty entry."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,9 @@ def refine_scan(
 def grid_neighbors(
     keypoints: NDArray[np.float32], boxes: NDArray[np.float32], settings: GridSettings, vector_cells: int = 0
 ) -> GridNeighbors:
-    """What RoI-grid pooling aggregates (PV-RCNN, section 3.3), for boxes (R, 7) among keypoints (K, 3), metres.
+    """Return the neighbors for RoI-grid pooling (PV-RCNN, section 3.3) of boxes (R, 7) among keypoints (K, 3), metres.
 
-    Balls, or with `vector_cells` along each axis the cells of cubes whose half length is the radius.
+    These are balls, or with `vector_cells` along each axis the cells of cubes whose half length is the radius.
     """
     points = np.ascontiguousarray(roi_grid_points(boxes, settings.grid_size).reshape(-1, 3), np.float32)
     return GridNeighbors(
@@ -128,9 +128,9 @@ def grid_neighbors(
 
 
 def roi_features(proposals: Detections) -> NDArray[np.float32]:
-    """What pooling does not tell of a proposal: class (one of them 1), logit of its score, length, width, height.
+    """Return RoI features: class (one-hot), logit of the score, length, width, height.
 
-    (R, classes + ROI_FEATURES). One head serves all classes, which differ in what a good box looks like.
+    Shape (R, classes + ROI_FEATURES). One head serves all classes, whose boxes differ.
     """
     classes = np.eye(len(proposals.class_names), dtype=np.float32)[proposals.labels]
     score = np.clip(proposals.scores, 1e-4, 1 - 1e-4)[:, None]
@@ -138,7 +138,7 @@ def roi_features(proposals: Detections) -> NDArray[np.float32]:
 
 
 def _keypoint_margin_m(keypoints: NDArray[np.float32], boxes: NDArray[np.float32]) -> float:
-    """How far a keypoint stands from the circle around the nearest box, at most."""
+    """Return the largest distance of a keypoint from the circle around the nearest box, at least 0."""
     if not len(keypoints) or not len(boxes):
         return 0.0
     reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2

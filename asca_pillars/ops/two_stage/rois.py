@@ -82,7 +82,7 @@ def _at_origin(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 FOREGROUND_IOU = 0.55
-"""From this overlap in 3D on a proposal is drawn as foreground, and above it learns its residuals."""
+"""3D IoU from which a proposal is sampled as foreground, and above which it learns residuals."""
 HARD_IOU = 0.1
 """Background from this overlap on is hard, below it easy."""
 _FOREGROUND_SHARE = 0.5
@@ -93,7 +93,7 @@ _CONFIDENCE_IOU = 0.25, 0.75  # where the confidence begins to rise from 0, and 
 
 @dataclass(frozen=True)
 class Overlaps:
-    """How proposals lie over the labelled boxes of their frame."""
+    """Overlaps of proposals with the labelled boxes of their frame."""
 
     iou: NDArray[np.float64]
     """(R,) largest 3D IoU with a box of the proposal's own class; 0 without any."""
@@ -105,7 +105,7 @@ class Overlaps:
 
 @dataclass(frozen=True)
 class RoiTargets:
-    """What to say of S sampled proposals."""
+    """Training targets of S sampled proposals."""
 
     rois: NDArray[np.int64]
     """(S,) rows of the proposals, some perhaps more than once."""
@@ -151,7 +151,7 @@ def sample_rois(overlaps: Overlaps, count: int, rng: np.random.Generator) -> NDA
 def roi_targets(
     proposals: Detections, boxes: NDArray[np.float32], overlaps: Overlaps, rois: NDArray[np.int64]
 ) -> RoiTargets:
-    """What to say of the proposals `rois` (S,), whose `overlaps` are with `boxes` (N, 7)."""
+    """Return the targets of the proposals `rois` (S,), whose `overlaps` are with `boxes` (N, 7)."""
     low, high = _CONFIDENCE_IOU
     iou = overlaps.iou[rois]
     positive = iou > FOREGROUND_IOU
