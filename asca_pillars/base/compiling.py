@@ -1,8 +1,8 @@
-"""How numba compiles the loops of the `*_kernels.py` files and of the simulator.
+"""Compilation with numba of the loops in `*_kernels.py` and in the simulator.
 
 The compiled functions of kernels take memory made by NumPy and have their signatures written out: that takes a quarter
 off the time to compile, and all of it is spent when they are imported, once per machine (numba's cache keeps the
-result). `nogil` lets other threads run meanwhile; nothing is `parallel`, because the network owns the cores.
+result). `nogil` lets other threads run meanwhile; nothing is `parallel`, because the network uses the cores.
 
 numba loads what lies in its cache as it is, machine code as well: an empty file ends the process with an EOFError, a
 flipped bit with SIGABRT. Here each file of the cache carries a digest. One that is damaged is compiled anew.

@@ -135,7 +135,7 @@ def file_inside(folder: Path, name: str) -> Path | None:
 
 
 def is_hidden(relative: Path) -> bool:
-    """Whether it or a folder on the way to it is; `relative` to the folder that is searched."""
+    """Return whether a path or one of its folders is hidden; `relative` to the folder that is searched."""
     return any(part.startswith(".") for part in relative.parts)
 
 

@@ -30,7 +30,7 @@ def install_command(extra: str) -> str:
 
 
 def upgrade_advice() -> str:
-    """How to get a newer version."""
+    """Return the advice to install a newer version."""
     root = source_tree()
     return "install a newer asca-pillars" if root is None else f"upgrade with `git -C {shlex.quote(str(root))} pull`"
 

@@ -67,7 +67,7 @@ others, and the one that started them, then wait forever.
 
 
 class _Failed(NamedTuple):
-    """In the place of a result, the error of the job."""
+    """Error of a job, in the place of its result."""
 
     error: Exception
 
@@ -134,7 +134,7 @@ def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]
 
 
 def _work(job: Callable[[Any], Any], connection: Connection) -> None:
-    """In a new process: do the job for items as long as there are some."""
+    """Run the job in a new process for the items received, until the connection ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches it, too; the process that started it ends it
     with contextlib.suppress(EOFError, ConnectionError):  # that one has ended
         while True:

@@ -42,7 +42,7 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
 
 
 def _flag_for_number(given: Any, taken: Any, path: str = "") -> tuple[str, bool] | None:
-    """Where true or false was given and a number was taken, as pydantic does; None: nowhere."""
+    """Return path and value of a boolean where a number was taken, as pydantic converts it; None if there is none."""
     if isinstance(given, dict) and isinstance(taken, dict):
         pairs = [(key, given[key], taken[key]) for key in given if key in taken]
     elif isinstance(given, list | tuple) and isinstance(taken, list):

@@ -141,7 +141,7 @@ def command_line() -> str:
 
 
 def describe_environment() -> dict[str, Any]:
-    """All of it as plain values, to be saved beside a result."""
+    """Return the environment of the process as plain values, to be saved beside a result."""
     return {
         "command": command_line(),
         "git_revision": git_revision(),

@@ -75,7 +75,7 @@ class RayPool(Generic[Result]):
         return len(self._running) < self._limit
 
     def fits(self) -> bool:
-        """Whether a machine of the cluster is large enough for a job; if not, jobs wait until one joins."""
+        """Return whether a machine of the cluster is large enough for a job; if not, jobs wait until one joins."""
         import ray
 
         resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]

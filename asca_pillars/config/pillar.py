@@ -81,7 +81,7 @@ class LossConfig(Strict):
 
 
 TRACED_PILLARS = 6
-"""Of the example that an export traces the encoder with."""
+"""Number of pillars in the example that an export traces the encoder with."""
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ class InsertConfig(Strict):
                 raise ConfigError(f"augment.insert.proportions.{name} = {share:g}: must be at least 0")
 
     def inserts_in(self, epoch: int) -> bool:
-        """Whether objects are inserted in an epoch, counted from 0."""
+        """Return whether objects are inserted in an epoch, counted from 0."""
         return self.method != "none" and (self.disable_after_epoch is None or epoch < self.disable_after_epoch)
 
 
@@ -119,7 +119,7 @@ class AugmentConfig(Strict):
 
 @dataclass(frozen=True)
 class DataConfig(Strict):
-    """What is read from a dataset.
+    """Settings for reading a dataset.
 
     Attributes:
         train_set, val_set: names of lists in ImageSets/.

@@ -34,10 +34,10 @@ def build_model(model: ModelConfig) -> Trainable:
 
 
 def build_preparation(model: ModelConfig, split: LabeledSplit, data: DataConfig) -> Preparation:
-    """What makes batches of the frames of `split` for that network; what is computed once per dataset is computed.
+    """Return the `Preparation` of batches for the network; what is computed once per dataset is computed here.
 
     Raises:
-        AscaError: of what is computed once per dataset.
+        AscaError: what is computed once per dataset cannot be computed or saved.
     """
     match model:
         case PillarModel():

@@ -29,7 +29,7 @@ class CheckpointFile(NamedTuple):
     steps: int
     """Optimizer steps behind them."""
     expected_input: ExpectedInput | None
-    """Of the scans that it was trained on; None in checkpoints made before this was measured."""
+    """Statistics of the scans that it was trained on; None in checkpoints made before they were measured."""
 
     def fill(self, network: nn.Module) -> None:
         """Load the weights into the network that they are of.
@@ -102,9 +102,9 @@ def _library_of(content: Mapping[str, Any]) -> str | None:
 
 
 def read_failure(error: Exception) -> str:
-    """Why a file of weights was not read, in one line.
+    """Return in one line why a file of weights could not be read.
 
-    The words of torch.load for a pickle that it does not take are left out: they advise to execute what is in it.
+    torch.load's message for a pickle that it refuses is left out: it advises to execute the content.
     """
     if isinstance(error, pickle.UnpicklingError):
         return "it is not plain arrays and settings; nothing in it was executed"

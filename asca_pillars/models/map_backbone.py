@@ -120,13 +120,13 @@ class SSDHead(nn.Module):
         return HeadMaps(self.scores(features), self.boxes(features), self.directions(features))
 
     def at_cells(self, features: Tensor) -> HeadMaps[Tensor]:
-        """The same at single cells: (M, C) -> scores (M, A), boxes (M, 7A), directions (M, 2A)."""
+        """Apply the head at single cells: (M, C) -> scores (M, A), boxes (M, 7A), directions (M, 2A)."""
         joined = linear_rows(features, *self.joined())  # one product and one gradient of the features instead of three
         return HeadMaps(*joined.split(self.channels, dim=1))
 
     @property
     def channels(self) -> list[int]:
-        """Of scores, boxes and directions."""
+        """Output channels of scores, boxes and directions."""
         return [part.out_channels for part in (self.scores, self.boxes, self.directions)]
 
     def joined(self) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ class Movable(Protocol):
     """A batch of tensors that can move to a device."""
 
     def to(self, device: Any) -> Self:
-        """The same batch with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         ...
 
 
@@ -33,7 +33,7 @@ class Preparation(Protocol):
         ...
 
     def collate(self, frames: Sequence[Any]) -> Movable:
-        """What `prepare` gave for B frames as one batch of tensors."""
+        """Collate the results of `prepare` for B frames into one batch of tensors."""
         ...
 
 

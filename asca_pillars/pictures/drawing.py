@@ -1,4 +1,4 @@
-"""What the pictures are made with: the view from above, text that keeps clear of other text, subpixels."""
+"""Drawing: bird's-eye view, text that does not overlap other text, subpixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ Color = tuple[int, int, int]
 
 BACKGROUND: Color = (24, 18, 14)
 OVERSAMPLING = 2
-"""What is seen from above is drawn this much larger and averaged down, which smooths even single points."""
+"""Factor by which bird's-eye views are drawn larger and then averaged down, which smooths even single points."""
 SUBPIXEL_BITS = 4
 LEGEND_PX, LEGEND_ROW_PX = 200, 22
 """Width kept free for the legend, and height of a row, before oversampling."""
@@ -28,7 +28,7 @@ _MAX_ASPECT = 1.1  # height over width of the picture from above
 
 @dataclass(frozen=True)
 class View:
-    """What part of the LiDAR's ground plane a canvas shows, at which scale (pixels of the canvas)."""
+    """Part of the LiDAR's ground plane that a canvas shows, and its scale (pixels of the canvas)."""
 
     x_max_m: float
     y_max_m: float
@@ -59,7 +59,7 @@ class View:
         return (np.array([self.y_max_m, self.x_max_m]) - xy_m[..., ::-1]) * self.px_per_m
 
     def shows(self, pixel: NDArray[np.floating], margin_px: float = 0.0) -> bool:
-        """Whether pixels (..., 2) of column, row all lie inside, at least `margin_px` from the border."""
+        """Return whether pixels (..., 2) of column, row all lie inside, at least `margin_px` from the border."""
         inner = (margin_px <= pixel) & (pixel <= np.array([self.width_px, self.height_px]) - margin_px)
         return bool(inner.all())
 
@@ -73,9 +73,9 @@ class BoxLayer:
     """(N, 7) LiDAR boxes."""
     color: Color
     texts: Sequence[str] = ()
-    """What stands beside each box; nothing if empty."""
+    """Text beside each box; none if empty."""
     thickness_px: int = 4
-    """Of the outline, before the picture is made half as large."""
+    """Width of the outline, before the picture is reduced to half its size."""
 
 
 @dataclass(frozen=True, eq=False)

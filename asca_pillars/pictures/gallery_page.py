@@ -84,7 +84,7 @@ def _number(value: float) -> str:
 
 
 def _text(text: str) -> str:
-    """As HTML, in a text or in an attribute."""
+    """Escape a text for HTML, as content or in an attribute."""
     return html.escape(text, quote=True)
 
 

@@ -194,7 +194,7 @@ def _draw_ego(canvas: Image, camera: ChaseCamera, ground_m: float) -> None:
 
 
 def _draw_trail(canvas: Image, camera: ChaseCamera, trail: Trail) -> None:
-    """From its oldest place, faint, to its newest."""
+    """Draw a trail from its oldest place, faint, to its newest."""
     count = len(trail.places_m)
     for number, line in enumerate(camera.cut(trail.places_m[:-1], trail.places_m[1:]), start=1):
         if np.isfinite(line).all():

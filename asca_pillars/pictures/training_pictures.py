@@ -53,7 +53,7 @@ def draw_training_frame(frame: LabeledFrame, frames: TrainingFrames) -> Image:
 
 
 def _moved(motion: Motion) -> str:
-    """How augmentation moved the frame as a whole, in words."""
+    """Return in words how augmentation moved the frame as a whole."""
     changes = ["mirrored"] if motion.flipped else []
     if motion.rotation_rad:
         changes.append(f"turned by {np.degrees(motion.rotation_rad):.0f} degrees")

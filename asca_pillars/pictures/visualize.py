@@ -238,7 +238,7 @@ def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
 
 
 def _draw_trail(canvas: Image, view: View, trail: Trail) -> None:
-    """From its oldest place, faint, to its newest."""
+    """Draw a trail from its oldest place, faint, to its newest."""
     pixels = view.pixels(trail.places_m[:, :2])
     for number in range(1, len(pixels)):
         color = mixed(BACKGROUND, trail.color, 0.15 + 0.85 * number / len(pixels))

@@ -1,4 +1,4 @@
-"""What happens around the steps of a run: progress, Ctrl-C, the average of the weights."""
+"""Callbacks of a run: progress, Ctrl-C, the average of the weights."""
 
 import contextlib
 import signal
@@ -134,7 +134,7 @@ class RunProgress(RankProgress):
         )
 
     def on_validation_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *arguments: Any) -> None:
-        """How far a validation is stands beside the epoch."""
+        """Show the progress of the validation beside the epoch."""
         if not trainer.sanity_checking:
             batches = sum(int(count) for count in trainer.num_val_batches)
             done = f"validation {arguments[2] + 1}/{batches}"

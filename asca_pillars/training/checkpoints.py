@@ -34,7 +34,7 @@ _OF_A_RUN = {
     "global_step": int,
     "pytorch-lightning_version": str,
 }
-"""What a run goes on from; weights.ckpt has no more than the weights."""
+"""Entries that a run resumes from; weights.ckpt holds only the weights."""
 _WEIGHTS_ALONE = "holds weights alone, not the state of a run (weights.ckpt is such a file)"
 
 
@@ -137,7 +137,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
 
 
 def _why_unusable(path: Path, model: ModelConfig) -> str | None:
-    """Why a run of this model cannot go on from the checkpoint; None if it can."""
+    """Return why a run of this model cannot resume from the checkpoint; None if it can."""
     try:
         content = read_plain(path)
     except _UNREADABLE as error:
@@ -167,9 +167,9 @@ _FIRST_STAGE = tuple(f"network.{part}." for part in PvRcnnModel.FIRST_STAGE)
 
 
 def initial_weights(config: Config, init: Path | None) -> dict[str, Any]:
-    """What a new run of `config` takes from `init`, by the names of `state_dict`; the rest starts at random.
+    """Return the weights that a new run of `config` takes from `init`, as in `state_dict`; others start at random.
 
-    All weights, but where `model.train_first_stage` is false, those of the first stage alone.
+    These are all weights, or where `model.train_first_stage` is false, those of the first stage.
 
     Args:
         config: of the run.

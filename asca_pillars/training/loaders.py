@@ -102,7 +102,7 @@ class DetectionData(L.LightningDataModule):
         return self._loader(self.training_set, lambda: self.trainer.global_step if self.trainer else 0)
 
     def val_dataloader(self) -> DataLoader[Any]:
-        """All validation frames in order."""
+        """Return batches of all validation frames in order."""
         return self._loader(self.validation_set, None)
 
     def _loader(self, frames: LabeledDataset, step: Callable[[], int] | None) -> DataLoader[Any]:

@@ -162,7 +162,7 @@ def _print(text: str) -> None:
 
 
 def syncs_statistics(model: ModelConfig) -> bool:
-    """Whether BatchNorm takes its statistics from all devices; on CPUs torch has no such thing.
+    """Return whether BatchNorm takes its statistics from all devices; torch does not support that on CPUs.
 
     In a step of two stages a device may have too few keypoints or proposals to take part, and the others would wait
     for its statistics forever. Each has thousands of rows, which are enough for statistics of its own.

@@ -1,4 +1,4 @@
-"""What one step of training and of validation does, whatever the family of detectors."""
+"""Steps of training and of validation, for every family of detectors."""
 
 import functools
 import math

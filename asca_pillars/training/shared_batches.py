@@ -111,7 +111,7 @@ class ShareCollated:
 
 
 def loader_context() -> ForkServerContext:
-    """How `DataLoader` starts its processes.
+    """Return the multiprocessing context in which `DataLoader` starts its processes.
 
     Each process would import torch for itself otherwise: seconds of start, and hundreds of MiB that are shared now.
     """
@@ -121,7 +121,7 @@ def loader_context() -> ForkServerContext:
 
 
 def start_loader_process(_: int) -> None:
-    """What a process does before its first batch."""
+    """Set up a loader process before its first batch."""
     leave_interrupts_to_the_loop()
     # Else the batch would be lost, and the loop would wait for it forever: it notices a process that has ended.
     Queue._on_queue_feeder_error = staticmethod(_end)  # type: ignore[attr-defined]

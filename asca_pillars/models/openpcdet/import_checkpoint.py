@@ -35,7 +35,7 @@ _NOT_LEGACY = re.compile(r"\blegacy['\"]?\s*[=:]\s*False\b")  # in a configurati
 
 
 class ForeignWeights(NamedTuple):
-    """What OpenPCDet or mmdetection3d wrote."""
+    """Weights in a file of OpenPCDet or mmdetection3d."""
 
     path: Path
     state: dict[str, Tensor]

@@ -1,4 +1,4 @@
-"""Which of OpenPCDet's arrays becomes which of ours, and that none is left over on either side."""
+"""Mapping of OpenPCDet's arrays to ours; every array of either side must be matched."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -32,7 +32,7 @@ class Link(NamedTuple):
 
 
 def norm_links(source: str, target: str) -> Iterator[Link]:
-    """Of a normalization."""
+    """Return the links of a normalization layer."""
     return (Link(f"{source}.{part}", f"{target}.{part}") for part in _NORM_PARTS)
 
 
@@ -112,7 +112,7 @@ _LAYOUTS = (
     (0, 4, 1, 2, 3),  # outputs, kernel, inputs: 2.x
     (3, 4, 0, 1, 2),  # kernel, outputs, inputs: 2.x, weights of its native algorithm
 )
-"""Where each layout has the axes (out, in, z, y, x) of a dense convolution."""
+"""Position of the axes (out, in, z, y, x) of a dense convolution in each layout."""
 
 
 def dense_order(pairs: Sequence[tuple[Tensor, Tensor]]) -> Callable[[Tensor], Tensor]:

@@ -34,7 +34,7 @@ _POOLS = {
     "roi_head.roi_grid_pool_layer": "roi_head.bbox_roi_extractor.roi_grid_pool_layer",
 }
 _LAYERS = {"0": "0.conv", "1": "0.bn", "4": "2.conv", "5": "2.bn", "7": "3"}
-"""Of the fully connected layers: OpenPCDet has dropout at 3, mmdetection3d at 1."""
+"""Names of the fully connected layers: OpenPCDet has dropout at 3, mmdetection3d at 1."""
 _NAMES: tuple[tuple[str, _Name], ...] = (
     (r"backbone_2d\.blocks\.(\d+)\.(\d+)", lambda m: f"backbone.blocks.{m[1]}.{int(m[2]) - 1}"),  # without the padding
     (r"backbone_2d\.deblocks", lambda _: "neck.deblocks"),

@@ -94,13 +94,13 @@ def _level(model: PvRcnnModel, source: str) -> int:
 
 
 def _map_order(model: PvRcnnModel) -> Tensor:
-    """Of each channel of our map, which of theirs it is."""
+    """Return for each channel of our map the index of OpenPCDet's."""
     height, channels = model.spec.level_shapes[-1][0], model.network.voxel_channels[-1]
     return torch.arange(height * channels).view(channels, height).T.flatten()
 
 
 def _joined_order(model: PvRcnnModel) -> Tensor:
-    """Of each of our joined channels of a keypoint, which of theirs it is."""
+    """Return for each of our joined channels of a keypoint the index of OpenPCDet's."""
     of_map = _map_order(model)
     widths = {
         each.source: len(each.radii_m) * widths[-1]

@@ -1,4 +1,4 @@
-"""What papers after PV-RCNN add around a keypoint: adaptive scales (AFE-RCNN, 3.2) and adaptive deformation."""
+"""Extensions of PV-RCNN's keypoint features: adaptive scales (AFE-RCNN, 3.2) and adaptive deformation."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -126,7 +126,7 @@ _BLOCK_STRIDES = (1, 2)
 
 
 class FirstStageOutputs(NamedTuple):
-    """What the voxels say."""
+    """Outputs of the first stage."""
 
     levels: list[Tensor]
     """Features (M, channels) of the active voxels of every level."""

@@ -29,14 +29,14 @@ _DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
 
 
 class PvRcnnOutputs(NamedTuple):
-    """What both stages say of B frames."""
+    """Outputs of both stages for B frames."""
 
     maps: HeadMaps[Tensor]
-    """Of the first stage."""
+    """Head maps of the first stage."""
     found: Refinements
-    """Of the second, about `proposals`."""
+    """Refinements of `proposals` by the second stage."""
     proposals: tuple[Detections, ...]
-    """Of each frame: in training those drawn, otherwise all."""
+    """Proposals of each frame: in training the sampled ones, otherwise all."""
 
 
 class PvRcnnDetector(Trainable):
@@ -61,7 +61,7 @@ class PvRcnnDetector(Trainable):
         self.train()  # Lightning gives back the modes that it found
 
     def train(self, mode: bool = True) -> "PvRcnnDetector":
-        """As of `torch.nn.Module`; a first stage that is not trained keeps its statistics."""
+        """Set the mode as `torch.nn.Module.train` does; a first stage that is not trained keeps its statistics."""
         super().train(mode)
         for part in self._kept:
             part.eval()

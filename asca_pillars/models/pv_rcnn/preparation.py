@@ -68,7 +68,7 @@ class LabeledVoxels(NamedTuple):
     """(M,) per frame, or IGNORED."""
 
     def to(self, device: Any) -> "LabeledVoxels":
-        """The same with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         moved: LabeledVoxels = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
         return moved
 

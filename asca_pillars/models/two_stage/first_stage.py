@@ -132,7 +132,7 @@ class _Weights(NamedTuple):
     path: Path
     spec: PillarSpec | None = None
     identity: str = ""
-    """Of the trained weights, of which the bundle's are rounded."""
+    """Identifier of the trained weights; the bundle's are rounded from them."""
 
 
 def _find_weights(source: str) -> _Weights:

@@ -11,16 +11,16 @@ from asca_pillars.models.two_stage.sets import SetAbstraction, VectorPool, mlp
 
 
 class BallSource(NamedTuple):
-    """What keypoints aggregate within balls: raw points, or the voxels of a level."""
+    """Source that keypoints aggregate within balls: raw points, or the voxels of a level."""
 
     channels: int
-    """Of a point besides its position."""
+    """Channels of a point besides its position."""
     radii: int
-    """How many balls around each keypoint."""
+    """Number of balls around each keypoint."""
     widths: Sequence[int]
-    """Of the MLP of each ball."""
+    """Widths of the MLP of each ball."""
     gated: bool = False
-    """Whether `ContextGate` chooses among its features."""
+    """True if its features pass through `ContextGate`."""
 
 
 class SourceRows(NamedTuple):
@@ -47,11 +47,11 @@ class ContextGate(nn.Module):
 
 
 class KeypointEncoder(nn.Module):
-    """What lies around a keypoint at several radii, and the first stage's map under it, fused and weighted.
+    """Keypoint features: balls of several radii and the first stage's map at the keypoint, fused and weighted.
 
     Args:
         sources: what is aggregated within balls.
-        bev_channels: of what is known of a keypoint besides, such as the first stage's map under it.
+        bev_channels: of a keypoint's other features, such as the first stage's map at its position.
         out_channels: of the fused feature.
         weighting_channels: of the hidden layers of the weighting.
     """

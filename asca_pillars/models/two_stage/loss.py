@@ -18,7 +18,7 @@ _LEAST_POSITIVE = 0.01
 
 
 class RefineTargets(NamedTuple):
-    """What the second stage should say; R proposals, K keypoints."""
+    """Training targets of the second stage; R proposals, K keypoints."""
 
     confidence: Tensor
     """(R,) in [0, 1]."""

@@ -40,11 +40,11 @@ POINT_CHANNELS = 1  # reflectance
 
 
 class RefineOutputs(NamedTuple):
-    """What the second stage says of the proposals of B frames."""
+    """Outputs of the second stage for the proposals of B frames."""
 
     found: Refinements
     proposals: tuple[Detections, ...]
-    """Of each frame, which `found` is about."""
+    """Proposals of each frame, which `found` refines."""
 
 
 class RefineDetector(Trainable):

@@ -122,7 +122,7 @@ class PreparedRefinement(NamedTuple):
 
     sample: RefineSample
     proposals: Detections
-    """Those of the sample, in its order."""
+    """Proposals of the sample, in its order."""
     learnt: NDArray[np.bool_]
     """(S,) those that the loss counts."""
 
@@ -135,19 +135,19 @@ class LabeledProposals(NamedTuple):
     learnt: Tensor
     """(R,) bool, the proposals that the loss counts."""
     proposals: tuple[Detections, ...]
-    """Of each frame."""
+    """Proposals of each frame."""
 
     def to(self, device: Any) -> "LabeledProposals":
-        """The same with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         moved: LabeledProposals = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
         return moved
 
 
 class ProposalSource(Protocol):
-    """Where a frame's proposals come from."""
+    """Source of a frame's proposals."""
 
     def __call__(self, frame: LabeledFrame) -> Proposed:
-        """What the first stage says of the frame as it is now."""
+        """Return the first-stage results of the frame in its current, perhaps augmented, state."""
         ...
 
 
@@ -200,7 +200,7 @@ class RefinePreparation:
 
 
 def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig) -> RefinePreparation:
-    """For the frames of `split`, whose proposals are computed where they are not yet on disk.
+    """Return the preparation for the frames of `split`; proposals that are not on disk yet are computed.
 
     Raises:
         AscaError: the first stage cannot be opened, a frame not be read, or a file not be written.
@@ -215,7 +215,7 @@ def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig
 
 
 def live_preparation(model: RefineModel) -> RefinePreparation:
-    """For scans of which nothing is on disk: the first stage runs on each.
+    """Return the preparation for single scans: the first stage runs on each of them.
 
     Raises:
         AscaError: the first stage cannot be opened, or is not the one of the training.

@@ -30,7 +30,7 @@ class ProposalFiles:
     class_names: tuple[str, ...]
 
     def read(self, frame_id: str) -> Proposed:
-        """What the first stage says of a frame.
+        """Read the first-stage results of a frame.
 
         Raises:
             DatasetError: its file is missing or damaged.
@@ -91,7 +91,7 @@ class ProposalCache:
             pass
 
     def _is_current(self, split: LabeledSplit, frame_id: str) -> bool:
-        """Whether the frame's file was made from its scan as it is; of the file only the stamp is read."""
+        """Return whether the frame's file was made from its scan as it is; only the file's stamp is read."""
         try:
             with self.files.path(frame_id).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return np.array_equal(arrays["stamp"], _stamp(split, frame_id))
@@ -115,7 +115,7 @@ def _propose(
 
 
 def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
-    """What tells that the files which the proposals were made from are still the same; empty if one is gone."""
+    """Return the state of the files that the proposals were made from; empty if one is missing."""
     try:
         return np.array(split.points_state(frame_id))
     except FileNotFoundError:  # reported, in words, by whoever reads it
