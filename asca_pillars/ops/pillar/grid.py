@@ -110,7 +110,7 @@ class PillarGrid(Strict):
 
     @property
     def ranges(self) -> Ranges:
-        """The three ranges, for what needs no pillars."""
+        """Detection ranges along x, y, z."""
         return Ranges(self.x_range_m, self.y_range_m, self.z_range_m)
 
     @property
@@ -131,7 +131,7 @@ class PillarGrid(Strict):
 
     @cached_property
     def map_columns(self) -> NDArray[np.int64]:
-        """First column of the pooled map that each column of pillars stands in, (nx,)."""
+        """First column of the pooled map that each column of pillars covers, (nx,)."""
         per_zone = 2 * self._first_zone_columns
         zones = [
             zone * per_zone + (np.arange(self._first_zone_columns << zone) * 2 >> zone) for zone in range(self.zones)
@@ -154,7 +154,7 @@ class PillarGrid(Strict):
         return _read_only(np.linspace(*self.y_range_m, self.ny + 1))
 
     def cells(self, points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
-        """Flat pillar index row * nx + column of each point, or -1 outside the ranges.
+        """Return the flat pillar index row * nx + column of each point, or -1 outside the ranges.
 
         Borders belong to the pillar above them: a point on a range's lower end is inside, on its upper end
         outside. Points and borders are compared as float32, so that a point written as -39.68 stands on a
@@ -180,12 +180,12 @@ class PillarGrid(Strict):
         return cells
 
     def cell_centers_m(self, cells: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Centers x, y of the pillars with these flat indices: (n,) -> (n, 2) float32, metres."""
+        """Return the centers x, y of the pillars with these flat indices: (n,) -> (n, 2) float32, metres."""
         rows, columns = np.divmod(cells, self.nx)
         return np.stack([self.column_centers_m[columns], self.row_centers_m[rows]], axis=-1)
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers of the head map's cells, metres, LiDAR frame: x of its columns (W,), y of its rows (H,).
+        """Return centers of the head map's cells, metres, LiDAR frame: x of its columns (W,), y of its rows (H,).
 
         Zones hold a multiple of HEAD_STRIDE columns, so the two columns of a head cell are equally deep.
         """
@@ -233,7 +233,7 @@ class PillarGrid(Strict):
 
 
 def _interval(values: NDArray[np.float32], edges: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Index of the interval [edges[i], edges[i + 1]) around each value, for evenly spaced edges.
+    """Return index of the interval [edges[i], edges[i + 1]) around each value, for evenly spaced edges.
 
     Equal to np.searchsorted(edges, values, "right") - 1 and several times faster on unsorted values.
     """
@@ -283,7 +283,7 @@ def map_cells(cells: NDArray[np.int64], grid: PillarGrid) -> MapCells[NDArray[np
 def pool_pillars(
     features: NDArray[Value], cells: NDArray[np.int64], grid: PillarGrid
 ) -> tuple[NDArray[Value], NDArray[np.int64]]:
-    """Features (P, C) of pillars at cells (P,) of the grid -> (M, C) and (M,) of the map.
+    """Return features (P, C) of pillars at cells (P,) of the grid -> (M, C) and (M,) of the map.
 
     Steps of a quantized graph may be pooled as well: their order is that of the values.
     """
@@ -343,7 +343,7 @@ def y_advice(span_m: tuple[float, float], v_y_m: float) -> str:
 
 
 def _nearest_ranges(span_m: tuple[float, float], step_m: float) -> str:
-    """The next shorter and longer range: about the origin if `span_m` is, else from the same minimum."""
+    """Return the next shorter and longer range: about the origin if `span_m` is, else from the same minimum."""
     low, high = span_m
     steps = math.floor((high - low) / step_m)
     ranges = []

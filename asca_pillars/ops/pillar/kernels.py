@@ -1,4 +1,4 @@
-"""The loops of `pillarize`, compiled; tests/ops/numpy_kernels.py has them in NumPy.
+"""Compiled loops of `pillarize`; tests/ops/numpy_kernels.py has them in NumPy.
 
 Indices are unsigned where it matters: with others, numba looks for negative ones, which count from the end.
 """

@@ -65,7 +65,7 @@ class NeckRulebooks(NamedTuple, Generic[Array]):
 
 
 class NeckRulebookBuilder:
-    """Builds the rulebooks of scan after scan, in memory of its own: for one thread at a time.
+    """Builder of a neck's rulebooks, which reuses its memory: for one thread at a time.
 
     Args:
         ny, nx: pillars of the map, multiples of 8.
@@ -92,7 +92,7 @@ class NeckRulebookBuilder:
         ]
 
     def build(self, cells: NDArray[np.int64]) -> NeckRulebooks[NDArray[np.int32]]:
-        """Rulebooks of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
+        """Build the rulebooks of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
         self._activate(cells)
         levels = []
         for number in range(LEVELS):
@@ -118,7 +118,7 @@ class NeckRulebookBuilder:
         return NeckRulebooks(tuple(levels), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
 
     def _activate(self, cells: NDArray[np.int64]) -> None:
-        """Find the active cells of every map, as the rule says."""
+        """Activate the cells of every map according to the rule."""
         self._pillars.activate(cells)
         before = self._pillars
         for strided_map, level in zip(self._strided_maps, self._strided, strict=True):
@@ -133,7 +133,7 @@ class NeckRulebookBuilder:
 def stack_neck_rulebooks(
     frames: Sequence[NeckRulebooks[NDArray[np.int32]]], pillars: Sequence[int]
 ) -> NeckRulebooks[NDArray[np.int32]]:
-    """Rulebooks of a batch from those of its frames.
+    """Stack the rulebooks of frames into those of a batch.
 
     Args:
         frames: at least one, all of one map; indices (M, 9) or (M,).

@@ -1,4 +1,4 @@
-"""Points -> pillars: the network's input (paper section 3.2), in training, export and on the vehicle.
+"""Pillarization: the network's input from points (paper section 3.2), for training, export and runtime.
 
 Pillars are flat: the kept points of all pillars stand one after another, and `pillar_index` says whose each
 is. Nothing is padded, so nothing needs to be masked later.

@@ -1,4 +1,4 @@
-"""The loops of `ball_query` and `cube_neighbors`, compiled; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `ball_query` and `cube_neighbors`; tests/ops/numpy_kernels.py has them in NumPy."""
 
 from typing import Any, TypeAlias
 
@@ -95,7 +95,7 @@ def _ball_query(
     sorted_xyz: _Floats,
     found: _Integers,
 ) -> None:
-    """`widths`: of each row of `offsets`, how many columns a ball can reach to either side."""
+    """Kernel of `ball_query`; `widths`: for each row of `offsets`, how many columns a ball reaches to either side."""
     for k in range(len(order)):
         for axis in range(3):
             sorted_xyz[k, axis] = xyz[order[k], axis]
@@ -157,7 +157,7 @@ def _ball_query(
 
 @inner
 def _kept(i: int, distance: float, nearest: _Three, squared: _Three) -> tuple[_Three, _Three]:
-    """The three nearest with one more point, of equally near ones the earlier first."""
+    """Merge a point into the three nearest; of equally near ones the earlier comes first."""
     i0, i1, i2 = nearest
     d0, d1, d2 = squared
     if distance > d2 or (distance == d2 and i > i2):

@@ -1,4 +1,4 @@
-"""The loops of `columns`, `farthest_points` and `bilinear`, compiled; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `columns`, `farthest_points` and `bilinear`; tests/ops/numpy_kernels.py has them in NumPy."""
 
 import math
 from typing import Any
@@ -218,7 +218,7 @@ def _near_circles(
     links: _Integers,
     near: _Floats,
 ) -> int:
-    """`heads`: of each cell, whether a circle covers it or none is near, or where its list begins in `links`.
+    """Kernel of `near_circles`; `heads`: state of a cell (covered, none near), or its first entry in `links`.
 
     `links`: a circle whose border may run through the cell, and where the list goes on.
     """

@@ -1,4 +1,4 @@
-"""The loops of `voxelize`, compiled; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `voxelize`; tests/ops/numpy_kernels.py has them in NumPy."""
 
 import math
 

@@ -23,7 +23,7 @@ Deform = Literal["none", "paper", "authors", "authors_frozen"]
 Source = Literal["points", "conv1", "conv2", "conv3", "conv4"]
 LEVEL_SOURCES: tuple[Source, ...] = ("conv1", "conv2", "conv3", "conv4")
 MOST_VECTOR_CELLS = 7
-"""Along an axis of a cube: more are more weights than keypoints to teach them."""
+"""Upper bound of cells along an axis of a cube; with more, weights outnumber the keypoints that train them."""
 
 
 def _are_radii(radii_m: Sequence[float]) -> bool:
@@ -108,7 +108,7 @@ class VoxelSetSettings(GridSettings):
 
     @property
     def deformed(self) -> tuple[SourceBalls, ...]:
-        """The sources around whose shifted places keypoints look: the levels, if any."""
+        """Sources aggregated around shifted positions: the levels, if there is deformation."""
         return tuple(each for each in self.sources if self.deform != "none" and each.source != "points")
 
     @property
@@ -153,7 +153,7 @@ class VoxelScan(NamedTuple):
 def voxel_scan(
     points: NDArray[np.float32], spec: VoxelSpec, settings: VoxelSetSettings, builder: VoxelRulebookBuilder
 ) -> VoxelScan:
-    """Voxels, tables, keypoints and their neighbors of the finite points (N, 4) of one scan.
+    """Return voxels, rulebooks, keypoints and their neighbors of the finite points (N, 4) of one scan.
 
     Args:
         points: x, y, z in metres, LiDAR frame, and reflectance.
@@ -174,7 +174,7 @@ class VoxelizedScan(NamedTuple):
 
 
 def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelRulebookBuilder) -> VoxelizedScan:
-    """Voxels and tables of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
+    """Return voxels and rulebooks of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
     voxels = voxelize(points, spec.grid, builder.maps[0])
     counts = ScanCounts(len(points), voxels.points_outside, 0)
     return VoxelizedScan(voxels.features, tuple(builder.build()), counts)
@@ -183,7 +183,7 @@ def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelRul
 def with_neighbors(
     points: NDArray[np.float32], voxelized: VoxelizedScan, spec: VoxelSpec, settings: VoxelSetSettings
 ) -> VoxelScan:
-    """Keypoints among the points (N, 4), metres, LiDAR frame, and what lies around them, see `voxel_scan`."""
+    """Return the scan with keypoints among the points (N, 4), metres, LiDAR frame, and neighbors, see `voxel_scan`."""
     features, levels, counts = voxelized
     inside = np.ascontiguousarray(points[spec.grid.inside(points)])
     keypoints = np.ascontiguousarray(inside[farthest_points(inside, settings.keypoints), :3])

@@ -1,4 +1,4 @@
-"""One voxel detector's numbers, all that training and the vehicle must agree on. `bundle.json` carries it."""
+"""Spec of a voxel detector, shared by training, export and runtime; stored in `bundle.json`."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +15,7 @@ from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
 from asca_pillars.ops.sparse.rulebooks import Convolution, Shape
 
 MAP_MULTIPLE = 2
-"""The blocks of the neck that halve the map do so once."""
+"""Required divisor of the map's rows and columns: the neck halves the map once."""
 
 
 @dataclass(frozen=True)

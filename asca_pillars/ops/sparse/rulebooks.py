@@ -1,4 +1,4 @@
-"""Sparse convolutions: which cells a kernel joins, the active cells of a lattice, and the rulebooks between two.
+"""Rulebooks of sparse convolutions: geometry of a convolution, active cells of a lattice, links between lattices.
 
 A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row
 at which its column starts plus the number of bits set below it. No hash, no sort. Active cells are ordered by
@@ -55,14 +55,14 @@ class Convolution:
                 )
 
     def output_shape(self, shape: Shape) -> Shape:
-        """Cells of the output for an input of this shape."""
+        """Return cells of the output for an input of this shape."""
         sizes = zip(shape, self.kernel, self.stride, self.padding, strict=True)
         z, y, x = ((size + 2 * padding - kernel) // stride + 1 for size, kernel, stride, padding in sizes)
         return z, y, x
 
     @property
     def taps(self) -> int:
-        """K, the kernel's cells."""
+        """Number of taps K of the kernel."""
         return math.prod(self.kernel)
 
     def inputs(self, outputs: Shape, inputs: Shape) -> Links:
@@ -151,7 +151,7 @@ class CellMap:
         self._list_cells(self._kernels.mark_points(cell_of_point, self.shape[0], *self.columns))
 
     def activate_joined(self, sources: Sequence[tuple["CellMap", Links]]) -> None:
-        """Make active what any tap joins with an active cell of any of the sources, none of which may be this map."""
+        """Activate the cells that any tap joins with an active cell of a source; this map must not be a source."""
         self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
         found = 0
         for source, links in sources:
@@ -159,13 +159,13 @@ class CellMap:
         self._list_cells(found)
 
     def _list_cells(self, count: int) -> None:
-        """Make active what the kernels have marked, so many cells."""
+        """Activate the cells that the kernels have marked, of this number."""
         cells = np.empty(count + 1, np.int64)
         self._kernels.list_cells(*self.columns, self.shape[0], cells)
         self.cells = cells[:count]
 
     def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
-        """Index of the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
+        """Return the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
 
         With `Convolution.inputs` it is what the convolution from `source` to this map reads. With `outputs` it is
         the inverse that its backward pass reads: which output, of the map `source`, each input was read by.
@@ -175,7 +175,7 @@ class CellMap:
         return table
 
     def places(self, parents: "CellMap", halvings: int) -> NDArray[np.int32]:
-        """Row of each active cell of this map among the outputs of an upsampling that does not overlap.
+        """Return the row of each active cell of this map among the outputs of a non-overlapping upsampling.
 
         Seen from above (one cell along z). Each parent cell has s^2 outputs, s = 2^halvings, its row of them before
         the next parent's, (y, x) within the parent: (N,) int32, len(parents) * s^2 where the parent is not active.
@@ -189,7 +189,7 @@ class CellMap:
 
 
 class Join(NamedTuple):
-    """A convolution between two maps; made once, as they are, for scan after scan."""
+    """Convolution between two maps; made once for scan after scan."""
 
     source: CellMap
     target: CellMap
@@ -208,7 +208,7 @@ class Join(NamedTuple):
 
 
 def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
-    """The convolution from one map to another."""
+    """Return the join of two maps by a convolution."""
     inputs = convolution.inputs(target.shape, source.shape)
     return Join(source, target, inputs, convolution.outputs(source.shape, target.shape))
 

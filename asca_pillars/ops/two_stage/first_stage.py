@@ -28,7 +28,7 @@ class FirstPass(NamedTuple):
 
 
 class FirstStage(Protocol):
-    """A trained one-stage detector that hands out its neck's map: a bundle or a checkpoint."""
+    """Trained one-stage detector that also returns its neck's map: a bundle or a checkpoint."""
 
     @property
     def spec(self) -> DetectorSpec:
@@ -70,7 +70,7 @@ class Proposed:
     """First-stage results of one scan that the second stage reads."""
 
     proposals: Detections
-    """R of them."""
+    """R proposals."""
     keypoints: NDArray[np.float32]
     """(K, 3) positions in metres, LiDAR frame."""
     bev: NDArray[np.float32]

@@ -17,7 +17,7 @@ from asca_pillars.ops.two_stage.first_stage import Proposed
 from asca_pillars.ops.two_stage.rois import roi_grid_points
 
 ROI_FEATURES = 4
-"""Columns of `roi_features` beside one for each class."""
+"""Columns of `roi_features` besides the one-hot class."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class RefineSettings(GridSettings):
     """Balls and grids of the second stage."""
 
     ball_radii_m: tuple[float, ...] = (0.4, 0.8)
-    """Around keypoints, in which raw points are aggregated."""
+    """Radii of the balls around keypoints in which raw points are aggregated."""
     ball_samples: int = 16
 
     def __post_init__(self) -> None:
@@ -63,7 +63,7 @@ class GridNeighbors(NamedTuple):
 
 @dataclass(frozen=True)
 class RefineScan:
-    """One scan as the second stage takes it; `models.two_stage.layers.RefineInputs` says what each array is."""
+    """Input of the second stage for one scan; `models.two_stage.layers.RefineInputs` describes the arrays."""
 
     points: NDArray[np.float32]
     keypoints: NDArray[np.float32]
@@ -81,11 +81,11 @@ def refine_scan(
     settings: RefineSettings,
     executor: Executor | None = None,
 ) -> RefineScan:
-    """Neighbours for some proposals of a scan, in their order.
+    """Return the neighbors for some proposals of a scan, in their order.
 
     Args:
         points: (N, 4) of the scan.
-        proposed: what the first stage says of it.
+        proposed: first-stage results of it.
         proposals: those of them to be refined.
         executor: of a thread for the grids' neighbours, while those of the keypoints are sought in this one.
     """
