@@ -26,11 +26,11 @@ _DIGEST_BYTES = 32
 _log = logging.getLogger(__name__)
 
 inner = numba.njit(no_cpython_wrapper=True, **_PLAIN)
-"""Decorates what is called by compiled functions of the same file alone."""
+"""Decorator of functions that only compiled functions of the same file call."""
 
 
 def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: compiled for arguments of these types when it is imported, cached as by `cached`."""
+    """Return a decorator that compiles for arguments of these types at import, cached as by `cached`."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         kept = cached(nogil=True, **_PLAIN)(function)
@@ -43,7 +43,7 @@ def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., An
 
 
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: `numba.njit` with these options, whose results are kept where a folder for them can be written.
+    """Return the decorator `numba.njit` with these options, cached where a folder can be written.
 
     Where there is none, each process compiles for itself, some seconds, and is then as fast as others.
     """
@@ -59,17 +59,17 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 def given(dtype: Any, axes: int = 1) -> Any:
-    """Type of an array that is only read."""
+    """Return the type of an array that is only read."""
     return types.Array(dtype, axes, "C", readonly=True)
 
 
 def written(dtype: Any, axes: int = 1) -> Any:
-    """Type of an array that is written: results, or room to work in."""
+    """Return the type of an array that is written: results, or scratch memory."""
     return types.Array(dtype, axes, "C")
 
 
 class _CheckedCache(FunctionCache):
-    """numba's cache of a function, in files that tell whether they are whole."""
+    """numba's cache of a function, in files with digests."""
 
     warned = False  # once a process, of the first function
 

@@ -1,4 +1,4 @@
-"""Errors that are the user's to mend: one line that names the file, the value and the remedy.
+"""User errors: one line that names the file, the value and the remedy.
 
 Exit codes of the command line are those of the errors' kinds; docs/guide/deploy.md lists them.
 """
@@ -52,7 +52,7 @@ class BundleError(AscaError):
 
 
 class OutputError(AscaError):
-    """A place to write to that holds something which is not ours to replace."""
+    """An output place that holds something that must not be replaced."""
 
     exit_code = USAGE
 

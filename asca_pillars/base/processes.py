@@ -33,7 +33,7 @@ def in_processes(
     progress: bool = True,
     console: Console | None = None,
 ) -> Iterator[Result]:
-    """The results of a job for each item, in the order of the items, each as soon as it is there.
+    """Yield the results of a job for each item, in the order of the items, each as soon as it is there.
 
     Args:
         job: one that can be sent to a process, if more than one works.
@@ -74,7 +74,7 @@ class _Failed(NamedTuple):
 
 @contextlib.contextmanager
 def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
-    """Processes that do a job for the items that they are sent, and end with the block.
+    """Start processes that run a job on the items sent to them, until the block ends.
 
     Raises:
         WorkerError: one cannot be started.
@@ -103,7 +103,7 @@ def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
 
 
 def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]:
-    """The results of the items, in their order.
+    """Yield the results of the items in their order.
 
     Raises:
         Exception: that of the job.

@@ -33,7 +33,7 @@ class Reporter:
             self._remark(text)
 
     def track(self, items: Iterable[Item], step: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
-        """The items; after each one the progress callback is called.
+        """Yield the items; after each one the progress callback is called.
 
         Args:
             items: to pass on.
@@ -53,4 +53,4 @@ class Reporter:
 
 
 SILENT = Reporter()
-"""Reports to nobody; for functions that only track."""
+"""Reporter without callbacks; for functions that only track."""

@@ -1,4 +1,4 @@
-"""The base of settings, and numbers within their bounds. Geometry has settings, too, and shall not need pydantic."""
+"""Base class of settings, and checks of bounds; free of pydantic, for `geometry`."""
 
 import math
 import reprlib

@@ -1,4 +1,4 @@
-"""Ray, which runs shards on the workers of a cluster. Nothing else in the package knows of it."""
+"""Shards on the workers of a Ray cluster; no other module uses Ray."""
 
 import contextlib
 import logging

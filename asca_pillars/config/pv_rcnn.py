@@ -89,7 +89,7 @@ class PvRcnnModel(Strict):
     """
 
     FIRST_STAGE: ClassVar[tuple[str, ...]] = ("voxels", "neck", "head")
-    """The parts of the network that propose, by the names of `PvRcnn`."""
+    """Parts of the network that propose, by the names of `PvRcnn`."""
 
     kind: Literal["pv_rcnn"] = "pv_rcnn"
     spec: VoxelSpec = field(default_factory=VoxelSpec)

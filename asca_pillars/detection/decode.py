@@ -1,4 +1,4 @@
-"""Head maps -> Detections: threshold, decode, non-maximum suppression. The last stop of every runtime."""
+"""Decoding of head maps to Detections: thresholds, box decoding, non-maximum suppression."""
 
 import math
 import reprlib
@@ -29,7 +29,7 @@ class PostProcess(Strict):
     """Settings for decoding head maps into detections."""
 
     nms_iou: float = 0.01
-    """Of two boxes of a class with a higher BEV IoU, NMS keeps the better one."""
+    """BEV IoU of two boxes of a class above which NMS keeps only the better one."""
     candidates: int = 1000
     """Best boxes of each class that enter the suppression."""
     max_detections: int = 100
@@ -83,7 +83,7 @@ def decode(
     cells: NDArray[np.integer[Any]] | None = None,
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Detections:
-    """Detections of one scan, best first.
+    """Decode the detections of one scan, best first.
 
     Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
     rotated NMS seen from above. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
@@ -109,7 +109,7 @@ def decode_candidates(
     cells: NDArray[np.integer[Any]] | None = None,
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Candidates:
-    """The first half of `decode`: what reaches its class's threshold, (n, 7) boxes in the LiDAR frame.
+    """Return the first half of `decode`: what reaches its class's threshold, (n, 7) boxes in the LiDAR frame.
 
     Raises:
         ValueError: if maps, anchors and classes do not belong together.
@@ -151,9 +151,9 @@ def decode_candidates(
 def suppress(
     candidates: Candidates, classes: tuple[ClassSpec, ...], post: PostProcess, most: int | None = None
 ) -> Detections:
-    """The second half of `decode`: (n, 7) candidates -> those that the rotated NMS of their class keeps, best first.
+    """Suppress (n, 7) candidates by the rotated NMS of their class, the second half of `decode`; best first.
 
-    Of each class no more than `most`.
+    At most `most` of each class are kept.
     """
     boxes, logits, labels, non_finite = candidates
     limit = post.max_detections if most is None else min(most, post.max_detections)
@@ -175,7 +175,7 @@ def nms_by_class(
     iou_threshold: float,
     limit: int | None = None,
 ) -> NDArray[np.int64]:
-    """`rotated_nms` within each class: (N, 7), (N,), (N,) -> indices of the kept boxes, class after class."""
+    """Apply `rotated_nms` within each class: (N, 7), (N,), (N,) -> indices of the kept boxes, class after class."""
     kept = [np.empty(0, np.int64)]
     for label in np.unique(labels):
         own = np.flatnonzero(labels == label)
@@ -186,7 +186,7 @@ def nms_by_class(
 def rotated_nms(
     boxes: NDArray[np.floating[Any]], scores: NDArray[np.floating[Any]], iou_threshold: float, limit: int | None = None
 ) -> NDArray[np.int64]:
-    """Greedy suppression by `bev_iou`: indices of the kept boxes, by descending score; of the first `limit` of them.
+    """Return indices of the boxes that greedy NMS by `bev_iou` keeps, by descending score, at most `limit`.
 
     A box is dropped if a kept, better one overlaps it by more than `iou_threshold`. Of equal scores the
     earlier goes first.
@@ -203,7 +203,7 @@ def rotated_nms(
 def _candidates(
     scores: NDArray[np.float32], labels: NDArray[np.int64] | None, classes: tuple[ClassSpec, ...], limit: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
+    """Return anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
 
     `labels` (M, A) are the classes that the scores are for; None: each anchor's own.
 
@@ -228,7 +228,7 @@ def _candidates(
 
 
 def _labels(anchor: NDArray[np.int64], row: NDArray[np.int64], labels: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    """Classes (n,) of what anchors (n,) in rows (n,) of `labels` (M, A) say, see `_candidates`."""
+    """Return the classes (n,) in `labels` (M, A) of anchors (n,) in rows (n,), see `_candidates`."""
     return anchor // len(ANCHOR_YAWS_RAD) if labels is None else labels[row, anchor]
 
 
@@ -239,5 +239,5 @@ def _logit(probability: float) -> float:
 
 
 def sigmoid(logits: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """Scores in [0, 1], any shape."""
+    """Return scores in [0, 1] from logits of any shape."""
     return np.exp(-np.logaddexp(0.0, -logits.astype(np.float64))).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The result: what was found in one scan."""
+"""Result of a detector: the boxes of one scan, and the report on it."""
 
 import json
 from collections import Counter
@@ -69,7 +69,7 @@ class Detections:
 
     @classmethod
     def empty(cls, class_names: tuple[str, ...]) -> "Detections":
-        """No boxes."""
+        """Return no boxes."""
         return cls(np.empty((0, 7), np.float32), np.empty(0, np.float32), np.empty(0, np.int64), class_names)
 
     def __len__(self) -> int:
@@ -112,7 +112,7 @@ class Detections:
         ]
 
     def to_json(self) -> str:
-        """`to_dicts` as JSON text."""
+        """Return `to_dicts` as JSON text."""
         return json.dumps(self.to_dicts())
 
 
@@ -129,14 +129,14 @@ class ScanCounts:
 
 
 def summed(counts: Sequence[ScanCounts]) -> ScanCounts:
-    """The counts of a scan's passes, all of one family, added up."""
+    """Sum the counts of a scan's passes, all of one family."""
     first = counts[0]
     return type(first)(**{name.name: sum(getattr(one, name.name) for one in counts) for name in fields(first)})
 
 
 @dataclass(frozen=True)
 class FrameReport:
-    """Record of one scan on its way to the boxes."""
+    """Report on one scan: times, counts, warnings."""
 
     times_ms: dict[str, float]
     """Wall time of each stage by name: "input" (check and conversion of the points), then those of the family."""

@@ -52,7 +52,7 @@ class DetectorSpec(Strict, ABC):
 
     @abstractmethod
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
+        """Return centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
 
     def anchor_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return anchor centers, as `head_centers_m`; a family may place them elsewhere than in the cells' centers."""
@@ -89,7 +89,7 @@ class DetectorSpec(Strict, ABC):
         )
 
     def decode(self, maps: HeadMaps[NDArray[np.float32]], cells: NDArray[np.integer[Any]] | None = None) -> Detections:
-        """Detections, LiDAR frame, from head maps of one scan, (channels, H, W) each.
+        """Decode head maps of one scan, (channels, H, W) each, into detections, LiDAR frame.
 
         With `cells` (M,), flat indices: from rows (M, channels) of these head cells.
         """
