@@ -1,4 +1,4 @@
-"""The one place where a model's section of the configuration becomes a network."""
+"""Construction of networks from a model's section of the configuration."""
 
 from typing import assert_never
 
@@ -17,7 +17,7 @@ from asca_pillars.models.two_stage.preparation import cached_preparation
 
 
 def build_model(model: ModelConfig) -> Trainable:
-    """The network that `model` describes, with fresh random weights.
+    """Build the network that `model` describes, with fresh random weights.
 
     Raises:
         ConfigError: `model` does not say enough about its first stage.

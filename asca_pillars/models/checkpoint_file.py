@@ -1,4 +1,4 @@
-"""A checkpoint as it lies on disk: its configuration and weights, before there is a network for them."""
+"""Checkpoint files: configuration and weights, before a network is built."""
 
 import hashlib
 import pickle
@@ -81,7 +81,7 @@ def _damaged(path: Path, error: Exception) -> TrainingError:
 
 
 def read_plain(path: Path) -> dict[str, Any]:
-    """The dictionary that a file of `torch.save` holds, weights only: nothing in the file is executed.
+    """Read the dictionary in a file of `torch.save`, weights only: nothing in the file is executed.
 
     Raises:
         ValueError: it holds something else than a dictionary.
@@ -134,7 +134,7 @@ def save_weights(checkpoint: Path, path: Path) -> None:
 
 
 def weights_sha256(weights: Mapping[str, Tensor]) -> str:
-    """SHA-256 of a network's trained arrays (its `state_dict`, on the CPU): names, shapes, values, sorted by name.
+    """Return the SHA-256 of a network's trained arrays (`state_dict`): names, shapes, values, sorted by name.
 
     It is that of the weights as they are computed with: last.ckpt and weights.ckpt of one run may differ, because the
     latter's were rounded to 16 bits.

@@ -13,7 +13,7 @@ NORM_EPS, NORM_MOMENTUM = 1e-3, 0.01  # as in SECOND and PointPillars
 
 
 def as_map(cells: Tensor) -> Tensor:
-    """A map whose channels lie side by side, as convolutions read it: (B, H, W, C) -> (B, C, H, W).
+    """Permute a channels-last map for convolutions: (B, H, W, C) -> (B, C, H, W).
 
     They lie so in memory after it, too, which suits convolutions; but on a CPU without AVX-512 their gradients then
     take twice the time, and the map is copied.
@@ -25,7 +25,7 @@ def as_map(cells: Tensor) -> Tensor:
 
 
 def convolution_block(in_channels: int, channels: int, convs: int, *, stride: int = 2) -> nn.Sequential:
-    """A 3x3 convolution with this stride and `convs` with stride 1, each with BatchNorm and ReLU.
+    """Build a 3x3 convolution with this stride and `convs` with stride 1, each with BatchNorm and ReLU.
 
     Table 1 of ASCA-PointPillars prints padding 0 for some strided convolutions and yet halves the maps exactly: one
     pixel of zeros is what both need.
@@ -37,7 +37,7 @@ def convolution_block(in_channels: int, channels: int, convs: int, *, stride: in
 
 
 def upsampling(in_channels: int, channels: int, stride: int) -> nn.Sequential:
-    """A transposed convolution whose kernel is its stride, with BatchNorm and ReLU."""
+    """Build a transposed convolution whose kernel is its stride, with BatchNorm and ReLU."""
     return nn.Sequential(
         *_normed(nn.ConvTranspose2d(in_channels, channels, stride, stride=stride, bias=False), channels)
     )
@@ -130,7 +130,7 @@ class SSDHead(nn.Module):
         return [part.out_channels for part in (self.scores, self.boxes, self.directions)]
 
     def joined(self) -> tuple[Tensor, Tensor]:
-        """The three convolutions as one product: weight (outputs, C) and bias (outputs,), split by `channels`."""
+        """Return the convolutions as one product: weight (outputs, C) and bias (outputs,), split by `channels`."""
         parts = self.scores, self.boxes, self.directions
         weight = torch.cat([part.weight[:, :, 0, 0] for part in parts])
         return weight, torch.cat([part.bias for part in parts if part.bias is not None])

@@ -20,7 +20,7 @@ from asca_pillars.scans.mounting import Mounting
 
 
 class ScanDetector:
-    """Detect objects in one scan after the other.
+    """Detector of single scans in PyTorch.
 
     Args:
         network: in evaluation mode; its scans are computed where its weights are.
@@ -49,7 +49,7 @@ class ScanDetector:
 
 
 class OpenedCheckpoint(NamedTuple):
-    """A checkpoint that detects, its configuration, and what a report says about it."""
+    """Opened checkpoint: detector, configuration, and description for a report."""
 
     detector: ScanDetector
     config: Config

@@ -21,10 +21,10 @@ class Movable(Protocol):
 
 
 class Preparation(Protocol):
-    """Frames to input and targets of a network. Loader processes do it, so it is pickled and holds no weights."""
+    """Conversion of frames to a network's input and targets. Pickled for loader processes, so it holds no weights."""
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> Any:
-        """One frame, NumPy arrays only.
+        """Prepare one frame, as NumPy arrays only.
 
         Args:
             frame: points and boxes in the LiDAR frame; boxes may lie outside the detector's ranges.
@@ -44,16 +44,16 @@ class Trainable(nn.Module, ABC):
     """
 
     preparation: Preparation
-    """Prepares its batches."""
+    """Preparation of its batches."""
 
     @abstractmethod
     def predict(self, batch: Any) -> Any:
-        """Outputs of the network for a batch that `preparation.collate` made."""
+        """Return the outputs of the network for a batch that `preparation.collate` made."""
 
     @abstractmethod
     def loss(self, outputs: Any, batch: Any) -> Mapping[str, Tensor]:
-        """Weighted terms of the loss by name, scalars; training minimizes their sum."""
+        """Return the weighted terms of the loss by name, scalars; training minimizes their sum."""
 
     @abstractmethod
     def detect(self, outputs: Any, spec: DetectorSpec) -> list[Detections]:
-        """Detections of each of the B frames, best first, with the thresholds of `spec`."""
+        """Return detections of each of the B frames, best first, with the thresholds of `spec`."""

@@ -14,17 +14,17 @@ _NAMED = 5  # of the names that do not fit
 
 
 def as_it_is(array: Tensor) -> Tensor:
-    """Unitless weights (out, in, ...) as they are, and arrays of any other shape."""
+    """Return unitless weights (out, in, ...), and arrays of any other shape, unchanged."""
     return array
 
 
 def without_singletons(array: Tensor) -> Tensor:
-    """A 1x1 convolution's unitless weight (out, in, 1, ...) as a linear layer's (out, in)."""
+    """Reshape a 1x1 convolution's unitless weight (out, in, 1, ...) to a linear layer's (out, in)."""
     return array.flatten(1) if array.shape[2:].numel() == 1 else array
 
 
 class Link(NamedTuple):
-    """One array: its name there, its name here, and how it is laid out anew."""
+    """Mapping of one array: source name, target name, conversion."""
 
     source: str
     target: str
@@ -39,7 +39,7 @@ def norm_links(source: str, target: str) -> Iterator[Link]:
 def convert_state(
     state: Mapping[str, Tensor], links: Iterable[Link], wanted: Mapping[str, Tensor], blamed: str
 ) -> dict[str, Tensor]:
-    """Our state dict from theirs; every array of theirs is used, or named in the error.
+    """Convert their state dict to ours; every array of theirs is used, or named in the error.
 
     Args:
         state: theirs by name: unitless weights (out, in, ...) and the (C,) values of normalizations.
@@ -86,7 +86,7 @@ _HEADS = {"scores": "conv_cls", "boxes": "conv_box", "directions": "conv_dir_cls
 
 
 def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as_it_is) -> Iterator[Link]:
-    """Links of `backbone_2d` and `dense_head`.
+    """Return links of `backbone_2d` and `dense_head`.
 
     Args:
         block_convs: convolutions of each block after its first.
@@ -116,7 +116,7 @@ _LAYOUTS = (
 
 
 def dense_order(pairs: Sequence[tuple[Tensor, Tensor]]) -> Callable[[Tensor], Tensor]:
-    """The conversion of a network's unitless sparse weights to (out, in, z, y, x): the layout that fits all of them.
+    """Return the conversion of unitless sparse weights to (out, in, z, y, x), by the layout that fits all of them.
 
     Layers with as many inputs as outputs fit two of the layouts; all layers of a file have the same.
 

@@ -23,7 +23,7 @@ _OLD_FEATURES = 9  # of a point before 1.0, where boxes had other axes, too
 
 
 def _part(layer: str, layers: int) -> str:
-    """The name within a module of what stands `layer`-th where each module is counted as so many layers."""
+    """Return `conv` or `bn` for OpenPCDet's layer number, where each module counts `layers` layers."""
     return ("conv", "bn")[int(layer) % layers]
 
 
@@ -52,13 +52,13 @@ _NAMES: tuple[tuple[str, _Name], ...] = (
     (r"roi_head\.(shared_fc|cls|reg)_layers?\.(\d)", lambda m: f"roi_head.bbox_head.{m[1]}_layer.{_LAYERS[m[2]]}"),
     (r"dense_head\.conv_box", lambda _: "dense_head.conv_reg"),
 )
-"""OpenPCDet's beginnings of names, and what stands there instead."""
+"""Prefixes of OpenPCDet's names, and their replacements."""
 
 
 def mmdetection3d_links(
     model: PillarModel | PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, legacy: bool = True
 ) -> Iterator[Link]:
-    """Links for our network of this model.
+    """Return links for our network of this model.
 
     Args:
         model: ours.
@@ -80,7 +80,7 @@ def mmdetection3d_links(
 
 
 def mmdetection3d_name(name: str, head: str = "rpn_head") -> str:
-    """mmdetection3d's name of an array of OpenPCDet's; `head` is that of its head on anchors."""
+    """Return mmdetection3d's name of an array of OpenPCDet's; `head` is that of its head on anchors."""
     for pattern, other in _NAMES:
         if match := re.match(pattern + r"(?=\.)", name):
             name = other(match) + name[match.end() :]

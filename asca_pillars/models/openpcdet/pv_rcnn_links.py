@@ -19,7 +19,7 @@ _JOINED = ("points", *LEVEL_SOURCES)  # after the map
 
 
 def pv_rcnn_links(model: PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Links for `build_pv_rcnn(model)` without what later papers add.
+    """Return the links for `build_pv_rcnn(model)` without extensions by later papers.
 
     Args:
         model: ours.
@@ -115,7 +115,7 @@ def _joined_order(model: PvRcnnModel) -> Tensor:
 
 
 def _channels_of(order: Tensor) -> Callable[[Tensor], Tensor]:
-    """Input channels in another order, and no singleton axes behind them unless it is a convolution's kernel."""
+    """Reorder input channels, and drop singleton axes behind them unless it is a convolution's kernel."""
 
     def convert(weight: Tensor) -> Tensor:
         weight = without_singletons(weight)

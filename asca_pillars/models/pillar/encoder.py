@@ -62,7 +62,7 @@ class _ChannelMixing(nn.Module, ABC):
 
     @abstractmethod
     def mixing(self, features: Tensor) -> Tensor:
-        """(C, C) of the pillars (P, C) of one frame, unitless."""
+        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
 
     def forward(self, features: Tensor) -> Tensor:
         """Unitless features (P, C) -> (P, C) for the pillars of one frame."""
@@ -76,9 +76,9 @@ class _ChannelMixing(nn.Module, ABC):
 
 
 class ChannelLinear(_ChannelMixing):
-    """No attention, but the layer that `ChannelAttention` would be if it were the same for every frame.
+    """Control without attention: a learned C x C mixing matrix that is the same for every frame.
 
-    It tells what of the attention's effect is that of one more linear layer. Training starts at the identity, near
+    It separates the effect of attention from that of one more linear layer. Training starts at the identity, near
     which channel attention starts, too.
     """
 
@@ -89,7 +89,7 @@ class ChannelLinear(_ChannelMixing):
         nn.init.zeros_(self.restore.bias)
 
     def mixing(self, features: Tensor) -> Tensor:
-        """(C, C), unitless, whatever the features (P, C)."""
+        """Return the mixing matrix (C, C), unitless, which does not depend on the features (P, C)."""
         return self.restore.weight
 
 
@@ -113,7 +113,7 @@ class ChannelAttention(_ChannelMixing):
         self.temperature = nn.Parameter(torch.ones(1))
 
     def mixing(self, features: Tensor) -> Tensor:
-        """(C, C) of the pillars (P, C) of one frame, unitless."""
+        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
         gram = features.T @ features  # (C, C)
         query, key = self.query.weight, self.key.weight
         products = query @ gram @ key.T  # of queries and keys, summed over the pillars
@@ -175,9 +175,9 @@ def _(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
 
 
 def pillar_max(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-    """Largest value of each channel among the points of each pillar: unitless features (M, C) -> (P, C).
+    """Return the channel-wise maximum over the points of each pillar: unitless features (M, C) -> (P, C).
 
-    Points lie flat, without padding, so nothing but real points can win. While a graph is exported the reduction is
+    Points lie flat, without padding, so only real points are compared. While a graph is exported the reduction is
     one named operator, because the exporter knows no segment reduction (asca_export.graphs translates it).
     """
     if torch.compiler.is_exporting():

@@ -41,7 +41,7 @@ class LossTerms(NamedTuple):
 
     @property
     def total(self) -> Tensor:
-        """Eq. (15), the unitless scalar that training minimizes."""
+        """Total loss, eq. (15), a unitless scalar."""
         return self.box + self.classification + self.direction
 
 
@@ -89,7 +89,7 @@ def states_by_class(state: Tensor, scores: int) -> Tensor:
 
 
 def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
-    """The targets of the anchors at M active head cells; the others take no part.
+    """Return the targets of the anchors at M active head cells; the others take no part.
 
     Args:
         targets: of whole maps.
@@ -142,7 +142,7 @@ def quality_focal_loss(logits: Tensor, state: Tensor, quality: Tensor, alpha: fl
 
 
 def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
-    """3D IoU of each positive anchor's predicted box with the one it is to find: (n, 7) -> (n,), without gradient."""
+    """Return the 3D IoU of positive anchors' predicted boxes with their targets: (n, 7) -> (n,), without gradient."""
     anchors, directions = targets.anchors.cpu().numpy(), targets.directions.cpu().numpy()
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows overlaps nothing
         # Half a turn changes no overlap, so the direction that is predicted does not matter.
@@ -164,6 +164,6 @@ def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
 
 
 def _by_anchor(maps: Tensor, values: int) -> Tensor:
-    """(B, A * values, H, W) or (M, A * values) -> (anchors, values), in the order of the targets."""
+    """Reshape (B, A * values, H, W) or (M, A * values) to (anchors, values), in the order of the targets."""
     rows = maps if maps.ndim == 2 else maps.permute(0, 2, 3, 1)
     return rows.reshape(-1, values)

@@ -18,7 +18,7 @@ assert math.prod(_STRIDES) == NECK_STRIDE, "what the grid is made for"
 
 
 class RPNNeck(MapBackbone):
-    """The neck of Table 1, everywhere on the map: three blocks that halve it, 384 channels with Table 1's widths."""
+    """Dense neck of Table 1: three blocks that halve the map, 384 channels with Table 1's widths."""
 
     def __init__(self, *widths: Any) -> None:
         super().__init__(*widths, strides=_STRIDES, head_stride=HEAD_STRIDE)
@@ -70,13 +70,13 @@ class SparseRPNNeck(MapBackbone):
 
 
 def block_layers(block: nn.Module) -> Iterator[tuple[Any, Any]]:
-    """Each convolution of a block, and the normalization that follows it."""
+    """Return each convolution of a block with the normalization that follows it."""
     children = list(block.children())
     return zip(children[0::3], children[1::3], strict=True)
 
 
 def _upsampled(deblock: nn.Module, features: Tensor, places: Tensor) -> Tensor:
-    """A deblock at active parents (N, C), read at head cells: (M, upsample_channels)."""
+    """Apply a deblock at active parents (N, C), and read it at head cells: (M, upsample_channels)."""
     transposed, norm, _ = deblock.children()
     assert isinstance(transposed, nn.ConvTranspose2d)
     by_place = transposed.weight.movedim(1, -1).flatten(1).T  # (stride^2 * channels, C)

@@ -32,7 +32,7 @@ class Placement(NamedTuple):
 
 
 class TargetedPillars(NamedTuple):
-    """One frame: its pillars, where they stand on the map, and the targets of its anchors."""
+    """One frame: its pillars, their positions on the map, and the targets of its anchors."""
 
     pillars: Pillars
     placement: Placement
@@ -91,7 +91,7 @@ class PillarPreparation:
     assigner: Assigner = "overlap"
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> TargetedPillars:
-        """Pillars of a frame and the targets of its anchors; nothing is drawn."""
+        """Return the pillars of a frame and the targets of its anchors; nothing is random."""
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points)
@@ -101,7 +101,7 @@ class PillarPreparation:
         return TargetedPillars(pillars, self.place(pillars), targets)
 
     def collate(self, frames: Sequence[TargetedPillars]) -> LabeledPillars:
-        """Frames as one batch."""
+        """Collate frames into one batch."""
         return LabeledPillars(
             batch_pillars([frame.pillars for frame in frames], [frame.placement for frame in frames]),
             batch_targets([frame.targets for frame in frames]),
@@ -118,7 +118,7 @@ class PillarPreparation:
 
 
 def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = ()) -> PillarBatch:
-    """Pillars of several frames, one frame's after the other's.
+    """Concatenate the pillars of several frames.
 
     Args:
         frames: at least one, each with features (M, 9), positions among them in metres, and flat indices (P,).
@@ -168,7 +168,7 @@ def _batch_poolings(
 
 
 def batch_targets(frames: Sequence[Targets]) -> TargetBatch:
-    """Targets of the anchors of several frames, one frame's after the other's."""
+    """Concatenate the anchor targets of several frames."""
     anchors_per_frame = frames[0].state.size
     return TargetBatch(
         state=torch.from_numpy(np.stack([frame.state for frame in frames])),

@@ -1,4 +1,4 @@
-"""PV-RCNN (arXiv 1912.13192): voxels propose, keypoints refine."""
+"""Layers and network of PV-RCNN (arXiv 1912.13192)."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -84,7 +84,7 @@ class SparseConvBlock(nn.Module):
 
 
 class VoxelBackbone(nn.Module):
-    """conv1 to conv4 and conv_out: each level halves the lattice before it.
+    """Sparse 3D backbone, conv1 to conv4 and conv_out; each level halves the lattice before it.
 
     Args:
         in_channels: of a voxel.
@@ -137,7 +137,7 @@ class FirstStageOutputs(NamedTuple):
 
 
 class PvRcnn(nn.Module):
-    """The network.
+    """Network of PV-RCNN.
 
     Args:
         spec: grid, strides and classes that its parts were made for.
@@ -182,7 +182,7 @@ class PvRcnn(nn.Module):
         return FirstStageOutputs(levels, canvas, maps)
 
     def scatter(self, features: Tensor, cells: Tensor, frames: int) -> Tensor:
-        """conv_out's voxels, one above the other, as channels of a map: (M, C) -> (B, H, W, nz * C), z-major.
+        """Scatter the voxels of conv_out to a map, z-major in its channels: (M, C) -> (B, H, W, nz * C).
 
         Args:
             features: of the active cells of conv_out.
@@ -196,7 +196,7 @@ class PvRcnn(nn.Module):
     def encode_keypoints(
         self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor], canvas: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Weighted features (K, C) of the keypoints, and logits (K,) of their being part of an object."""
+        """Return weighted features (K, C) of the keypoints, and foreground logits (K,)."""
         cells = canvas.flatten(0, 2)
         bev = sum(
             cells.index_select(0, batch.bev_cells[:, corner]) * batch.bev_weights[:, corner, None]
@@ -223,7 +223,7 @@ class PvRcnn(nn.Module):
         return features, logits
 
     def deformed_places(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
-        """Around which places (K, 3), metres, keypoints look at each deformed source: one, or one for each radius."""
+        """Return shifted positions (K, 3), metres, of keypoints for each deformed source: one, or one per radius."""
         places, first = {}, 0
         for number, each in enumerate(self.settings.sources):
             balls = batch.ball_indices[first : first + len(each.radii_m)]
@@ -246,7 +246,7 @@ def _source_features(source: Source, points: Tensor, levels: Sequence[Tensor]) -
 
 
 def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
-    """The network that `model` describes, with fresh random weights."""
+    """Build the network that `model` describes, with fresh random weights."""
     network, spec, settings = model.network, model.spec, model.settings
     channels = {"points": POINT_CHANNELS - 3, **dict(zip(LEVEL_SOURCES, network.voxel_channels[:-1], strict=True))}
     map_channels = network.voxel_channels[-1] * spec.level_shapes[-1][0]

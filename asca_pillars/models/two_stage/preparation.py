@@ -1,4 +1,4 @@
-"""Labelled frames to batches of the second stage."""
+"""Batches of the second stage from labelled frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ from asca_pillars.ops.two_stage.rois import (
 
 @dataclass(frozen=True)
 class RefineSample:
-    """One frame with the proposals that are learnt from, and what to say of them."""
+    """One frame with its sampled proposals and their targets."""
 
     scan: RefineScan
     targets: RoiTargets
@@ -59,7 +59,7 @@ def sample_of(
     rows: NDArray[np.int64],
     settings: RefineSettings,
 ) -> RefineSample:
-    """Neighbours and targets of the proposals `rows` (S,), which have these `overlaps` with the frame's boxes."""
+    """Return neighbors and targets of proposals `rows` (S,) with these `overlaps` with the frame's boxes."""
     chosen = proposed.proposals[rows]
     return RefineSample(
         scan=refine_scan(frame.points, proposed, chosen, settings),
@@ -70,7 +70,7 @@ def sample_of(
 
 
 def collate_samples(samples: Sequence[RefineSample]) -> RefineBatch:
-    """Samples of several frames, one frame's after the other's."""
+    """Concatenate the samples of several frames."""
     targets = [sample.targets for sample in samples]
     return RefineBatch(
         collate_scans([sample.scan for sample in samples]),
@@ -85,7 +85,7 @@ def collate_samples(samples: Sequence[RefineSample]) -> RefineBatch:
 
 
 def collate_scans(scans: Sequence[RefineScan]) -> RefineInputs:
-    """Scans of several frames, one frame's after the other's; indices then count through the batch."""
+    """Concatenate the scans of several frames; indices then count through the batch."""
     points = [len(scan.points) for scan in scans]
     keypoints = [len(scan.keypoints) for scan in scans]
     return RefineInputs(
@@ -100,7 +100,7 @@ def collate_scans(scans: Sequence[RefineScan]) -> RefineInputs:
 
 
 def _counted_through(frames: Sequence[tuple[NDArray[np.int32], ...]], rows: Sequence[int]) -> tuple[Tensor, ...]:
-    """Indices of each radius; those of a frame move by the rows of the frames before it, "nothing" to the very end."""
+    """Offset each radius's indices by the rows of the frames before; the index for empty entries moves to the end."""
     total, starts = sum(rows), np.cumsum([0, *rows[:-1]])
     return tuple(
         _joined(
@@ -164,7 +164,7 @@ class CachedProposals:
 
 @dataclass(frozen=True)
 class LiveProposals:
-    """Proposals of a first stage that is run; for whoever prepares in the process itself."""
+    """Proposals of a first stage that runs in this process."""
 
     stage: FirstStage
     settings: FirstStageSettings
@@ -182,7 +182,7 @@ class RefinePreparation:
     source: ProposalSource
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedRefinement:
-        """Neighbours and targets of proposals: drawn ones for training, without `rng` all of them."""
+        """Return neighbors and targets of proposals: sampled ones for training, all of them without `rng`."""
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
         frame = replace(frame, points=points)
         proposed = self.source(frame)
@@ -193,7 +193,7 @@ class RefinePreparation:
         return PreparedRefinement(sample, proposed.proposals[rows], ~overlaps.ignored[rows])
 
     def collate(self, frames: Sequence[PreparedRefinement]) -> LabeledProposals:
-        """Frames as one batch."""
+        """Collate frames into one batch."""
         batch = collate_samples([frame.sample for frame in frames])
         learnt = torch.from_numpy(np.concatenate([frame.learnt for frame in frames]))
         return LabeledProposals(*batch, learnt, tuple(frame.proposals for frame in frames))
@@ -225,7 +225,7 @@ def live_preparation(model: RefineModel) -> RefinePreparation:
 
 
 def move_proposed(proposed: Proposed, motion: Motion) -> Proposed:
-    """Proposals and keypoints in the scene that moved; what the map says of a keypoint stays."""
+    """Move proposals and keypoints with the augmented scene; map features of keypoints stay."""
     proposals = proposed.proposals
     moved = LabeledFrame("", proposed.keypoints.copy(), proposals.boxes.copy(), proposals.labels)
     move_scene(moved, motion)

@@ -47,7 +47,7 @@ class ProposalFiles:
             raise DatasetError(f"{path}: damaged ({error}); delete it, it will be computed again") from None
 
     def path(self, frame_id: str) -> Path:
-        """The frame's file."""
+        """Return the path of the frame's file."""
         return self.folder / f"{frame_id}.npz"
 
 
