@@ -73,7 +73,7 @@ class BestCheckpoint(ModelCheckpoint):
         super().__init__(folder, filename="best", save_top_k=1, enable_version_counter=False, monitor="val/loss")
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Know the loss of the best.ckpt that is there: the last checkpoint may be from before its validation."""
+        """Read the loss of the existing best.ckpt: the last checkpoint may be from before its validation."""
         super().on_train_start(trainer, pl_module)
         path = Path(str(self.dirpath)) / BEST
         if trainer.global_step and path.exists():
@@ -109,7 +109,7 @@ class LastCheckpoint(Checkpoint):
 
 
 def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None, str | None]:
-    """The newest checkpoint that a run can go on from, or None in a new run; and what is wrong with a newer one.
+    """Return the newest checkpoint to resume from, None in a new run; and what is wrong with a newer one.
 
     Args:
         folder: of the run's checkpoints.
@@ -157,7 +157,7 @@ def _why_unusable(path: Path, model: ModelConfig) -> str | None:
 
 
 def steps_of(checkpoint: Path | None) -> int:
-    """Optimizer steps of the run that a checkpoint, which can be read, is of; 0 without one."""
+    """Return optimizer steps of the run that a checkpoint, which can be read, is of; 0 without one."""
     if checkpoint is None:
         return 0
     return int(read_plain(checkpoint)["global_step"])

@@ -34,7 +34,7 @@ class BatchLoader(DataLoader[Any]):
     _processes: frozenset[Any] = frozenset()
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
-        """The batches.
+        """Yield the batches.
 
         Raises:
             WorkerError: a process has ended, cannot be started or cannot send a batch, or there is none for too long.
@@ -67,7 +67,7 @@ class BatchLoader(DataLoader[Any]):
             yield batch
 
     def _start(self) -> Iterator[Any]:
-        """Batches of one epoch; notes the processes that the first one starts."""
+        """Yield batches of one epoch; notes the processes that the first one starts."""
         # torch's loader leaves a traceback where it gets no lock; here are as many as its queues have, and some more.
         _ = [loader_context().Lock() for _ in range(4 * self.num_workers + 8)]
         others = set(multiprocessing.active_children())
@@ -98,7 +98,7 @@ class DetectionData(L.LightningDataModule):
             frames.split.require_files()
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Shuffled batches, from the step on at which the trainer stands."""
+        """Return shuffled batches, from the step on at which the trainer stands."""
         return self._loader(self.training_set, lambda: self.trainer.global_step if self.trainer else 0)
 
     def val_dataloader(self) -> DataLoader[Any]:

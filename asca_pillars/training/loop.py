@@ -1,4 +1,4 @@
-"""Training, on Lightning: what a run is stands here; launching, devices and the loop itself are Lightning's."""
+"""Training on Lightning, which does launching, devices and the loop itself."""
 
 import logging
 import warnings
@@ -171,7 +171,7 @@ def syncs_statistics(model: ModelConfig) -> bool:
 
 
 def _with_settled_precision(recipe: TrainConfig, out: Path, *, resumes: bool) -> TrainConfig:
-    """`auto` becomes what the run in `out` computes in, so that it goes on exactly, or what suits the device."""
+    """Resolve `auto` to the precision of the run in `out`, so that it resumes exactly, or to what suits the device."""
     auto = recipe.precision == "auto"
     precision = recorded_precision(out) if auto and resumes else recipe.precision
     return replace(recipe, precision=settled(precision))

@@ -1,4 +1,4 @@
-"""The files in the folder of a run, and whether those that are there are of a run."""
+"""Files in the folder of a run, and the recognition of earlier ones."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The folder of a run: what it is, so that only the same run goes on in it."""
+"""Identity of the run in a folder, so that only the same run resumes there."""
 
 import hashlib
 from collections.abc import Mapping
