@@ -1,4 +1,4 @@
-"""Every direction with a bundle that looks ahead: in one pass where its weights know every direction, else in several.
+"""Detection in every direction with a model that looks ahead: one pass with wider ranges, or several turned ones.
 
 A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolutions looks around with wider ones
 (`widened`). With others the scan is turned before each pass, and the boxes are turned back:
@@ -39,7 +39,7 @@ _STEP_RAD = math.radians(1)
 
 
 def widened(bundle: Bundle) -> Bundle:
-    """The bundle with ranges that reach in every direction as far as its own do in one, where its graphs allow it.
+    """Return the bundle with ranges widened in every direction to its farthest reach, where its graphs allow it.
 
     They do with a sparse neck, which reads rulebooks instead of a map, on even pillars, if the weights were trained on
     whole revolutions. Other bundles are returned as they are. `max_pillars` grows with the area.
@@ -58,7 +58,7 @@ def widened(bundle: Bundle) -> Bundle:
 
 
 def _fitting_range(reach_m: float, pillar_m: float) -> float:
-    """The shortest range from `reach_m` on that pillars of this size fill as the network's strides need it."""
+    """Return the shortest range from `reach_m` on that pillars of this size fill as the network's strides need it."""
     step_m = NECK_STRIDE * pillar_m
     return round(math.ceil(reach_m / step_m - 1e-6) * step_m, 6)
 
@@ -92,7 +92,7 @@ def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...
 
 
 def about_ground(turns: Sequence[FrameChange], points: NDArray[np.float32]) -> tuple[FrameChange, ...]:
-    """The turns about the normal of a scan's ground, through its origin; about z where no ground is sure.
+    """Return the turns about the normal of a scan's ground, through its origin; about z where no ground is found.
 
     In all of them the ground then lies as it does before them. The first turn, which is none, stays as it is.
 
@@ -119,7 +119,7 @@ def ranges_around(ranges: Ranges, passes: int) -> Ranges:
 
 
 def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: float) -> Detections:
-    """The boxes of all passes in the frame before the turns, each object once, best first.
+    """Return the boxes of all passes in the frame before the turns, each object once, best first.
 
     Args:
         passes: of each turn, in its turned frame; two or more.

@@ -102,7 +102,7 @@ class PillarSection(Strict):
     """C, features of one pillar."""
     canvas: CanvasFormat
     neck: Literal["dense", "sparse"] = "dense"
-    """`sparse`: backbone.onnx takes rows and neighbor tables, and answers at active head cells alone."""
+    """`sparse`: backbone.onnx takes rows and rulebooks, and its outputs are rows of active head cells."""
     active_cells: MaskRule | None = None
     """Rule for the active cells of a sparse neck, see `asca_pillars.ops.pillar.neck_rulebooks`; None with a dense
     one."""
@@ -130,9 +130,9 @@ class RefineSection(Strict):
     bev_channels: int
     """C of the backbone's output `neck`."""
     seen: FirstStageSettings
-    """Proposals and keypoints."""
+    """Settings of proposals and keypoints."""
     neighbors: RefineSettings
-    """Balls and grids."""
+    """Settings of balls and grids."""
     scores: Scores
     """Source of a refined box's score."""
 
@@ -161,7 +161,7 @@ class LayerQuantization(Strict):
     """One layer of the backbone in the sensitivity sweep."""
 
     layer: str
-    """Its name in the model, such as `neck.blocks.0.0`."""
+    """Name of the layer in the model, such as `neck.blocks.0.0`."""
     logit_rms_error: float
     """RMS error of the class logits of the best anchors if this layer alone stays in floating point."""
     kept_float: bool
@@ -173,7 +173,7 @@ class Quantization(Strict):
 
     calibration_scans: int
     dropped_scans: int | None
-    """Scans that were not calibrated on because they are among the compared ones; None of a bundle of schema 2."""
+    """Scans left out of the calibration because they are among the compared ones; None in bundles of schema 2."""
     compared_scans: int
     layers: tuple[LayerQuantization, ...]
     logit_rms_error: float
@@ -233,7 +233,7 @@ class PvRcnnSection(Strict):
     keypoint_channels: int
     """Channels of a keypoint's fused feature."""
     settings: VoxelSetSettings
-    """Keypoints, proposals and neighbors."""
+    """Settings of keypoints, proposals and neighbors."""
     scores: Scores
     """Source of a refined box's score."""
 
@@ -249,12 +249,12 @@ class Bundle(Strict):
 
     name: str
     kind: str
-    """The family of detectors; the section of that name holds what only this family has."""
+    """Family of the detector, see GRAPHS."""
     spec: DetectorSpec
     precision: Literal["float32", "int8"]
     """Type of the arithmetic of backbone.onnx; for kind `pv_rcnn` of voxels.onnx too."""
     backbone_gmac: float
-    """Multiply-accumulates of backbone.onnx, 10^9; of a sparse neck in the mean over the scans of `parity`."""
+    """Multiply-accumulates of backbone.onnx, 10^9; with a sparse neck the mean over the scans of `parity`."""
     graphs: Mapping[str, GraphFile]
     """Graphs by name, see GRAPHS."""
     parity: Parity | None
@@ -263,7 +263,7 @@ class Bundle(Strict):
     """None in float32."""
     expected_input: ExpectedInput
     expected_input_from: Literal["training", "export"]
-    """The scans that `expected_input` was measured on: those trained on, or those given to the export."""
+    """Scans that `expected_input` was measured on: those of the training, or those given to the export."""
     provenance: Provenance
     license: str
     schema_version: int = SCHEMA_VERSION

@@ -1,4 +1,4 @@
-"""Scan files one after the other: boxes in memory and, if wanted, as files."""
+"""Detection in scan files: boxes in memory and, if wanted, as files."""
 
 import errno
 import re
@@ -34,7 +34,7 @@ from asca_pillars.scans.scan_times import require_one_folder, scan_times_ns
 
 _NUMBER = re.compile(r"\d[\d.,]*")
 FRAME_ID = "lidar"
-"""The frame of scan files, which name none, for viewers."""
+"""Frame of scan files, which name none, for viewers."""
 _PLAIN = RuntimeOptions()
 _AS_TRAINED = ScanSettings()
 
@@ -185,7 +185,7 @@ def detect_scans(
 
 
 def repairs(results: Iterable[DetectedScan]) -> Iterator[str]:
-    """Yield what was repaired, dropped or odd, each kind once, with the first scan that it concerns and a count."""
+    """Yield what was repaired, dropped or odd, each kind once, with the first such scan and a count."""
     names: dict[str, list[str]] = defaultdict(list)
     for result in results:
         notes = result.notes

@@ -39,7 +39,7 @@ _GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
 
 
 class UsablePoints(NamedTuple):
-    """The points that a pipeline takes, and what was done to get them."""
+    """Points for a pipeline, and how many were dropped or clipped."""
 
     points: NDArray[np.float32]
     """(N, 4), finite, reflectance within 0..1."""
@@ -50,7 +50,7 @@ class UsablePoints(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """A scan between its points and its boxes."""
+    """State of a scan between its points and its boxes."""
 
     start: float
     laps: Laps
@@ -201,7 +201,7 @@ class Detector:
         return self._finish(frame, raw)
 
     def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[ScanDetections, None, None]:
-        """Detections of scan after scan, in order, the same as one by one and more of them per second.
+        """Yield the detections of scan after scan, in order: those of single calls, at a higher rate.
 
         While the network works on one scan, the next is read and prepared and the one before is decoded, in threads
         that live as long as the iterator; see `asca_deploy.stream`.
@@ -231,7 +231,7 @@ class Detector:
         return overlapped(scans, prepare, infer, finish)
 
     def _open(self, points: NDArray[Any]) -> _Frame:
-        """The usable points in the model's frame."""
+        """Return the usable points in the model's frame."""
         start = perf_counter()
         usable = usable_points(points, self._to_model)
         warnings = []
@@ -300,7 +300,7 @@ class Detector:
 
 
 def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> UsablePoints:
-    """The points of (N, 4) that are finite in the model's frame as contiguous float32, reflectance within 0..1.
+    """Return the points of (N, 4) that are finite in the model's frame as contiguous float32, reflectance within 0..1.
 
     Args:
         points: (N, 4) x, y, z in metres and reflectance, of any real type.

@@ -1,4 +1,4 @@
-"""A model, or finished predictions, against labels."""
+"""Evaluation of a model, or of finished predictions, against labels."""
 
 from collections.abc import Sequence
 from dataclasses import replace

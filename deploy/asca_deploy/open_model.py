@@ -1,4 +1,4 @@
-"""A model that is to be run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
+"""Models to run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
 
 import logging
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ def open_detector(
     *,
     around: bool = False,
 ) -> Detector:
-    """The detector of a bundle that is run as `options` say, from `score` on; None for the bundle's own thresholds.
+    """Open the detector of a bundle as `options` say, from `score` on; None for the bundle's own thresholds.
 
     Raises:
         AscaError: as `asca_deploy.Detector`.
@@ -56,7 +56,7 @@ def open_detector(
 
 
 def track_thresholds(bundle: str | Path | None, score: ScoreThresholds | None = None) -> tuple[dict[str, float], float]:
-    """The scores from which on detections of each class begin tracks, and from which on the detector is to report.
+    """Return the scores from which on detections of each class begin tracks, and are reported by the detector.
 
     Args:
         bundle: of the detector; None: the one that ships.

@@ -1,4 +1,4 @@
-"""Which pipeline runs a bundle, by its family, and on which provider."""
+"""Choice of the pipeline for a bundle, by its family, and of its provider."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ def open_pipeline(
     precision: providers.Precision | None,
     threads: int,
 ) -> auto.Choice[Pipeline[Any, Any]]:
-    """The pipeline of a bundle's family, on the provider of that name or, with auto, on the fastest that agrees.
+    """Open the pipeline of a bundle's family on a provider or, with auto, on the fastest that agrees.
 
     Args:
         folder: of the bundle.

@@ -14,7 +14,7 @@ end before it; a name may come twice."""
 
 
 class Prepared(Protocol):
-    """A scan on its way into the network."""
+    """A scan's input for the slowest network."""
 
     @property
     def counts(self) -> ScanCounts:
@@ -26,14 +26,14 @@ R = TypeVar("R")
 
 
 class Pipeline(Protocol[P, R]):
-    """The way from points to boxes, in three parts that `Detector.stream` runs at once for different scans.
+    """Interface of a family's pipeline: three parts that `Detector.stream` runs concurrently on different scans.
 
-    What belongs to one scan travels in the arguments and results, so that several threads may be in one pipeline.
-    Each part appends the stages that it is through with to `laps`.
+    A scan's state is in arguments and results alone, so that several threads may use one pipeline. Each part appends
+    its finished stages to `laps`.
     """
 
     spec: Any
-    """The bundle's numbers; the same with other score thresholds may be put in their place."""
+    """Spec of the bundle; may be replaced by one with other score thresholds."""
 
     @property
     def stages(self) -> Sequence[str]:

@@ -1,4 +1,4 @@
-"""Which hardware the backbone runs on, through which library and in which precision.
+"""Providers of the backbone: hardware, library and precision.
 
     cpu       onnxruntime, always there
     cuda      onnxruntime's GPU build
@@ -28,7 +28,7 @@ AUTO: Literal["auto"] = "auto"
 
 
 def arithmetic(weights: str, precision: str) -> str:
-    """What a network computes in, in words.
+    """Return the arithmetic of a network in words.
 
     Args:
         weights: the bundle's own precision, float32 or int8.
@@ -55,7 +55,7 @@ def require(provider: str, precision: str = "float32") -> None:
 
 
 def available() -> list[tuple[Provider, Precision]]:
-    """Every (provider, precision) that is installed; the faster precision of a provider first."""
+    """Return every (provider, precision) that is installed; the faster precision of a provider first."""
     found: list[tuple[Provider, Precision]] = []
     for provider in PROVIDERS:
         for precision in reversed(PRECISIONS):

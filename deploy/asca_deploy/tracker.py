@@ -32,22 +32,22 @@ FADE_PER_S = 1.0  # of a track's score that nothing confirms
 MAX_SCORE = 0.98  # so that the best tracks end, too
 MAX_SCAN_GAP_S = 2.0  # between two scans of one drive
 WEAK_SHARE = 0.7
-"""Detections from this share of the lowest threshold on carry tracks on that better ones began."""
+"""Share of the lowest threshold from which on detections continue tracks that better ones began."""
 MAX_UNLOOKED_FADE_S = 0.2  # of the time until the first scan after a detection, in which nobody looked
 
 
 @dataclass
 class _State:
-    """T tracks in the frame that stands still; what is a row here is a row everywhere."""
+    """State of T tracks in the fixed frame; rows of the arrays correspond."""
 
     ids: _Integers
     labels: _Integers
     boxes: _Doubles
-    """(T, 7) of the last detection, moved to where it should be now."""
+    """(T, 7) boxes of the last detections, predicted to the current time."""
     velocities: _Doubles
     """(T, 2)."""
     covariance: _Doubles
-    """(T, 3) variance of the position, covariance, variance of the velocity; of x and of y alike."""
+    """(T, 3) variance of the position, covariance, variance of the velocity; the same for x and y."""
     scores: _Doubles
     unseen_s: _Doubles
 
@@ -62,10 +62,10 @@ class _State:
 
 
 class Tracker:
-    """Gives the boxes of scan after scan identities and velocities. One per sensor; not for several threads.
+    """Tracker of multiple objects: assigns identities and velocities to boxes. One per sensor; not thread-safe.
 
-    Detections of low score are worth having: they carry on a track that a better one began. Give the tracker a
-    detector with a lower `score_threshold` than the scores that shall begin tracks.
+    Detections of low score continue tracks that better ones began: the detector's `score_threshold` should be below
+    `birth_score`.
 
     Args:
         birth_score: a detection that no track takes begins one from this score on; one number, or one for each class
@@ -100,7 +100,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all tracks, as before another drive. Numbers go on."""
+        """Drop all tracks, as before another drive; numbers of tracks are not reused."""
         self._state = _empty()
         self._time_s: float | None = None
         self._origin: _Doubles | None = None
@@ -150,7 +150,7 @@ class Tracker:
         return Tracks(detections[reported], self._state.ids[rows], velocities)
 
     def _predict(self, elapsed_s: float) -> None:
-        """Move all tracks on, and drop those that faded."""
+        """Predict all tracks, and drop those whose score has faded."""
         state = self._state
         seen = (state.unseen_s == 0) & (elapsed_s <= MAX_SCAN_GAP_S)
         state.scores = state.scores - FADE_PER_S * np.where(seen, min(elapsed_s, MAX_UNLOOKED_FADE_S), elapsed_s)
@@ -164,7 +164,7 @@ class Tracker:
         self._state = state
 
     def _match(self, boxes: _Doubles, labels: _Integers) -> _Integers:
-        """The row of the track that each detection (N, 7) belongs to, or UNMATCHED."""
+        """Return for each detection (N, 7) the row of its track, or UNMATCHED."""
         state = self._state
         if not len(state) or not len(boxes):
             return np.full(len(boxes), UNMATCHED)
@@ -183,7 +183,7 @@ class Tracker:
         return row_of
 
     def _update(self, rows: _Integers, boxes: _Doubles, scores: _Doubles) -> None:
-        """Correct tracks by the detections (N, 7) that they took."""
+        """Correct tracks by their matched detections (N, 7)."""
         state = self._state
         place, both, speed = state.covariance[rows].T
         gain_place = place / (place + MEASURED_SIGMA_M**2)

@@ -1,4 +1,4 @@
-"""Every way of running a bundle on this machine, side by side: providers, precisions, threads."""
+"""Comparison of providers, precisions and threads for a bundle on this machine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class MatrixRow:
     boxes: BoxDifference | None
     """Against the reference's boxes, over all scans."""
     reason: str | None
-    """Why it cannot run here; None if it can."""
+    """Reason why it cannot run here; None if it can."""
 
 
 def measure_matrix(
@@ -87,12 +87,12 @@ def _ways(bundle: str, most: int) -> list[Way]:
 
 
 def _same_but_threads(way: Way, failed: Way) -> bool:
-    """Whether `way` would fail for the same reason; another precision might not."""
+    """Return whether `way` would fail for the same reason; another precision might not."""
     return way[:3] == failed[:3]
 
 
 def _open(folder: Path, way: Way, scan: NDArray[np.float32], mounting: Mounting | None) -> Detector | str:
-    """The detector, after its first scan, or why there is none."""
+    """Return the detector after its first scan, or why it cannot be opened."""
     try:
         detector = Detector(
             folder, provider=way.provider, precision=way.precision, threads=way.threads, mounting=mounting

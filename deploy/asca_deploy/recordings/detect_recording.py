@@ -1,4 +1,4 @@
-"""Detection in a recording: scans of one topic in, boxes with time stamps and identities out."""
+"""Detection in the scans of one topic of a recording: boxes with time stamps and identities."""
 
 import json
 from collections import Counter, deque
@@ -222,7 +222,7 @@ class _Run:
         self.kept: list[DetectedScan] = []
 
     def results(self) -> Iterator[None]:
-        """One item for each scan that is in the journal now."""
+        """Yield one item for each scan that is in the journal now."""
         for found in self._detector.stream(self._points()):
             yield from self._skip()
             scan = self._coming.popleft()
@@ -242,11 +242,11 @@ class _Run:
         yield from self._skip()
 
     def first(self) -> str:
-        """The first reason why a scan was skipped, to end a sentence with."""
+        """Return the first reason why a scan was skipped, to end a sentence with."""
         return f": {self.troubles[0]}" if self.troubles else ""
 
     def skipped(self) -> list[str]:
-        """A sentence, if scans were skipped."""
+        """Return a sentence, if scans were skipped."""
         return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
@@ -268,7 +268,7 @@ class _Run:
 
 
 def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
-    """Say that stamps are out of order or the odometry is too short; ScanError if it is of another time."""
+    """Report stamps out of order or too short odometry; ScanError if the odometry is of another time."""
     if stamps := said_of_stamps(times):
         reporter.remark(f"{task.path}, {topic}: {stamps}")
     if poses is None:
@@ -292,7 +292,7 @@ def _about(
     topic: str,
     least: ScoreThresholds | None,
 ) -> dict[str, Any]:
-    """All that detections depend on: a journal of anything else is not gone on with."""
+    """Return all that detections depend on; a journal is only resumed if it is the same."""
     files = recording_files(task.path)
     return {
         "recording": str(task.path),
@@ -311,7 +311,7 @@ def _about(
 
 
 def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.float64]:
-    """From the scan to the frame that stands still: the scan is turned to x forward, where the odometry's axes lie."""
+    """Return the pose of the scan, turned to x forward as the odometry's axes, in the fixed frame."""
     level = np.eye(4)
     level[:3, :3], level[:3, 3] = mounting.level.axes, mounting.level.shift_m
     return np.asarray(poses.at(time_ns) @ level)
@@ -320,7 +320,7 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
 def _with_points(
     results: Iterator[Found], scans: RecordedScans | None
 ) -> Iterator[tuple[Found, NDArray[np.float32] | None]]:
-    """Each result with the points of its scan, which is read once more; None without `scans`."""
+    """Yield each result with the points of its scan, which is read once more; None without `scans`."""
     again = iter(()) if scans is None else scans.read()
     for found in results:
         points = (one.scan.points for one in again if one.number == found.number and one.scan is not None)
@@ -335,7 +335,7 @@ def _write(
     about: dict[str, Any],
     opened: Callable[[ExitStack, ExitStack], list[ResultFile]],
 ) -> tuple[int, Counter[str]]:
-    """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
+    """Write all files, none of which appears before all are complete; return the counts of scans and boxes by class."""
     with ExitStack() as places, ExitStack() as handles:
         place = places.enter_context(atomic_path(task.out / ABOUT_FILE))
         place.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")

@@ -90,7 +90,7 @@ class FoxgloveFile:
         self._channel = self._writer.register_channel(TOPIC, "json", schema)
 
     def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
-        """One message."""
+        """Write one message."""
         data = json.dumps(scene_update(found)).encode()
         self._writer.add_message(self._channel, found.time_ns, data, found.time_ns, found.number)
 
@@ -100,7 +100,7 @@ class FoxgloveFile:
 
 
 def scene_update(found: Found) -> dict[str, Any]:
-    """A scan's boxes as the fields of foxglove.SceneUpdate."""
+    """Return a scan's boxes as the fields of foxglove.SceneUpdate."""
     time = {"sec": found.time_ns // 10**9, "nsec": found.time_ns % 10**9}
     entities = []
     for row, box in enumerate(found.detections):

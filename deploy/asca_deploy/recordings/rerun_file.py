@@ -1,4 +1,4 @@
-"""Scans and boxes as a file that the rerun viewer opens: `rerun out.rrd`."""
+"""Scans and boxes as a file for the rerun viewer: `rerun out.rrd`."""
 
 import errno
 from pathlib import Path
@@ -13,7 +13,7 @@ from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
 MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
 TIMELINE = "time"
 MOVES_MPS = 0.5
-"""Slower tracks have no arrow."""
+"""Speed below which tracks have no arrow."""
 _BACKGROUND = (14, 18, 24)
 APPLICATION = "asca-pillars"
 _HEAD_BYTES = 4096  # of a file, among which the application's name is
@@ -47,7 +47,7 @@ class RerunFile:
         self._ground_m: float | None = None
 
     def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
-        """One scan with its boxes."""
+        """Write one scan with its boxes."""
         assert points is not None, "it shows points"
         rr, stream = self._rr, self._stream
         stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
@@ -68,7 +68,7 @@ class RerunFile:
             self._stream.disconnect()
 
     def _flush(self) -> None:
-        """After each scan: once its writer has failed, rerun says so here, and waits forever anywhere else."""
+        """Flush after each scan: once its writer has failed, rerun reports it here and blocks anywhere else."""
         try:
             self._stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:
@@ -82,7 +82,7 @@ class RerunFile:
         return rrb.Blueprint(view, collapse_panels=True)
 
     def _velocities(self, found: Found) -> Any:
-        """An arrow for each track that moves, as long as its way of one second, from the center of its roof."""
+        """Return an arrow for each moving track, as long as its way of one second, from the center of its roof."""
         assert found.tracks is not None
         moving = np.hypot(*found.tracks.velocities_mps.T) > MOVES_MPS
         boxes, velocities = found.detections.boxes[moving], found.tracks.velocities_mps[moving]
