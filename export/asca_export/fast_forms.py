@@ -1,4 +1,4 @@
-"""The trained network in the forms that run fastest; the export proves them to be the same function.
+"""Equivalent forms of the trained network that run fastest; the export proves the equivalence.
 
 - A batch normalization after a convolution is part of its weights.
 - A transposed convolution whose kernel equals its stride writes every output once: it is a 1x1 convolution to stride^2
@@ -28,7 +28,7 @@ STEP_VALUE = 1 / 64
 
 
 class CanvasSteps(NamedTuple):
-    """A pseudo-image's real value is scale * (step - empty), channel by channel."""
+    """Quantization of a pseudo-image: its real value is scale * (step - empty), by channel."""
 
     scale: Tensor
     """(C,) positive."""
@@ -41,7 +41,7 @@ class NeckAndHead(Protocol):
 
     @property
     def neck(self) -> Any:
-        """With `blocks` and `deblocks`."""
+        """The neck, with `blocks` and `deblocks`."""
 
     @property
     def head(self) -> Any:
@@ -57,7 +57,7 @@ class Stage(NamedTuple):
 
 
 def fast_encoder(encode: PillarEncoder) -> nn.Module:
-    """The encoder, in evaluation mode, in the form of `FastEncoder` where it has that form, otherwise as it is.
+    """Return the encoder, in evaluation mode, as a `FastEncoder` where it has that form, otherwise unchanged.
 
     Attention over points, or a pillar's empty slots, need each point's feature, not the largest alone.
     """
@@ -179,7 +179,7 @@ class _Head(nn.Module):
 
 
 def _folded(block: nn.Module) -> nn.Sequential:
-    """Convolution, normalization, ReLU, ... -> convolution, ReLU, ..."""
+    """Fold normalizations into convolutions: convolution, ReLU, ..."""
     children, layers = list(block.children()), []
     for convolution, norm in zip(children[0::3], children[1::3], strict=True):
         assert isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)

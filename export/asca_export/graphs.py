@@ -1,4 +1,4 @@
-"""PyTorch modules -> the two ONNX graphs of a bundle. The scatter between them is not exported: it is an assignment."""
+"""Export of PyTorch modules to the two ONNX graphs of a bundle; the scatter between them is not exported."""
 
 import dataclasses
 import json
@@ -103,7 +103,7 @@ def export_backbone(backbone: FastBackbone | MaskedBackbone, map_shape: tuple[in
 
 
 def multiply_accumulates(path: Path) -> int:
-    """What the convolutions and matrix products of a graph with fixed shapes cost."""
+    """Return the multiply-accumulates of the convolutions and matrix products of a graph with fixed shapes."""
     graph = onnx.shape_inference.infer_shapes(onnx.load(path)).graph
     shapes = {
         value.name: [size.dim_value for size in value.type.tensor_type.shape.dim]
@@ -122,7 +122,7 @@ def multiply_accumulates(path: Path) -> int:
 
 
 def graph_path(folder: Path, name: str) -> Path:
-    """Where the graph of that name lies in a bundle's folder."""
+    """Return the path of a graph in a bundle's folder."""
     return folder / f"{name}.onnx"
 
 
@@ -159,7 +159,7 @@ def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **nam
 
 @contextmanager
 def errors_only(name: str) -> Iterator[None]:
-    """Without what a library's logger reports of every operator that it leaves as it is."""
+    """Log only errors of a library within the block; it would report every operator that it leaves unchanged."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -182,13 +182,13 @@ class _Encoder(nn.Module):
 
 
 def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:
-    """`models.pillar.encoder.pillar_max` in ONNX: ScatterND with a max is the fast one of the forms that exist."""
+    """Translate `models.pillar.encoder.pillar_max` to ONNX: ScatterND with a max is the fastest form."""
     shape = op.Concat(op.Shape(point_counts), op.Shape(features, start=1), axis=0)
     lowest = op.Expand(op.Constant(value_float=LOWEST), shape)
     return op.ScatterND(lowest, op.Unsqueeze(pillar_index, op.Constant(value_ints=[1])), features, reduction="max")
 
 
 def _forget_origin(graph: Any) -> None:
-    """Drop the stack traces that the exporter writes at every node: they name folders of the exporting machine."""
+    """Drop the stack traces that the exporter writes at every node, which name folders of the machine."""
     for part in (graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
         del part.metadata_props[:]

@@ -1,4 +1,4 @@
-"""The proof that a bundle is the trained model: PyTorch and onnxruntime on the same scans, stage by stage."""
+"""Parity of a bundle and the trained model: PyTorch and onnxruntime on the same scans, stage by stage."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -80,27 +80,27 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
 
 
 def require_compared(scans: int) -> int:
-    """The number of scans that a proof rests on, which must not be none."""
+    """Return the number of compared scans; ExportError if there are none."""
     if not scans:
         raise ExportError("none of the scans given to prove parity on has a point in the model's ranges; give others")
     return scans
 
 
 def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:
-    """What PyTorch says of a batch of one frame: maps, or rows of its active head cells."""
+    """Return PyTorch's outputs for a batch of one frame: maps, or rows of its active head cells."""
     maps = (part.numpy() for part in detector(batch))
     return HeadMaps(*(part if batch.neck is not None else part[0] for part in maps))
 
 
 def _at_cells(maps: Maps, cells: NDArray[np.int32], scan: int) -> tuple[Maps, NDArray[np.int32]]:
-    """Rows of maps (channels, H, W) at the active head cells, (M,); no other cell may have a score."""
+    """Return rows of maps (channels, H, W) at the active head cells, (M,); no other cell may have a score."""
     elsewhere = np.delete(maps.scores.reshape(len(maps.scores), -1), cells, axis=1)
     require_close("head `scores` of inactive cells", np.full_like(elsewhere, NEVER), elsewhere, 0, scan)
     return HeadMaps(*(part.reshape(len(part), -1).T[cells] for part in maps)), cells
 
 
 def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArray[np.float32]:
-    """The logits (A, H, W), or rows (M, A), of each class: (classes, n); likewise of A * classes."""
+    """Return the logits (A, H, W), or rows (M, A), of each class: (classes, n); likewise of A * classes."""
     classes = len(spec.classes)
     channels = scores if scores.ndim == 3 else scores.T
     if spec.scores_per_anchor > 1:  # of an anchor those of all classes, then the next anchor's
@@ -111,7 +111,7 @@ def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArr
 def require_close(
     stage: str, expected: NDArray[np.float32], found: NDArray[np.float32], allowed: float, scan: int
 ) -> float:
-    """The largest difference, which must not exceed what is allowed."""
+    """Return the largest difference; ExportError if it exceeds `allowed`."""
     error = float(np.abs(expected - found).max(initial=0.0))
     if not error <= allowed:
         raise _unlike(
@@ -255,6 +255,6 @@ def _ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.
 
 
 def _beyond_allowed(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.float64]:
-    """(N, M): overlap minus the largest that suppression keeps side by side; -inf for pairs of two classes."""
+    """Return (N, M): overlap minus the largest that suppression keeps side by side; -inf for pairs of two classes."""
     same_class = a.labels[:, None] == b.labels[None]
     return np.where(same_class, bev_iou(a.boxes, b.boxes) - spec.post.nms_iou, -np.inf)

@@ -75,7 +75,7 @@ def draft_bundle(
     options: ExportOptions,
     **sections: Any,
 ) -> B:
-    """The manifest of a checkpoint in float32, without graphs and proof.
+    """Return the manifest of a checkpoint in float32, without graphs and parity.
 
     Args:
         bundle_type: of its family.

@@ -1,4 +1,4 @@
-"""The backbone in 8 bits: every activation in steps of its own channel, every weight rounded with the others in view.
+"""Quantization of the backbone to 8 bits: per-channel steps of activations, jointly rounded weights.
 
 Most of a pseudo-image is empty, and there a trained network gives the same small values everywhere. If those are
 rounded, one and the same error stands all over the map and grows from layer to layer; nothing else costs as much
@@ -36,7 +36,7 @@ TINY = 1e-6  # a channel that is never above it is as good as empty; its step mu
 
 
 def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
-    """Steps of a canvas that holds the unitless features of all these scans, (P, C) each, and zero exactly."""
+    """Return steps of a canvas that holds the unitless features of all these scans, (P, C) each, and zero exactly."""
     lows, highs = zip(*((features.min(axis=0), features.max(axis=0)) for features in pillar_features), strict=True)
     low, high = np.minimum(np.min(lows, axis=0), 0.0), np.maximum(np.max(highs, axis=0), 0.0)
     scale = np.maximum((high - low) / STEPS, TINY).astype(np.float32)
@@ -45,7 +45,7 @@ def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
 
 
 def layer_names(backbone: FastBackbone) -> list[str]:
-    """The layers that can compute in 8 bits, by the names of their modules."""
+    """Return the layers that can compute in 8 bits, by the names of their modules."""
     return [name for name, layer in backbone.named_modules() if isinstance(layer, nn.Conv2d)] + [HEAD]
 
 
@@ -85,7 +85,7 @@ def scale_to_steps(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]]
 
 
 class Moments(NamedTuple):
-    """What the layers of a backbone read."""
+    """Moments of the inputs of a backbone's layers."""
 
     empty: dict[str, Tensor]
     """(inputs,) in empty space, by layer."""
@@ -95,7 +95,7 @@ class Moments(NamedTuple):
 
 @torch.no_grad()
 def input_moments(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]], steps: CanvasSteps) -> Moments:
-    """Moments of what every layer reads on the calibration scans.
+    """Return moments of what every layer reads on the calibration scans.
 
     Args:
         backbone: scaled to steps.
@@ -137,7 +137,7 @@ def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Mome
 
 
 def round_together(weight: Tensor, squares: Tensor) -> Tensor:
-    """Unitless weights (outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output; the outputs change little.
+    """Round unitless weights (outputs, n) jointly to a grid of 2 WEIGHT_STEPS + 1 values per output.
 
     The largest weight of an output stays at the end of its grid, from which the graph's writer takes the grid's unit.
     """
@@ -156,7 +156,7 @@ def round_together(weight: Tensor, squares: Tensor) -> Tensor:
 
 
 class _Pass(NamedTuple):
-    """One layer at work on one scan."""
+    """Inputs and outputs of one layer for one scan."""
 
     input: Tensor
     """(1, inputs, H, W)"""
@@ -186,7 +186,7 @@ def _empty_canvas(backbone: FastBackbone, steps: CanvasSteps) -> Tensor:
 
 
 def _center(values: Tensor) -> Tensor:
-    """(C,) of (1, C, H, W), far from any border; of upsampled maps the mean over the places of one cell."""
+    """Return (C,) of (1, C, H, W), far from any border; of upsampled maps the mean over the places of one cell."""
     _, _, height, width = values.shape
     return values[0, :, height // 2 :, width // 2 :][:, :4, :4].mean(dim=(1, 2))
 

@@ -1,4 +1,4 @@
-"""A bundle written again for this version, its networks as they are.
+"""Reissue of a bundle for this version, with unchanged networks.
 
     python -m asca_export.reissue asca_small_sim --scans data/sim/training/velodyne -o bundles/asca_small_sim
 

@@ -42,7 +42,7 @@ class Encoded(NamedTuple):
     pillars: Pillars
 
     def in_steps(self, steps: CanvasSteps) -> NDArray[np.uint8]:
-        """(P, C) unitless whole steps of the features."""
+        """Return the features in whole steps, (P, C), unitless."""
         scale, empty = steps.scale.numpy(), steps.empty.numpy()
         return np.clip(np.round(self.features / scale + empty), 0, STEPS).astype(np.uint8)
 
@@ -116,7 +116,7 @@ class RoundedMaps:
         quantize_backbone(self._template, path, eight_bit, self._parameters(eight_bit))
 
     def _parameters(self, eight_bit: Sequence[str]) -> dict[str, Tensor]:
-        """Parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
+        """Return parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
         own = dict(self._rounded.named_parameters())
         return {
             name: own[name] if name.rpartition(".")[0] in eight_bit else parameter
