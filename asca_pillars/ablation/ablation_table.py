@@ -102,6 +102,6 @@ def _mean_ap(result: dict[str, Any]) -> float:
 
 
 def _spread(values: Sequence[float]) -> str:
-    """Return mean over the seeds, and half the distance between the best and the worst."""
+    """Return the mean over the seeds, and half the distance between the best and the worst."""
     mean = f"{statistics.fmean(values):.2f}"
     return mean if len(values) == 1 else f"{mean} ± {(max(values) - min(values)) / 2:.2f}"

@@ -79,7 +79,7 @@ class _CheckedCache(FunctionCache):
         self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, locator.get_source_stamp())
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        """Keep what was compiled, if it can be written; this process goes on with it in any case."""
+        """Save the compiled function if the file can be written; this process uses it in any case."""
         try:
             super().save_overload(signature, data)
         except OSError as error:
@@ -93,7 +93,7 @@ class _CheckedCache(FunctionCache):
 
 
 class _CheckedFile(IndexDataCacheFile):
-    """Index and data of a cached function, each with a digest at its end, which numba's own reading passes over."""
+    """Index and data of a cached function, each followed by a digest, which numba ignores."""
 
     def _load_index(self) -> Any:
         return super()._load_index() if _is_whole(Path(self._index_path)) else {}

@@ -58,7 +58,7 @@ class OutputError(AscaError):
 
 
 class ProviderError(AscaError):
-    """Hardware or a runtime library that was asked for and is not there, or does not start."""
+    """Hardware or a runtime library that was requested and is missing, or does not start."""
 
 
 class ExportError(AscaError):
@@ -82,7 +82,7 @@ class TrainingError(AscaError):
 
 
 def printable(text: str, limit: int = 1000) -> str:
-    """A message as one line of at most `limit` characters that does nothing to a terminal.
+    """Return a message as one line of at most `limit` characters that does nothing to a terminal.
 
     Messages quote what stands in files: control characters are written as escapes, and a long text loses its middle.
     """

@@ -1,4 +1,4 @@
-"""Optional parts of the installation, and what to say when one is missing."""
+"""Optional extras of the installation, and the error when one is missing."""
 
 import importlib.util
 

@@ -123,7 +123,7 @@ def portable_name(text: str) -> str:
 def file_inside(folder: Path, name: str) -> Path | None:
     """Return the file below `folder` that a name from data stands for; None if there is none, or it leads outside.
 
-    Links in the folder are followed: whoever made the folder put them there.
+    Links in the folder are followed.
     """
     relative = Path(name)
     if relative.is_absolute() or relative.drive or ".." in relative.parts:

@@ -18,7 +18,7 @@ _KINDS = (
 def require_content(path: str | Path, error: type[AscaError]) -> None:
     """Make sure that reading a file ends and gives the file's own content.
 
-    A path where nothing is, or a folder, is left to whoever opens it.
+    A missing path, or a folder, is left to the caller's `open`.
 
     Args:
         path: of the file; links are followed.

@@ -1,4 +1,4 @@
-"""One job for each of many items, in processes of their own, with a progress bar."""
+"""Parallel execution of a job for many items in processes, with a progress bar."""
 
 import contextlib
 import math
@@ -155,7 +155,7 @@ def _results(job: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
 
 @contextlib.contextmanager
 def one_thread_per_process() -> Iterator[None]:
-    """The processes started inside compute with one thread each: the processes are the parallelism."""
+    """Let the processes started inside the block compute with one thread each, as they run in parallel."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:

@@ -1,4 +1,4 @@
-"""Progress and remarks of long work: told to callbacks, never printed."""
+"""Progress and remarks of long work, passed to callbacks and never printed."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeAlias, TypeVar
@@ -8,7 +8,7 @@ Item = TypeVar("Item")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with the name of a step, how many parts of it are done, and how many there are."""
 Remark: TypeAlias = Callable[[str], None]
-"""Called with a sentence that the user should know, as soon as it is known."""
+"""Called with a sentence for the user, as soon as it is known."""
 
 
 class Reporter:

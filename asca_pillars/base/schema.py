@@ -23,7 +23,7 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
     Args:
         type_: a dataclass whose fields are plain values, dataclasses or tuples of them.
         data: what a YAML or JSON file held.
-        source: the file or command-line option to blame in the error.
+        source: the file or command-line option to name in the error.
 
     Raises:
         ConfigError: an unknown key (the nearest one that exists is named), a missing or an unusable value.

@@ -29,7 +29,7 @@ PACKAGES = (
 
 
 def default_threads() -> int:
-    """Return physical cores granted to this process: its CPU affinity, its control group's quota, at least 1.
+    """Return the physical cores granted to this process: its CPU affinity, its control group's quota, at least 1.
 
     Two hardware threads of one core share the arithmetic units that a network keeps busy, so that a second
     thread per core brings waiting, not speed. A quota is rounded down: a thread that only gets part of its
@@ -44,7 +44,7 @@ def default_threads() -> int:
 
 
 def check_threads(threads: int | None) -> int:
-    """Return the number of CPU threads to use: as asked for, or `default_threads` for None.
+    """Return the number of CPU threads to use: the given one, or `default_threads` for None.
 
     Raises:
         ConfigError: no whole number, less than one, or more than four for each CPU of the machine, which only wait for
@@ -92,7 +92,7 @@ def cpu_quota(proc: Path = PROC, cgroup: Path = CGROUP) -> float:
 
 
 def cpu_model() -> str:
-    """Return name of the processor as the operating system gives it."""
+    """Return the name of the processor as the operating system gives it."""
     for cpu in _cpuinfo_blocks(_read(PROC / "cpuinfo")):
         for key in ("model name", "Model", "Hardware"):
             if key in cpu:
@@ -101,7 +101,7 @@ def cpu_model() -> str:
 
 
 def git_revision() -> str | None:
-    """Return revision of the source checkout this code runs from, `-dirty` if it was changed; None when installed."""
+    """Return the revision of the source checkout of this code, `-dirty` if it was changed; None when installed."""
     root = Path(__file__).parents[2]
     try:
         run = subprocess.run(

@@ -17,5 +17,5 @@ def disable_telemetry() -> None:
 
 
 def onnxruntime_may_report() -> bool:
-    """Return whether the user asks for onnxruntime's reports: ORT_DISABLE_TELEMETRY is set to 0."""
+    """Return whether the user enables onnxruntime's reports: ORT_DISABLE_TELEMETRY is set to 0."""
     return os.environ["ORT_DISABLE_TELEMETRY"].lower() not in _YES

@@ -49,7 +49,7 @@ class RayPool(Generic[Result]):
 
     Args:
         job: called with a shard on a worker; it and its result have to be picklable.
-        seen: a file that every machine must see, so that results do not go to a disk that nobody looks at.
+        seen: a file that every machine must see, so that results do not go to a local disk.
         cpus: CPUs of a job.
         gpus: GPUs of a job.
     """

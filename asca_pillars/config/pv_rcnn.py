@@ -74,7 +74,7 @@ class PvRcnnModel(Strict):
     """PV-RCNN (arXiv 1912.13192): voxels, keypoints and two stages trained together.
 
     Attributes:
-        kind: tells the families of detectors apart.
+        kind: family of the detector.
         spec: grid, strides, classes and post-processing, which training and the vehicle share.
         settings: keypoints, proposals and neighbors, likewise.
         network: widths.

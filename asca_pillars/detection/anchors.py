@@ -68,7 +68,7 @@ KITTI_CLASSES = (
 def make_anchors(
     x_m: NDArray[np.float64], y_m: NDArray[np.float64], classes: tuple[ClassSpec, ...]
 ) -> NDArray[np.float32]:
-    """Return one box per head cell, class and anchor yaw: (H, W, A, 7) float32, metres, LiDAR frame.
+    """Return anchors for head cells, classes and anchor yaws: (H, W, A, 7) float32, metres, LiDAR frame.
 
     A = 2 * len(classes), class-major: anchor a belongs to class a // 2 and has yaw ANCHOR_YAWS_RAD[a % 2].
 

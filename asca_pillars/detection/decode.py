@@ -205,7 +205,7 @@ def _candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
 
-    `labels` (M, A) are the classes that the scores are for; None: each anchor's own.
+    `labels` (M, A) are the classes of the scores; None: each anchor's class.
 
     Of equal scores that of the earlier anchor goes first, and among those that of the earlier row.
     """

@@ -69,7 +69,7 @@ class Detections:
 
     @classmethod
     def empty(cls, class_names: tuple[str, ...]) -> "Detections":
-        """Return no boxes."""
+        """Return detections without boxes."""
         return cls(np.empty((0, 7), np.float32), np.empty(0, np.float32), np.empty(0, np.int64), class_names)
 
     def __len__(self) -> int:

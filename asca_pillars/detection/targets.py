@@ -65,7 +65,7 @@ def assign_targets(
 
     Args:
         anchors: (H, W, A, 7), class-major along A, see `detection.anchors.make_anchors`.
-        classes: what anchor 2c and 2c + 1 look for.
+        classes: class c is that of anchors 2c and 2c + 1.
         boxes: (N, 7) labelled boxes.
         labels: (N,) index into `classes`, or IGNORED.
         assigner: which of both.

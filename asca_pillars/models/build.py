@@ -20,7 +20,7 @@ def build_model(model: ModelConfig) -> Trainable:
     """Build the network that `model` describes, with fresh random weights.
 
     Raises:
-        ConfigError: `model` does not say enough about its first stage.
+        ConfigError: `model` lacks properties of its first stage.
     """
     match model:
         case PillarModel():

@@ -78,7 +78,7 @@ class MapBackbone(nn.Module):
         self.out_channels = upsample_channels * len(self.blocks)
 
     def forward(self, canvas: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> (B, out_channels, h, w) with h = H / head_stride and w = W / head_stride."""
+        """Apply the blocks: unitless (B, C, H, W) -> (B, out_channels, h, w), with h, w = H, W / head_stride."""
         maps, attention = [], self.attention or [nn.Identity()] * len(self.blocks)
         for block, attend, deblock in zip(self.blocks, attention, self.deblocks, strict=True):
             canvas = attend(block(canvas))
@@ -113,7 +113,7 @@ class SSDHead(nn.Module):
         nn.init.normal_(self.boxes.weight, std=0.001)
 
     def forward(self, features: Tensor) -> HeadMaps[Tensor]:
-        """(B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W).
+        """Apply the head: (B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W).
 
         With several scores per anchor there are so many times A of them, those of an anchor side by side.
         """

@@ -40,7 +40,7 @@ class Preparation(Protocol):
 class Trainable(nn.Module, ABC):
     """A detector that can be trained.
 
-    Outputs are the family's own: what `predict` gives goes to `loss` and to `detect` only.
+    The type of outputs is the family's: the result of `predict` is only passed to `loss` and `detect`.
     """
 
     preparation: Preparation

@@ -34,7 +34,7 @@ def class_rgb(name: str) -> Rgb:
 
 
 def class_shares(name: str) -> tuple[float, float, float]:
-    """Return the color of a class as shares of red, green and blue, 0..1, as WebGL, Foxglove and ROS want it."""
+    """Return the color of a class as shares of red, green and blue, 0..1, as in WebGL, Foxglove and ROS."""
     red, green, blue = class_rgb(name)
     return red / 255, green / 255, blue / 255
 
@@ -50,7 +50,7 @@ def height_table() -> dict[str, Any]:
 
 
 def ground_height(z_m: NDArray[np.floating]) -> float:
-    """Return height (m) at which the color ramp begins: the 10th percentile of the points' (N,); 0 without points."""
+    """Return the height (m) at which the color ramp begins: 10th percentile of the points' (N,); 0 without points."""
     return float(np.percentile(z_m, 10)) if len(z_m) else 0.0
 
 

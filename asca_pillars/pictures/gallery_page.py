@@ -34,7 +34,7 @@ def gallery_page(
         introduction: plain text; empty lines divide paragraphs.
         cards: in the order of their files.
         first: the value that they are sorted by at first, the largest on top; None: as they come.
-        end: what follows the HTML, such as the sentence by which a command recognizes its own page.
+        end: text after the HTML, such as the sentence by which a command recognizes its page.
     """
     names = list(dict.fromkeys(name for card in cards for name in card.values))
     buttons = "".join(_button(name, pressed=name == first) for name in ["order", *names])

@@ -111,7 +111,7 @@ def draw_chase(
         ranges: where the detector looked; they choose the camera.
         width_px: of the picture.
         trails: where boxes were before.
-        ground_m: z of the ground; None: as the points say.
+        ground_m: z of the ground; None: estimated from the points.
     """
     places: NDArray[np.float64] = np.asarray(points)[:, :3].astype(np.float64)
     points = places = places[np.isfinite(places).all(axis=1)]

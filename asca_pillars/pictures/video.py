@@ -41,7 +41,7 @@ def find_encoder() -> str:
     """Return the program that encodes videos.
 
     Raises:
-        AscaError: there is none; says how to get it.
+        AscaError: there is none; the message says how to install it.
     """
     if importlib.util.find_spec("imageio_ffmpeg") is not None:
         import imageio_ffmpeg
@@ -164,7 +164,7 @@ class BoxVideo:
             points: (N, >=3) metres, in the scan's frame.
             detections: found in it, in the same frame.
             time_s: of the scan.
-            track_ids: (M,) the identity of each box: written beside it, and it gets a trail; None: scores.
+            track_ids: (M,) identity of each box, drawn beside it with a trail; None: scores are drawn.
             pose: 4x4, from the scan to a frame that stands still; None: trails show how things moved about the sensor.
         """
         self._file.write(self.draw(points, detections, time_s, track_ids, pose))

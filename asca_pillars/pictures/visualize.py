@@ -128,7 +128,7 @@ def draw_layers(
 
     Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR. With the same boxes (K, 7) as
     `room_for` several pictures of a scan show the same part of it, whatever is drawn in each. `trails` are where boxes
-    were before; colors begin at `ground_m`, or where the points say.
+    were before; colors begin at `ground_m`, or at a height estimated from the points.
     """
     points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]

@@ -172,7 +172,7 @@ class StepProgress(RankProgress):
         self._progress, self._remark, self._total = progress, remark, 0
 
     def print(self, *args: Any, **_: Any) -> None:
-        """Pass a line on."""
+        """Pass a line to `remark`."""
         if self._enabled:
             self._remark(" ".join(map(str, args)))
 

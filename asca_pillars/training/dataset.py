@@ -109,7 +109,7 @@ class LabeledDataset(Dataset[Sample | AscaError]):
 
 
 def open_dataset(root: str | Path, config: Config, *, training: bool) -> LabeledDataset:
-    """Open the training or the validation samples that `config` asks for.
+    """Open the training or the validation samples of `config`.
 
     Raises:
         DatasetError: as `open_frames`.

@@ -1,4 +1,4 @@
-"""Training and validation batches, loaded by processes of their own."""
+"""Training and validation batches from loader processes."""
 
 import atexit
 import contextlib
@@ -19,7 +19,7 @@ from asca_pillars.training.dataset import Collate, LabeledDataset, open_dataset
 from asca_pillars.training.shared_batches import ShareCollated, loader_context, start_loader_process
 
 LOOK_AGAIN_S = 5
-"""Seconds without a batch after which the loop looks whether all processes live."""
+"""Seconds without a batch after which the loop checks that all processes live."""
 MOST_LOOKS = 180
 """Looks without a batch after which it gives up: a quarter of an hour, in which the run was not suspended."""
 _REMEDY = (
@@ -141,7 +141,7 @@ class EpochSampler(Sampler[list[tuple[int, int]]]):
         frames: number of frames.
         batch_size: frames per batch and rank.
         seed: of the order.
-        step: tells the optimizer steps done so far; None walks once through all frames in order (validation).
+        step: returns the optimizer steps so far; None: all frames once, in order (validation).
     """
 
     def __init__(

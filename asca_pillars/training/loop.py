@@ -72,7 +72,7 @@ def train(
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
         init: checkpoint that a new run starts from, see `initial_weights`; a run that goes on must have started from
             them.
-        bar: shows or tells the progress; None: on the terminal.
+        bar: displays or reports the progress; None: on the terminal.
         remark: called with what is odd about the run; None: it is printed.
 
     Returns:

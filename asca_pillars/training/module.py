@@ -140,7 +140,7 @@ def make_schedule(optimizer: Optimizer, recipe: TrainConfig, epoch_steps: int) -
 
 
 def warmup_stable_decay(recipe: TrainConfig, total_steps: int, step: int) -> float:
-    """Return factor of the learning rate at `step` of `total_steps`: a linear rise, then 1, then a linear fall.
+    """Return the factor of the learning rate at `step` of `total_steps`: a linear rise, then 1, then a linear fall.
 
     It is more than 0 at every step from 0 to `total_steps` - 1 (Hu et al., MiniCPM, arXiv 2404.06395).
     """
@@ -150,7 +150,7 @@ def warmup_stable_decay(recipe: TrainConfig, total_steps: int, step: int) -> flo
 
 
 def cooldown_start(recipe: TrainConfig, total_steps: int) -> int:
-    """Return first step of `warmup_stable_decay` whose rate depends on how long the run is."""
+    """Return the first step of `warmup_stable_decay` whose rate depends on how long the run is."""
     return math.ceil((1 - recipe.cooldown) * total_steps)
 
 

@@ -56,7 +56,7 @@ class Seen(NamedTuple):
         Args:
             split: the frames.
             processes: how many.
-            initial: weights, empty where all are random; None where a run goes on whose start is not stated again.
+            initial: weights, empty where all are random; None where a resumed run's start is not given again.
 
         Raises:
             OSError: a scan is not there.

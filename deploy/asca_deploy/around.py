@@ -1,6 +1,6 @@
 """Detection in every direction with a model that looks ahead: one pass with wider ranges, or several turned ones.
 
-A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolutions looks around with wider ones
+A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolutions is run with wider ones
 (`widened`). With others the scan is turned before each pass, and the boxes are turned back:
 
     pass 0: ahead     pass 1: left     pass 2: behind     pass 3: right
@@ -94,7 +94,7 @@ def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...
 def about_ground(turns: Sequence[FrameChange], points: NDArray[np.float32]) -> tuple[FrameChange, ...]:
     """Return the turns about the normal of a scan's ground, through its origin; about z where no ground is found.
 
-    In all of them the ground then lies as it does before them. The first turn, which is none, stays as it is.
+    The ground keeps its pose in all of them. The first turn, the identity, is not changed.
 
     Args:
         turns: see `turns_around`.

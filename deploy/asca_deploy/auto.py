@@ -73,7 +73,7 @@ def choose(
     """Open, compare and time candidates in turn; return the fastest that agrees, float32 where it is about as fast.
 
     Args:
-        names: (provider, precision) of the candidates beside REFERENCE, in the order in which they are tried.
+        names: (provider, precision) of the candidates besides REFERENCE, in the order of trials.
         open_network: of a provider and a precision.
         detect: the sample scan's boxes by a network.
         spec: whose thresholds those boxes had to reach.
@@ -82,7 +82,7 @@ def choose(
         weights: the bundle's own precision, for the report.
 
     Raises:
-        ProviderError: nothing in the precision that was asked for can be taken; says why.
+        ProviderError: no candidate in the requested precision can be used; the message says why.
         BundleError: the reference cannot run the graph.
     """
     reference = open_network(*REFERENCE)
@@ -111,7 +111,7 @@ def choose(
 
 
 def summary(runs_on: str, candidates: Iterable[Candidate]) -> str:
-    """Return one line that says what was taken (`Detector.runs_on`) and why."""
+    """Return one line on what was chosen (`Detector.runs_on`) and why."""
     return f"auto takes {runs_on}: {'; '.join(map(str, candidates))}"
 
 

@@ -211,7 +211,7 @@ class Provenance(Strict):
     """SHA-256 of the trained arrays, the same for every export of a checkpoint, see
     `asca_pillars.models.checkpoint_file`; None in bundles made before it was recorded."""
     weights_file: Literal["weights.ckpt"] | None = None
-    """Checkpoint beside the graphs that holds the trained arrays in 16 bits; None where it was not asked for."""
+    """Checkpoint beside the graphs that holds the trained arrays in 16 bits; None if it was not exported."""
     weights_file_sha256: str | None = None
     """SHA-256 of `weights_file`; None in bundles made before it was recorded."""
 

@@ -159,7 +159,7 @@ def detect_archive(
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
         progress: called while it is found out what an earlier run has done.
         remark: called with what was decided for a folder.
 
@@ -280,7 +280,7 @@ def _job(
 
 
 def _results_depend_on(job: DetectShard, scans: Sequence[Path]) -> dict[str, object]:
-    """Return what results depend on, as plain values."""
+    """Return the settings that results depend on, as plain values."""
     relative = any(not path.is_absolute() for path in scans)
     return {
         "working_folder": str(job.start) if relative else None,

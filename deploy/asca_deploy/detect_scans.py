@@ -43,7 +43,7 @@ _AS_TRAINED = ScanSettings()
 class DetectedScan:
     """One scan: its file, what was repaired while reading it, and its boxes with their report.
 
-    `tracks` are the same boxes with identities and velocities, if they were asked for.
+    `tracks` are the same boxes with identities and velocities, with tracking.
     """
 
     path: Path
@@ -109,7 +109,7 @@ def detect_scans(
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
         pictures: whether pictures are drawn into `out`.
         track: give boxes identities and velocities over time; the scans then lie in one folder, in order.
         rate_hz: scans per second of that folder; None: 10.

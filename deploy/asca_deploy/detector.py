@@ -76,18 +76,18 @@ class Detector:
         bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the
             default, see `default_bundle_path`.
         provider: of the slowest network: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one available
-            that finds in the sample scan what "cpu" finds. `self.provider` and `self.precision` say what was taken,
-            `self.candidates` how each one did. The other graphs always run on onnxruntime's CPU provider.
+            whose boxes in the sample scan agree with those of "cpu". `self.provider` and `self.precision` are the
+            choice, `self.candidates` the results. The other graphs always run on onnxruntime's CPU provider.
         precision: "float32", in which the bundle was proven, or "reduced" where the provider has something faster
             (`asca_deploy.providers`); None for float32, with "auto" for either.
         threads: of the CPU; None for the physical cores granted to the process.
         score_threshold: overrides that of every class, or of the classes named, such as {"Car": 0.4}; None keeps the
             bundle's.
-        mounting: how the scans' frame lies to the model's. Points come and boxes go in the scans' own frame. None: the
-            scans are as those of the training.
+        mounting: pose of the scans' frame relative to the model's. Points and boxes are in the scans' frame. None: the
+            scans are like those of the training.
         view: "ahead", or "around" for every direction: one pass with wider ranges where the model was trained on whole
             revolutions (`asca_deploy.around`), else as many turned passes as its field of view needs, merged.
-            `self.passes` says how many; each turned one costs what a scan ahead costs.
+            `self.passes` is their number; each turned one costs as much as a scan ahead.
 
     Raises:
         BundleError: the bundle is missing, damaged or made for another version.
@@ -207,7 +207,7 @@ class Detector:
         that live as long as the iterator; see `asca_deploy.stream`.
 
         Args:
-            scans: (N, 4) each, as for a call; read in another thread, at most one ahead of the one asked for.
+            scans: (N, 4) each, as for a call; read in another thread, at most one ahead of the one requested.
 
         Raises:
             ScanError: a scan cannot be used; the scans before it have been yielded. Errors of `scans` itself come in

@@ -35,7 +35,7 @@ def layout_of(spec: PillarSpec) -> dict[str, Any]:
 
 
 def difference(written: Any, derived: Any) -> str | None:
-    """Return path of the first value that differs (metres and radians by more than 1e-6), or None."""
+    """Return the path of the first value that differs (metres and radians by more than 1e-6), or None."""
     if isinstance(derived, dict | list):
         keys = list(derived) if isinstance(derived, dict) else list(range(len(derived)))
         if not isinstance(written, type(derived)) or len(written) != len(derived):

@@ -1,4 +1,4 @@
-"""bundle.json: read, compared with the graphs beside it, and written.
+"""Reading, verifying and writing bundle.json.
 
 A manifest that does not belong to its graphs would move boxes without any error. So everything that boxes depend on
 is also in the metadata of each graph, under the graph's SHA-256, and the two have to agree.

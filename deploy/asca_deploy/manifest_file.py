@@ -51,7 +51,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
 
 
 def first_misread(written: Any, understood: Any) -> str | None:
-    """Return path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
+    """Return the path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
 
     A key that is understood as None need not be written: bundles made before there was such a key lack it.
     """

@@ -60,7 +60,7 @@ def track_thresholds(bundle: str | Path | None, score: ScoreThresholds | None = 
 
     Args:
         bundle: of the detector; None: the one that ships.
-        score: from which on boxes are wanted, or by class; None: the thresholds of the model.
+        score: lowest score of boxes, or by class; None: the thresholds of the model.
 
     Returns:
         `Tracker`'s birth_score, and the detector's score threshold: WEAK_SHARE of the lowest of these.
@@ -83,10 +83,10 @@ def open_model(
         options: which one, and how it runs.
         min_score: lowest score of what it reports.
         sensor_height_m: of the scans; None: as high as in the training.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
 
     Raises:
-        AscaError: missing, damaged, or not to be run as asked; one line.
+        AscaError: missing, damaged, or not runnable with these options; one line.
     """
     path = None if options.bundle is None else Path(options.bundle)
     if path is not None and (path.is_file() or path.suffix == ".ckpt"):

@@ -30,7 +30,7 @@ def open_pipeline(
         precision: None for float32, with auto for any.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start or cannot run the graph; with auto, none can be taken.
     """
 

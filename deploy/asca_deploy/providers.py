@@ -42,7 +42,7 @@ def arithmetic(weights: str, precision: str) -> str:
 def require(provider: str, precision: str = "float32") -> None:
     """Raise ProviderError, one line with the remedy, unless the provider is installed and has the precision.
 
-    AUTO always is; what it has shows when it looks.
+    AUTO always passes; its candidates are checked when they are opened.
     """
     if provider not in (AUTO, *PROVIDERS):
         raise ProviderError(f"unknown provider {provider!r}; choose one of {AUTO}, {', '.join(PROVIDERS)}")

@@ -65,7 +65,7 @@ class ScanDetections(Detections):
 
         Args:
             points: (N, >=3) x, y, z in metres, LiDAR frame. None for those that the boxes were found in: only a weak
-                reference to them is kept, so they are drawn as long as somebody else keeps the array.
+                reference to them is kept, so they are drawn as long as the caller keeps the array.
             view: "above", where ahead is up, or "chase", in 3D from behind the sensor.
             labels: (M, 7) true boxes in the scan's frame, drawn thin and white; None without any.
             width_px: of the image.

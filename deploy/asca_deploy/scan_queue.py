@@ -23,7 +23,7 @@ class ScanQueue:
     """Queue between a sensor's thread, which calls `put`, and `Detector.stream`, which iterates. One of each.
 
     A stream takes up to two scans ahead of the one that it hands out; those are no longer in the queue. After a stream
-    that failed or was left, a new one over the same queue goes on with the scans that wait.
+    that failed or was left, a new one over the same queue continues with the waiting scans.
 
     Args:
         when_full: what a scan does that finds the queue full. "drop": the oldest waiting scan is dropped and counted,

@@ -14,7 +14,7 @@ from asca_pillars.base.input_files import require_content
 
 
 def default_bundle_path() -> Path:
-    """Return folder of the model that is used unless another is named: 8-bit, the faster one on every CPU."""
+    """Return the folder of the model that is used unless another is named: 8-bit, the faster one on every CPU."""
     return shipped_bundles()["asca_sim_int8"]
 
 

@@ -70,7 +70,7 @@ class Tracker:
     Args:
         birth_score: a detection that no track takes begins one from this score on; one number, or one for each class
             name. With several classes, those that are not named take the lowest.
-        report_score: a track is reported from this score on: at once if it begins so well, else after a second look.
+        report_score: a track is reported from this score on: at once if it begins there, else after later detections.
         death_score: a track ends below it. Unseen, it loses `FADE_PER_S` of its score per second.
         max_unseen_s: a track that nothing confirmed for so long ends, whatever its score. One that the last scan
             confirmed waits for this scan, if the two are at most `MAX_SCAN_GAP_S` apart.

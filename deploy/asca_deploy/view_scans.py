@@ -66,7 +66,7 @@ class ScanServer:
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: show detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction.
+        around: detect in every direction, see `asca_deploy.around`.
 
     Attributes:
         address: where the page is.

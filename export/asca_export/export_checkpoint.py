@@ -65,18 +65,18 @@ def export(
         checkpoint: of a run, or a bundle (folder, or name of one that ships) that holds its weights.
         out: folder of the bundle; an earlier bundle there is replaced.
         scans: like those trained on, to compare on; None: simulated ones.
-        trained_on: what the weights saw, for the manifest; None: what a bundle says of itself.
+        trained_on: training data in words, for the manifest; None: from the bundle that holds the weights.
         score: thresholds of the bundle; None: those of the checkpoint.
-        range_m: where the bundle looks for objects, x0 x1 y0 y1 in metres; None: as trained.
+        range_m: detection range of the bundle, x0 x1 y0 y1 in metres; None: as trained.
         int8: make the graphs 8-bit ones.
         calibrate: scans to calibrate these with; None: simulated ones.
         dense_neck: write a sparse neck as dense convolutions with masks.
         with_weights: add the weights, in 16 bits.
         progress: called while scans are simulated.
-        step: told what is being done.
+        step: called with a description of each step.
 
     Returns:
-        The manifest; `parity` and `quantization` say how far it is from the checkpoint.
+        The manifest; `parity` and `quantization` are the differences from the checkpoint.
 
     Raises:
         AscaError: an argument cannot be used, `out` holds something else, or the graphs differ from PyTorch.

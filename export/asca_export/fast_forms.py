@@ -84,7 +84,7 @@ class FastBackbone(nn.Module):
     """Neck and head of a trained detector as one graph in fast forms.
 
     Args:
-        detector: in evaluation mode; it stays as it is.
+        detector: in evaluation mode; not modified.
         steps: of the pseudo-image, which then holds STEP_VALUE times the step; None for real values.
         padded: whether the pseudo-image comes with the first convolution's padding.
         attention: a module after each block, if there is any.
@@ -112,7 +112,7 @@ class FastBackbone(nn.Module):
             _take_steps(first, steps, padded=padded)
 
     def stages(self) -> list[Stage]:
-        """The blocks, from the finest map to the coarsest."""
+        """Return the blocks, from the finest map to the coarsest."""
         stages = []
         for i, (block, upsample) in enumerate(zip(self.blocks, self.upsamples, strict=True)):
             assert isinstance(block, nn.Sequential) and isinstance(upsample, Upsample)
@@ -121,7 +121,7 @@ class FastBackbone(nn.Module):
         return stages
 
     def forward(self, canvas: Tensor) -> tuple[Tensor, ...]:
-        """(1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A).
+        """Run: (1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A).
 
         Without padding in it the pseudo-image is (1, ny, nx, C).
         """
@@ -152,7 +152,7 @@ class Upsample(nn.Module):
             self.convolution.bias.copy_(fused.bias.repeat(self.stride**2))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless (1, C, H, W) -> (1, stride * H, stride * W, channels)."""
+        """Upsample unitless (1, C, H, W) -> (1, stride * H, stride * W, channels)."""
         upsampled = torch.relu(self.convolution(features)).permute(0, 2, 3, 1)
         if self.stride == 1:
             return upsampled

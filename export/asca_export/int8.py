@@ -104,7 +104,7 @@ def quantize_bundle(
         detector: what it was exported from, in evaluation mode.
         calibration: scans (N, 4), LiDAR frame, that set the ranges, see `calibration_scans`.
         scans: to measure on.
-        progress: told what is being done.
+        progress: called with a description of each step.
 
     Raises:
         ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
@@ -168,7 +168,7 @@ def sweep(
     Args:
         layers: by name.
         error_of: the `logit_error` with these layers in 8 bits.
-        progress: told what is being done.
+        progress: called with a description of each step.
 
     Raises:
         ExportError: MAX_LOGIT_ERROR is exceeded whatever stays in floating point.

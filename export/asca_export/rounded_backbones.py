@@ -64,7 +64,7 @@ def round_backbone(
     """Round the weights of a dense or of a sparse neck and its head.
 
     Args:
-        detector: in evaluation mode; it stays as it is.
+        detector: in evaluation mode; not modified.
         encoded: the calibration scans.
         steps: of their pillar features.
         work: folder for what is needed on the way.
@@ -220,7 +220,7 @@ def _layer(node: onnx.NodeProto) -> str:
 
 
 def _feed_uint8(graph: onnx.GraphProto) -> None:
-    """Take the canvas as uint8. Runtimes know how to move the conversion through the transpose that follows."""
+    """Declare the canvas input as uint8. Runtimes can move the conversion through the transpose that follows."""
     (canvas,) = graph.input
     for node in graph.node:
         node.input[:] = ["float_canvas" if name == canvas.name else name for name in node.input]

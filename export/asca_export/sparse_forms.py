@@ -50,7 +50,7 @@ class SparseBackbone(nn.Module):
     """Sparse neck and head of a trained detector as matrix products by name.
 
     Args:
-        detector: in evaluation mode, with a sparse neck; it stays as it is.
+        detector: in evaluation mode, with a sparse neck; not modified.
         steps: of the pillar features, which then hold STEP_VALUE times the step; None for real values.
     """
 
@@ -115,14 +115,14 @@ class SparseBackbone(nn.Module):
         yield HEAD, joined, self.product(HEAD)(joined)
 
     def forward(self, features: Tensor, tables: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
-        """Pillar features (P, C) -> scores (H, A), boxes (H, 7A), directions (H, 2A) at H head cells."""
+        """Run: pillar features (P, C) -> scores (H, A), boxes (H, 7A), directions (H, 2A) at H head cells."""
         for _, _, output in self.passes(features, tables):
             last = output
         return HeadMaps(*last.split(self.head_channels, dim=1))
 
 
 def scale_and_shift(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
-    """Return scale and shift of a normalization in evaluation mode, (C,) each."""
+    """Return the scale and shift of a normalization in evaluation mode, (C,) each."""
     assert norm.running_var is not None and norm.running_mean is not None
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
     return scale, norm.bias - norm.running_mean * scale

@@ -41,10 +41,10 @@ class ForeignWeights(NamedTuple):
     state: dict[str, Tensor]
     """Arrays by name."""
     steps: int
-    """Optimizer steps behind them, as far as the file says."""
+    """Optimizer steps of the training, if the file has them."""
     library: Literal["OpenPCDet", "mmdetection3d"] = "OpenPCDet"
     classes: tuple[str, ...] = ()
-    """Names of the classes in their order, as far as the file says."""
+    """Names of the classes in their order, if the file has them."""
     legacy: bool = True
     """Flag of mmdetection3d's encoder, see `encoder_links`; true unless the configuration in the file denies it."""
 
@@ -80,7 +80,7 @@ def read_foreign(path: str | Path) -> ForeignWeights:
 
 
 def _described(weights: ForeignWeights, content: Mapping[str, Any]) -> ForeignWeights:
-    """Return the weights with what stands beside them in the file.
+    """Return the weights with the metadata of the file.
 
     Raises:
         TrainingError: mmdetection3d before 1.0 wrote them.
@@ -105,7 +105,7 @@ def _described(weights: ForeignWeights, content: Mapping[str, Any]) -> ForeignWe
 
 
 def published_config(weights: ForeignWeights) -> str:
-    """Return name of the configuration that ships for this family of checkpoints.
+    """Return the name of the configuration that ships for this family of checkpoints.
 
     Raises:
         TrainingError: it is neither PointPillars nor PV-RCNN.

@@ -44,7 +44,7 @@ class PaperAttention(nn.Module):
         self.restore = nn.Parameter(torch.empty(channels, max_pillars).uniform_(-bound, bound))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
+        """Apply the attention: unitless features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
         pillars = features.shape[0]
         by_channel = features.T  # F of the paper, (C, P)
         query = by_channel @ self.query[:pillars] + self.bias["query"]  # (C, d)
@@ -65,7 +65,7 @@ class _ChannelMixing(nn.Module, ABC):
         """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless features (P, C) -> (P, C) for the pillars of one frame."""
+        """Apply the attention: unitless features (P, C) -> (P, C) for the pillars of one frame."""
         device = features.device.type
         if torch.is_autocast_enabled(device):  # differences of large sums: bfloat16 would leave little of them
             with torch.autocast(device, enabled=False):
@@ -141,7 +141,7 @@ class PointAttention(nn.Module):
         self.restore = nn.Linear(channels, channels)
 
     def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-        """(M, C) point features -> (M, C); points attend to the points of their own pillar only.
+        """Apply the attention: (M, C) point features -> (M, C); points attend to the points of their own pillar only.
 
         Args:
             features: (M, C), unitless, rows of one pillar adjacent.
@@ -178,7 +178,7 @@ def pillar_max(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> 
     """Return the channel-wise maximum over the points of each pillar: unitless features (M, C) -> (P, C).
 
     Points lie flat, without padding, so only real points are compared. While a graph is exported the reduction is
-    one named operator, because the exporter knows no segment reduction (asca_export.graphs translates it).
+    one named operator, because the exporter has no segment reduction (asca_export.graphs translates it).
     """
     if torch.compiler.is_exporting():
         pooled: Tensor = _traced_pillar_max(features, pillar_index, point_counts)

@@ -46,7 +46,7 @@ class LossTerms(NamedTuple):
 
 
 def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossConfig) -> LossTerms:
-    """Eq. (15): focal loss over anchors, smooth L1 and direction over the positive ones, per positive anchor.
+    """Compute eq. (15): focal loss over anchors, smooth L1 and direction over the positive ones, per positive anchor.
 
     Args:
         maps: scores (B, A, H, W), or (B, A * classes, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W); or rows
@@ -113,7 +113,7 @@ def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
 
 
 def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Tensor:
-    """Eq. (14), summed: binary focal loss (arXiv 1708.02002) where `state` is 1 or 0, nothing where it is -1.
+    """Compute eq. (14), summed: binary focal loss (arXiv 1708.02002) where `state` is 1 or 0, nothing where it is -1.
 
     Both are (B, H, W, A); the loss is a scalar.
     """
@@ -125,7 +125,7 @@ def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Ten
 
 
 def quality_focal_loss(logits: Tensor, state: Tensor, quality: Tensor, alpha: float, gamma: float) -> Tensor:
-    """Eq. (2) of Generalized Focal Loss (arXiv 2006.04388), summed: where `state` is 1 a score is to be `quality`.
+    """Compute eq. (2) of Generalized Focal Loss (arXiv 2006.04388), summed: `quality` is the target of positives.
 
     With eq. (14)'s weights of positive and negative anchors, which that paper leaves out: where every quality is 1 this
     is `focal_loss`.
@@ -154,7 +154,7 @@ def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
 
 
 def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
-    """Eq. (13), summed over residuals (K, 7): smooth L1 of six of them and of the sine of the yaw difference.
+    """Compute eq. (13), summed over residuals (K, 7): smooth L1 of six of them and of the sine of the yaw difference.
 
     The sine makes a box and the same box turned by half a circle equal; the direction bins tell them apart.
     """

@@ -42,7 +42,7 @@ class SparseRPNNeck(MapBackbone):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, pillars: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:  # type: ignore[override]
-        """Unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
+        """Apply the neck: unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):

@@ -65,7 +65,7 @@ class PillarDetector(Trainable):
         self.head = head
 
     def forward(self, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Pillars of B frames -> head maps (B, channels, H, W) of logits and residuals.
+        """Apply the network: pillars of B frames -> head maps (B, channels, H, W) of logits and residuals.
 
         With a sparse neck: rows (M, channels) of the active head cells, see `SSDHead`.
 
@@ -157,7 +157,7 @@ class PillarDetector(Trainable):
 def _running_statistics(module: nn.Module) -> Iterator[None]:
     """Normalize by running statistics within the block, because a single value per channel has no variance.
 
-    `SyncBatchNorm` stays as it is: other devices wait for it, and it has their values, too.
+    `SyncBatchNorm` is not changed: other devices wait for it, and its statistics include theirs.
     """
     norms = [part for part in module.modules() if isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d)]
     training = [norm for norm in norms if norm.training]

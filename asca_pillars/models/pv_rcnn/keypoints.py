@@ -28,7 +28,7 @@ class Adjustment(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, features: Tensor, counted: Tensor) -> Tensor:
-        """Unitless features of groups (M, T, C) -> the same shape.
+        """Adjust unitless features of groups (M, T, C) -> the same shape.
 
         Args:
             features: F.
@@ -60,7 +60,7 @@ class AdaptiveScales(nn.Module):
         self.out_channels = out_channels
 
     def forward(self, points: Tensor, scales: Sequence[PointScale[Tensor]]) -> Tensor:
-        """Points (N, 3 + in_channels), x, y, z in metres, and their scales -> features (K, out_channels)."""
+        """Encode points (N, 3 + in_channels), x, y, z in metres, and their scales -> features (K, out_channels)."""
         positions, features, found = points[:, :3], points[:, 3:], []
         for lift, adjust, scale in zip(self.lift, self.adjust, scales, strict=True):
             assert isinstance(lift, SetAbstraction)

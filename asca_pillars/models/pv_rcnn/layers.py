@@ -48,12 +48,12 @@ class DualAttention(nn.Module):
         self.place_query = nn.Conv2d(channels, half, 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> the same shape."""
+        """Apply the attention: unitless (B, C, H, W) -> the same shape."""
         attended = self.by_place(self.by_channel(features))
         return features + _RESIDUAL_WEIGHT * attended if self.residual else attended
 
     def by_channel(self, features: Tensor) -> Tensor:
-        """Eq. (1) and (2): a weight in (0, 1) for each channel of unitless (B, C, H, W)."""
+        """Return eq. (1) and (2): a weight in (0, 1) for each channel of unitless (B, C, H, W)."""
         values = self.channel_value(features).flatten(2)  # (B, C / 2, HW)
         shares = torch.softmax(self.channel_query(features).flatten(2), dim=2)  # (B, 1, HW)
         pooled = (values @ shares.transpose(1, 2))[:, :, 0]
@@ -61,7 +61,7 @@ class DualAttention(nn.Module):
         return features * weights[:, :, None, None]
 
     def by_place(self, features: Tensor) -> Tensor:
-        """Eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
+        """Return eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
         values = self.place_value(features)  # (B, C / 2, H, W)
         shares = torch.softmax(self.place_query(features).mean(dim=(2, 3)), dim=1)  # (B, C / 2)
         return features * torch.sigmoid((values * shares[:, :, None, None]).sum(dim=1, keepdim=True))
@@ -79,7 +79,7 @@ class SparseConvBlock(nn.Module):
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
 
     def forward(self, features: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
-        """Unitless (N, in_channels) -> (M, channels), see `rulebook_conv`."""
+        """Apply the block: unitless (N, in_channels) -> (M, channels), see `rulebook_conv`."""
         return torch.relu(self.norm(rulebook_conv(features, self.convolution.weight, table, back)))
 
 
@@ -109,7 +109,7 @@ class VoxelBackbone(nn.Module):
         self.out_channels = out
 
     def forward(self, features: Tensor, levels: Sequence[VoxelLevel[Tensor]]) -> list[Tensor]:
-        """Voxel features (N, in_channels) -> unitless features (M, channels) of the active cells of every level."""
+        """Encode voxel features (N, in_channels) -> unitless (M, channels) of the active cells of every level."""
         found = []
         for number, level in enumerate(levels):
             if number:
@@ -175,7 +175,7 @@ class PvRcnn(nn.Module):
         self.scales = scales
 
     def propose(self, batch: VoxelBatch[Tensor]) -> FirstStageOutputs:
-        """Voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
+        """Encode voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
         levels = self.voxels(batch.features, batch.levels)
         canvas = self.scatter(levels[-1], batch.levels[-1].cells, len(batch.frame_keypoints))
         maps: HeadMaps[Tensor] = self.head(self.neck(as_map(canvas)))

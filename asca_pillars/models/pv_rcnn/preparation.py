@@ -40,7 +40,7 @@ class VoxelBatch(NamedTuple, Generic[Array]):
     ball_indices: tuple[Array, ...]
     """(K, samples), source by source and radius by radius."""
     nearest: tuple[Array, ...]
-    """(K, 3) voxels per source, (0, 3) where they are not asked for."""
+    """(K, 3) voxels per source, (0, 3) where they are not needed."""
     nearest_weights: tuple[Array, ...]
     """(K, 3)."""
     bev_cells: Array
@@ -74,7 +74,7 @@ class LabeledVoxels(NamedTuple):
 
 
 def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch[Tensor]:
-    """Return several scans, at least one, as one batch."""
+    """Batch several scans, at least one."""
     levels = stack_voxel_levels([scan.levels for scan in scans], spec.level_shapes)
     sources = range(len(scans[0].positions))
     frame_rows = tuple(tuple(len(scan.positions[source]) for scan in scans) for source in sources)

@@ -94,7 +94,7 @@ def with_first_stage(model: RefineModel, stage: FirstStage | None = None) -> Ref
 
     Raises:
         AscaError: as `open_first_stage`.
-        ConfigError: the model says something else of it.
+        ConfigError: the model states other properties of it.
     """
     stage = stage or open_first_stage(model.first_stage)
     if model.first_stage_identity not in ("", stage.identity):
@@ -122,7 +122,7 @@ def with_first_stage(model: RefineModel, stage: FirstStage | None = None) -> Ref
 
 
 def _geometry(spec: PillarSpec) -> PillarSpec:
-    """Return the spec without thresholds and suppression, which are the second stage's own."""
+    """Return the spec without thresholds and suppression, which are those of the second stage."""
     return replace(spec.with_score_threshold(0.0), post=PostProcess())
 
 

@@ -109,7 +109,7 @@ def build_refine_detector(model: RefineModel) -> RefineDetector:
     """Build the network that `model` describes, with fresh random weights.
 
     Raises:
-        ConfigError: it does not say how many channels the first stage's map has.
+        ConfigError: it lacks the number of channels of the first stage's map.
     """
     if not model.bev_channels:
         raise ConfigError(

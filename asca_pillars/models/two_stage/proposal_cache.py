@@ -54,7 +54,7 @@ class ProposalFiles:
 class ProposalCache:
     """Files below `prepared`/proposals-KEY, one for each frame; KEY names the first stage and the settings.
 
-    Each file tells what its frame's points depended on (`points_state`), so that a frame that changed is noticed.
+    Each file records the state of its frame's points (`points_state`), so that changed frames are detected.
 
     Args:
         prepared: folder of what is computed once per dataset, see `data.insertion.prepared`.
@@ -73,7 +73,7 @@ class ProposalCache:
         self.files = ProposalFiles(prepared / pool / f"proposals-{key}", stage.spec.class_names)
 
     def fill(self, split: LabeledSplit, *, workers: int = 1, console: Console | None = None) -> None:
-        """Compute what is missing or outdated. Each file appears when it is complete, so a killed run just goes on.
+        """Compute what is missing or outdated. Each file appears when it is complete, so a killed run can be resumed.
 
         Args:
             split: frames.

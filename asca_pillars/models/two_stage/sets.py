@@ -50,7 +50,7 @@ class SetAbstraction(nn.Module):
         return self.grouped(positions, features, queries, indices).max(dim=1).values
 
     def grouped(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """Return output of the MLP for each point of each ball, (Q, T, out_channels).
+        """Return the output of the MLP for each point of each ball, (Q, T, out_channels).
 
         Args:
             positions: (N, 3) of the points, metres, in the frame of the queries.
@@ -116,7 +116,7 @@ class VectorPool(nn.Module):
         self.out_channels = widths[-1]
 
     def forward(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """Features of the queries, (Q, out_channels).
+        """Return features of the queries, (Q, out_channels).
 
         Args:
             positions: (N, 3) of the points, metres, in the frame of the queries.
@@ -136,7 +136,7 @@ class VectorPool(nn.Module):
 
     @staticmethod
     def _cell(place: Tensor, of_points: Tensor, padded: Tensor, centers: Tensor, index: Tensor) -> Tensor:
-        """[a_i - v_t ; h_t] W_t of one cell, (Q, cell_channels)."""
+        """Return [a_i - v_t ; h_t] W_t of one cell, (Q, cell_channels)."""
         found = (index < padded.shape[0] - 1).to(padded.dtype)  # (Q, 3)
         near = padded.index_select(0, index.reshape(-1)).unflatten(0, index.shape)
         away = (near - centers[:, None]) * found[..., None]  # a_i - v_t

@@ -233,7 +233,7 @@ class PillarGrid(Strict):
 
 
 def _interval(values: NDArray[np.float32], edges: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return index of the interval [edges[i], edges[i + 1]) around each value, for evenly spaced edges.
+    """Return the index of the interval [edges[i], edges[i + 1]) around each value, for evenly spaced edges.
 
     Equal to np.searchsorted(edges, values, "right") - 1 and several times faster on unsorted values.
     """

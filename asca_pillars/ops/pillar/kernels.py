@@ -21,7 +21,7 @@ _BLOCK = 16  # cells of the grid that are looked at together
 
 
 def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, _Integers]:
-    """`numpy_kernels._sort_points`, by counting: (N, 4) -> indices (K,) of the points inside, cells, counts (Q,)."""
+    """Compute `numpy_kernels._sort_points` by counting: (N, 4) -> indices (K,) of points inside, cells, counts (Q,)."""
     size = -(-grid.ny * grid.nx // _BLOCK) * _BLOCK
     # In one piece: glibc gives several pieces back to the system, and gets them page by page again for the next scan.
     memory = np.empty(5 * len(points) + size, np.uint32)
@@ -33,7 +33,7 @@ def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, 
 
 @inner
 def _interval(value: float, edges: _Floats, per_m: float) -> Any:
-    """`grid._interval` of one value."""
+    """Compute `grid._interval` of one value."""
     guess = np.uint64(min(int((value - edges[0]) * per_m), len(edges) - 2))
     if value < edges[guess]:
         return guess - np.uint64(1)
@@ -112,7 +112,7 @@ def fill_pillars(
     max_points: int,
     grid: PillarGrid,
 ) -> tuple[_Floats, _Integers, _Integers]:
-    """`numpy_kernels._fill_pillars`, in one pass: features (M, 9), pillar indices (M,) and counts of points (P,)."""
+    """Compute `numpy_kernels._fill_pillars`, in one pass: features (M, 9), pillar indices (M,), point counts (P,)."""
     point_counts = np.minimum(counts[kept], max_points)
     features = np.empty((point_counts.sum(), 9), np.float32)
     pillar_index = np.empty(len(features), np.int64)

@@ -28,7 +28,7 @@ def ball_query(
     samples: int,
     share: int,
 ) -> _Integers:
-    """`numpy_kernels._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
+    """Compute `numpy_kernels._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
     found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
     at = centers, cells_of(centers, columns)
     widths = np.zeros(2 * int(offsets.max()) + 1, np.int32)
@@ -39,7 +39,7 @@ def ball_query(
 
 
 def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_Integers, _Floats]:
-    """`numpy_kernels._three_nearest`, in rings of columns around each query.
+    """Compute `numpy_kernels._three_nearest`, in rings of columns around each query.
 
     Metres (N, 3), (Q, 3) -> indices (Q, 3) and squared distances (Q, 3) in m²; N and infinity where there is no point.
     """
@@ -60,7 +60,7 @@ def nearest_in_cubes(
     offsets: _Floats,
     reach_m: np.float32,
 ) -> _Integers:
-    """`numpy_kernels._nearest_in_cubes`, in columns (Q, 2) `first` to `last`: metres (N, 3), (Q, 3) -> (Q, T, 3)."""
+    """Compute `numpy_kernels._nearest_in_cubes` in columns `first` to `last` (Q, 2): (N, 3), (Q, 3) -> (Q, T, 3)."""
     nearest = np.empty((len(centers), len(offsets), 3), np.int32)
     at = centers, first, last
     room = np.empty(len(xyz), np.int32)

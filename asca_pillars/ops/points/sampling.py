@@ -106,7 +106,7 @@ def bilinear_cells(
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return flat indices row * W + column of the cells around positions, and weights: (K, >= 2) -> 2 x (K, 4).
 
-    Weights are not negative and sum to 1; beside the map its border counts.
+    Weights are not negative and sum to 1; outside the map, positions are clamped to its border.
 
     Args:
         points: x, y in metres first.

@@ -59,11 +59,11 @@ class VoxelSetSettings(GridSettings):
 
     Attributes:
         keypoints: of a scan, at most.
-        sources: what keypoints aggregate beside the map seen from above.
+        sources: aggregated by keypoints besides the bird's-eye-view map.
         scale_radii_m: of groups of raw points at scales that have all keypoints, a quarter of them, a sixteenth, ...,
             the finest first (AFE-RCNN's adaptive features); none without.
         scale_samples: of each of these groups at most.
-        deform: where keypoints look for voxels. `none`: around themselves. `paper`: around a place learnt from their
+        deform: centers of keypoints' balls. `none`: the keypoints. `paper`: a position predicted from their
             surroundings, one for each level (Deformable PV-RCNN). `authors`: one for each level and radius, as in that
             paper's code. `authors_frozen`: likewise, learning nothing through the place, as that code does.
         proposals: which of the first stage's boxes are refined.

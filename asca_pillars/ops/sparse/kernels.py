@@ -73,7 +73,7 @@ def _mark(mask: _Masks, start: _Rows, column: np.uint64, bits: np.uint64) -> Any
 
 @inner
 def _mark_flat(cells: _Integers, y_links: _Integers, x_links: _Integers, taps: int, nx: int, start: _Rows) -> Any:
-    """`mark_joined` where both lattices are one cell high and the kernel is square, several times as fast."""
+    """Compute `mark_joined` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
     row, found = 0, np.int64(0)
     start[nowhere] = 0
@@ -187,7 +187,7 @@ def _fill_flat(
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """`fill_table` where both lattices are one cell high and the kernel is square, several times as fast."""
+    """Compute `fill_table` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
     row = 0
     for i in range(len(cells)):
@@ -215,7 +215,7 @@ def fill_table(
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """`CellMap.table`, column by column: cells (N,) -> indices (N, K)."""
+    """Compute `CellMap.table`, column by column: cells (N,) -> indices (N, K)."""
     depth, width = len(z_links), len(x_links)
     taps_z, taps_y, taps_x = z_links.shape[1], y_links.shape[1], x_links.shape[1]
     if not len(mask) and depth == taps_z == 1 and taps_y == taps_x:
@@ -263,7 +263,7 @@ def fill_places(
     halvings: int,
     places: _Rows,
 ) -> None:
-    """`CellMap.places`: cells (N,) -> indices (N,)."""
+    """Compute `CellMap.places`: cells (N,) -> indices (N,)."""
     row, within = 0, (1 << halvings) - 1
     for i in range(len(cells)):
         while cells[i] >= (row + 1) * nx:

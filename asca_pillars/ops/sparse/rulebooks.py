@@ -214,7 +214,7 @@ def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
 
 
 def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
-    """Tables (M_i, ...) of indices into features of `rows[i]` rows each -> one into all of them, (sum of M_i, ...).
+    """Stack tables (M_i, ...) of indices into features of `rows[i]` rows -> one into all of them, (sum of M_i, ...).
 
     What is missing, row rows[i], becomes row sum(rows).
     """
@@ -227,5 +227,5 @@ def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDAr
 
 
 def stack_cells(cells: Sequence[NDArray[np.int32]], cells_per_frame: int) -> NDArray[np.int32]:
-    """Flat indices (M_i,) on each frame's map -> (sum of M_i,) on the maps of all frames, one after the other."""
+    """Stack flat indices (M_i,) on each frame's map -> (sum of M_i,) on the maps of all frames, one after the other."""
     return np.concatenate([each + np.int32(frame * cells_per_frame) for frame, each in enumerate(cells)])

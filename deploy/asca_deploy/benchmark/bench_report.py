@@ -51,7 +51,7 @@ class BenchmarkReport:
     threads: int
     cpu: str
     peak_memory_mib: float | None
-    """Largest resident memory of the process so far; None where the system does not say."""
+    """Largest resident memory of the process so far; None if the system does not report it."""
     versions: dict[str, str]
     bundle: str
     graphs_sha256: dict[str, str]

@@ -53,7 +53,7 @@ class ColdStart:
     first_scan_s: float
     """Part of it: the first scan."""
     detect_peak_memory_mib: float | None
-    """Largest resident memory of `asca detect` on that scan, pictures and all; None where the system does not say."""
+    """Largest resident memory of `asca detect` on that scan, with pictures; None if the system does not report it."""
     repeats: int
 
 
@@ -66,7 +66,7 @@ def cold_start(
     """Start new processes that do with `scan` (N, 4), LiDAR frame, what `detector` would.
 
     Raises:
-        AscaError: a process failed; says how.
+        AscaError: a process failed; the message says how.
     """
     bundle = detector.folder
     options = {"provider": detector.provider, "precision": detector.precision, "threads": detector.threads}

@@ -56,7 +56,7 @@ def measure_matrix(
         bundles: folders by name. The first one's default on the CPU is the reference and the first row.
         scans: (N, 4) each, LiDAR frame.
         mounting: of their sensor.
-        threads: beside one alone; None for the physical cores granted to the process.
+        threads: compared with a single one; None for the physical cores granted to the process.
     """
     opened: dict[Way, Detector | str] = {}
     ways = [way for bundle in bundles for way in _ways(bundle, default_threads() if threads is None else threads)]

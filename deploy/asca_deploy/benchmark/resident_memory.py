@@ -7,7 +7,7 @@ STATUS = Path("/proc/self/status")
 
 
 def peak_memory_mib() -> float | None:
-    """Return largest resident memory of the process so far; None where the system does not say.
+    """Return the largest resident memory of the process so far; None if the system does not report it.
 
     Linux keeps the figure of getrusage across exec, so that a small program started by a large one looks large;
     its own /proc does not.
@@ -23,7 +23,7 @@ def peak_memory_mib() -> float | None:
 
 
 def resident_mib() -> float | None:
-    """Return resident memory of the process now; None where the system does not say."""
+    """Return the resident memory of the process now; None if the system does not report it."""
     return _status_mib("VmRSS")
 
 

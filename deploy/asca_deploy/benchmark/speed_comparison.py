@@ -61,7 +61,7 @@ def compare(
 def alternate(
     runs: Mapping[str, Run], scans: Sequence[NDArray[np.float32]], rounds: int, track: Track = silently
 ) -> dict[str, NDArray[np.float64]]:
-    """Return wall times of several detectors that take turns, never two at a time.
+    """Return the wall times of several detectors that take turns, never two at a time.
 
     Args:
         runs: by name; called with a scan.

@@ -66,7 +66,7 @@ def open_encoder(folder: Path, bundle: PillarBundle) -> Session:
     """Open encoder.onnx of the bundle in this folder, on the CPU.
 
     Raises:
-        BundleError: the graph cannot be run or is not what the manifest says.
+        BundleError: the graph cannot be run or does not match the manifest.
     """
     # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
     # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is

@@ -42,7 +42,7 @@ class PillarPipeline:
         provider, precision, threads: of the backbone.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start, or cannot run this backbone.
     """
 
@@ -111,7 +111,7 @@ def open_backbone(
     """Open backbone.onnx of a dense or of a sparse neck; with `neck_channels` it has the output NECK.
 
     Raises:
-        BundleError: the graph cannot be run or is not what the manifest says.
+        BundleError: the graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start, or cannot run a sparse neck.
     """
     check_neck(bundle, provider)

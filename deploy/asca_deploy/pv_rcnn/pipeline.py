@@ -83,7 +83,7 @@ class PvRcnnPipeline:
         provider, precision, threads: of the backbone; the other graphs have as many threads.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start.
     """
 

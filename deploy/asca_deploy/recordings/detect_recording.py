@@ -125,7 +125,7 @@ def detect_recording(
         options: which model runs, and how.
         reading: how the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
         progress: called after each scan.
         remark: called with each of the result's `remarks` as soon as it is known.
 

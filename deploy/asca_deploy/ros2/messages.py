@@ -42,7 +42,7 @@ class Stamp(NamedTuple):
 
 
 def stamp_of(header: Any) -> Stamp:
-    """Return stamp and frame of a `std_msgs/Header`."""
+    """Return the stamp and frame of a `std_msgs/Header`."""
     return Stamp(int(header.stamp.sec), int(header.stamp.nanosec), str(header.frame_id))
 
 

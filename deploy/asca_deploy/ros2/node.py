@@ -82,7 +82,7 @@ def reliability(offered: Sequence[str], qos: Qos) -> Literal["best_effort", "rel
 
     Args:
         offered: by each publisher, "reliable" or "best_effort".
-        qos: what was asked for.
+        qos: the setting.
     """
     if qos != "auto":
         return qos

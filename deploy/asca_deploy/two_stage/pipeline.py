@@ -60,7 +60,7 @@ class RefinePipeline:
         provider, precision, threads: of the backbone; the second stage has as many threads.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start.
     """
 

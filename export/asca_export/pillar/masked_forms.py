@@ -37,7 +37,7 @@ class MaskedBackbone(nn.Module):
     """Neck and head of a detector with a sparse neck on a pseudo-image of features that `MarkedEncoder` gives.
 
     Args:
-        detector: in evaluation mode; it stays as it is.
+        detector: in evaluation mode; not modified.
     """
 
     def __init__(self, detector: PillarDetector) -> None:

@@ -48,7 +48,7 @@ def export_refine_head(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> Non
 
 
 def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
-    """Write deform.onnx alone: the places that keypoints of a deformed source look around."""
+    """Write deform.onnx alone: the shifted positions of keypoints for each deformed source."""
     inputs, outputs = interfaces.deform_interface(bundle)
     export_row_graph(_Deform(network), path, inputs, _source_rows(inputs, bundle.pv_rcnn.settings.sources), outputs)
 

@@ -48,7 +48,7 @@ class VoxelProducts(nn.Module):
     """A trained `VoxelBackbone` as matrix products by name, normalization in their weights.
 
     Args:
-        backbone: it stays as it is.
+        backbone: not modified.
     """
 
     def __init__(self, backbone: VoxelBackbone) -> None:
@@ -86,7 +86,7 @@ class RoundedVoxels:
     """The backbone before and after its weights are rounded, see `rounded_backbones.RoundedBackbone`.
 
     Args:
-        backbone: in evaluation mode; it stays as it is.
+        backbone: in evaluation mode; not modified.
         samples: of the calibration scans, none of them empty.
         levels: what the graph returns.
     """

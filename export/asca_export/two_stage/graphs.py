@@ -20,7 +20,7 @@ from asca_pillars.ops.two_stage.prepare import RefineSettings
 
 
 class _Layers(nn.Module):
-    """The layers of a trained `SetAbstraction` with their normalization in them; it stays as it is."""
+    """The layers of a trained `SetAbstraction` with their normalization in them; not modified."""
 
     def __init__(self, trained: SetAbstraction) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class GatheredSetAbstraction(_Layers):
     """Set abstraction on balls whose points have been gathered; points have fewer channels than the first output."""
 
     def forward(self, _positions: None, _features: None, _queries: Tensor, balls: Tensor) -> Tensor:
-        """[p_j - q ; f_j] of each ball, (Q, T, 3 + C), zeros for nothing -> (Q, out_channels)."""
+        """Aggregate [p_j - q ; f_j] of each ball, (Q, T, 3 + C), zeros for empty entries, -> (Q, out_channels)."""
         pairs = F.linear(balls.flatten(0, 1), self.first.weight, self.first_shift())
         largest = self.after_first(pairs).unflatten(0, balls.shape[:2]).amax(dim=1)
         return torch.relu(largest + self.last.bias)
