@@ -43,7 +43,7 @@ class Family(NamedTuple):
 
 
 _FINE_M = 0.08
-_SIZES = 5  # of a class, the first fields: name, sizes and height, which thresholds do not change
+_SIZES = 5  # first fields of a class: name, sizes and height, which do not depend on thresholds
 
 
 @dataclass(frozen=True)

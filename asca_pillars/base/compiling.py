@@ -101,7 +101,7 @@ class _CheckedFile(IndexDataCacheFile):
     def _load_data(self, name: str) -> Any:
         path = Path(self._data_path(name))
         if not _is_whole(path):
-            raise FileNotFoundError(path)  # which means to numba that it is to be compiled
+            raise FileNotFoundError(path)  # lets numba compile the function
         return super()._load_data(name)
 
     @contextlib.contextmanager

@@ -82,7 +82,7 @@ class TrainingError(AscaError):
 
 
 def printable(text: str, limit: int = 1000) -> str:
-    """Return a message as one line of at most `limit` characters that does nothing to a terminal.
+    """Return a message as one printable line of at most `limit` characters.
 
     Messages quote what stands in files: control characters are written as escapes, and a long text loses its middle.
     """

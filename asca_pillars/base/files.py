@@ -22,7 +22,7 @@ from asca_pillars.base.own_files import Recognizer, require_no_link, require_rep
 
 WEIGHTS_FILE: Literal["weights.ckpt"] = "weights.ckpt"
 """Trained weights alone, among the checkpoints of a run and in a bundle."""
-_LONGEST_NAME_BYTES = 255  # of a file, on nearly every file system
+_LONGEST_NAME_BYTES = 255  # limit of nearly every file system
 _NOT_PLAIN = re.compile(r"[^A-Za-z0-9._-]")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # devices of Windows
 _LONGEST_NAME = 100  # characters; systems allow 255 bytes, suffixes and the names of temporary files included

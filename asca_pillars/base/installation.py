@@ -36,7 +36,7 @@ def upgrade_advice() -> str:
 
 
 def shipped_bundles() -> dict[str, Path]:
-    """Return folders of the bundles that come with the runtime, by name; the runtime is not imported."""
+    """Return the folders of the bundles that come with the runtime, by name; the runtime is not imported."""
     runtime = importlib.util.find_spec("asca_deploy")
     places = [] if runtime is None else runtime.submodule_search_locations or []
     return {path.parent.name: path.parent for place in places for path in Path(place).glob("bundles/*/bundle.json")}

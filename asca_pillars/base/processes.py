@@ -136,7 +136,7 @@ def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]
 def _work(job: Callable[[Any], Any], connection: Connection) -> None:
     """Run the job in a new process for the items received, until the connection ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches it, too; the process that started it ends it
-    with contextlib.suppress(EOFError, ConnectionError):  # that one has ended
+    with contextlib.suppress(EOFError, ConnectionError):  # the other process has ended
         while True:
             connection.send(_results(job, connection.recv()))
 

@@ -53,7 +53,7 @@ T = TypeVar("T")
 
 
 def shipped_configs(kind: str = "") -> dict[str, Path]:
-    """Return the configurations that come along, by name: those of the installed package, or of the checkout.
+    """Return the shipped configurations by name: those of the installed package, or of the checkout.
 
     Args:
         kind: folder below configs/ for those of something else than a model.

@@ -80,7 +80,7 @@ class PvRcnnModel(Strict):
         network: widths.
         training_proposals: which boxes of the first stage a training step draws from.
         rois: how many of them it draws for each frame.
-        box_loss: of the second stage's boxes; `va` adds AFE-RCNN's distance IoU seen from above to residuals and
+        box_loss: of the second stage's boxes; `va` adds AFE-RCNN's BEV distance IoU to residuals and
             corners.
         scores: of refined boxes: `second`, the second stage's as published, or `both`, the geometric mean with the
             proposal's.

@@ -86,7 +86,7 @@ def decode(
     """Decode the detections of one scan, best first.
 
     Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
-    rotated NMS seen from above. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
+    rotated BEV NMS. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
     from a network that overflowed, are left out and counted (`Detections.non_finite`).
 
     Args:
@@ -109,7 +109,7 @@ def decode_candidates(
     cells: NDArray[np.integer[Any]] | None = None,
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Candidates:
-    """Return the first half of `decode`: what reaches its class's threshold, (n, 7) boxes in the LiDAR frame.
+    """Return candidates that reach their class's threshold, for `suppress`: (n, 7) boxes in the LiDAR frame.
 
     Raises:
         ValueError: if maps, anchors and classes do not belong together.
@@ -135,7 +135,7 @@ def decode_candidates(
     logits = scores[row, anchor]
     residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
     directions = rows.directions.reshape(-1, count, 2)[row, anchor]
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
+    with np.errstate(over="ignore", invalid="ignore"):  # overflows are left out below
         own = anchors.reshape(-1, count, 7)[cell, anchor]
         boxes = decode_boxes(residuals, directions.argmax(axis=-1), own, direction_offset_rad)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)

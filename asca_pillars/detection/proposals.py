@@ -81,7 +81,7 @@ class AnchorProposals(Strict):
 
     Attributes:
         candidates: anchors that enter the suppression, by the best of their scores.
-        nms_iou: boxes that overlap less, seen from above, are both proposed.
+        nms_iou: BEV IoU of two boxes up to which both are proposed.
         count: of the proposals at most.
     """
 
@@ -123,7 +123,7 @@ def propose_anchors(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, set
     best = scores.max(axis=1)
     finite = np.isfinite(best)
     chosen = _best(np.where(finite, best, -np.inf), min(settings.candidates, int(finite.sum())))
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
+    with np.errstate(over="ignore", invalid="ignore"):  # overflows are left out below
         bins, anchors = directions[chosen].argmax(axis=1), spec.anchors.reshape(-1, 7)[chosen]
         boxes = decode_boxes(residuals[chosen], bins, anchors, spec.direction_offset_rad)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions[chosen]).all(axis=1)

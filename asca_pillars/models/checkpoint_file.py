@@ -87,7 +87,7 @@ def read_plain(path: Path) -> dict[str, Any]:
         ValueError: it holds something else than a dictionary.
         Exception: whatever the damaged bytes happen to trigger in `torch.load`.
     """
-    with warnings.catch_warnings(action="ignore"):  # of pickles that are no checkpoints; the error says so
+    with warnings.catch_warnings(action="ignore"):  # from pickles that are no checkpoints, which raise an error
         content = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(content, dict):
         raise ValueError(f"it holds a {type(content).__name__}, where a checkpoint holds a dictionary")

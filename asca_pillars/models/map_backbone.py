@@ -1,4 +1,4 @@
-"""Layers on a map seen from above (SECOND, PointPillars): blocks, their upsamplings, and the head on them."""
+"""Layers on a bird's-eye-view map (SECOND, PointPillars): blocks, their upsamplings, and the head on them."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -94,7 +94,7 @@ def _normed(convolution: nn.Module, channels: int) -> list[nn.Module]:
     ]
 
 
-POSITIVE_PRIOR = 0.01  # what an untrained head says of every anchor: focal loss starts calm (arXiv 1708.02002, 4.1)
+POSITIVE_PRIOR = 0.01  # initial score of every anchor, which stabilizes focal loss (arXiv 1708.02002, 4.1)
 
 
 class SSDHead(nn.Module):

@@ -200,6 +200,6 @@ def weight_average(decay: float) -> WeightAveraging:
         kept = min(decay, float((1 + steps) / (10 + steps)))
         if not averaged.is_floating_point():  # batches that a normalization has counted
             return current
-        return averaged + (current - averaged) * (1 - kept)  # what does not move stays bit for bit
+        return averaged + (current - averaged) * (1 - kept)  # constant values stay bit for bit
 
     return WeightAveraging(avg_fn=average)

@@ -23,7 +23,7 @@ from asca_pillars.models.checkpoint_file import read_failure, read_plain
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
-_OTHERWISE_FILLED = (AttributeError, TypeError)  # of a dictionary whose values are of other types
+_OTHERWISE_FILLED = (AttributeError, TypeError)  # from a dictionary with values of other types
 _OF_A_RUN = {
     "state_dict": dict,
     "optimizer_states": list,
@@ -53,7 +53,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """Write `checkpoint` to `path`."""
         path = Path(path)
         with atomic_path(path) as temporary:
-            with temporary.open("wb") as file:  # of a path torch's error is no OSError where the disk is full
+            with temporary.open("wb") as file:  # given a path, torch raises no OSError on a full disk
                 torch.save(checkpoint, file)
             if path.name == LAST:
                 if self.keep_last and path.exists():
@@ -157,7 +157,7 @@ def _why_unusable(path: Path, model: ModelConfig) -> str | None:
 
 
 def steps_of(checkpoint: Path | None) -> int:
-    """Return optimizer steps of the run that a checkpoint, which can be read, is of; 0 without one."""
+    """Return the optimizer steps of a readable checkpoint; 0 without one."""
     if checkpoint is None:
         return 0
     return int(read_plain(checkpoint)["global_step"])

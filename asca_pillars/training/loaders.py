@@ -52,7 +52,7 @@ class BatchLoader(DataLoader[Any]):
                 return
             except (OSError, EOFError, RuntimeError) as error:
                 text = " ".join(str(error).split())
-                if text.startswith("Caught "):  # as torch begins what the work in a process raised
+                if text.startswith("Caught "):  # torch's prefix for errors of a loader process
                     raise
                 late = text.startswith("DataLoader timed out")
                 looks += 1
@@ -98,7 +98,7 @@ class DetectionData(L.LightningDataModule):
             frames.split.require_files()
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Return shuffled batches, from the step on at which the trainer stands."""
+        """Return shuffled batches, beginning at the trainer's step."""
         return self._loader(self.training_set, lambda: self.trainer.global_step if self.trainer else 0)
 
     def val_dataloader(self) -> DataLoader[Any]:

@@ -106,7 +106,7 @@ def _train(
     if isinstance(config.model, RefineModel):
         config = replace(config, model=with_first_stage(config.model))
     checkpoints = out / "checkpoints"
-    # What the run records of itself must hold for its checkpoint: without a camera it has seen whole scans.
+    # The recorded configuration must hold for the checkpoint: without a camera, training uses whole scans.
     view = config.data.camera_view and open_split(data_root).has_camera
     config = replace(config, data=replace(config.data, camera_view=view))
     recover(checkpoints)
@@ -114,7 +114,7 @@ def _train(
     goes_on = resumed is not None
     config = replace(config, train=_with_settled_precision(config.train, out, resumes=goes_on))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    # What may be mistyped is looked at before minutes of work, and before the folder is that of this run.
+    # Arguments are checked before minutes of work, and before the folder is claimed for this run.
     weights = None if goes_on and init is None else initial_weights(config, init)
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
@@ -140,11 +140,11 @@ def _train(
     if weights and not goes_on:
         module.detector.load_state_dict(module.detector.state_dict() | weights)
     with warnings.catch_warnings(), interrupt.listening():
-        # Of torch and Lightning about each other.
+        # Warnings of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")
         # EpochSampler starts at the step where the checkpoint stopped, which Lightning cannot know.
         warnings.filterwarnings("ignore", message="You're resuming from a checkpoint that ended before the epoch")
-        # Of a gradient of 1x1 convolutions, whose two layouts in memory are the same.
+        # Warning on the gradient of 1x1 convolutions, whose two memory layouts are the same.
         warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         # Advice on workers and logging that does not fit two cores and small data.

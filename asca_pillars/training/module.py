@@ -44,7 +44,7 @@ class DetectionModule(L.LightningModule):
             AscaError: a frame of the batch could not be read, or a term of its loss is not finite.
         """
         batch = _read(batch)
-        # What a network drops at random belongs to the step, so that a resumed run drops what an unbroken one would.
+        # Dropout depends on the step, so that a resumed run drops the same as an uninterrupted one.
         draws = np.random.SeedSequence((self.config.train.seed, self.global_step, self.global_rank))
         torch.manual_seed(int(draws.generate_state(1, np.uint64)[0]))
         terms = self.detector.loss(self.detector.predict(batch.inputs), batch.inputs)
@@ -134,7 +134,7 @@ def make_schedule(optimizer: Optimizer, recipe: TrainConfig, epoch_steps: int) -
         optimizer,
         max_lr=recipe.learning_rate,
         total_steps=total_steps,
-        pct_start=0.3,  # of fast.ai's one cycle, torch's default, stated because it is the recipe
+        pct_start=0.3,  # fast.ai's one-cycle value and torch's default, stated because it is part of the recipe
         div_factor=10,  # as OpenPCDet starts it
     )
 
@@ -150,7 +150,7 @@ def warmup_stable_decay(recipe: TrainConfig, total_steps: int, step: int) -> flo
 
 
 def cooldown_start(recipe: TrainConfig, total_steps: int) -> int:
-    """Return the first step of `warmup_stable_decay` whose rate depends on how long the run is."""
+    """Return the first step of `warmup_stable_decay` whose rate depends on the length of the run."""
     return math.ceil((1 - recipe.cooldown) * total_steps)
 
 

@@ -136,7 +136,7 @@ def _why_another(path: Path, config: Config, seen: Seen, steps: int) -> str | No
     """Return in words how `config` differs from the run that `path` is of; None if it is the same run, or longer."""
     found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
     found = to_dict(found_config)
-    if found_config.train.precision == "auto":  # of an older version, which did not write down what it became
+    if found_config.train.precision == "auto":  # an older version, which did not record the resolved value
         found["train"]["precision"] = config.train.precision
     longer = config.train.epochs > found_config.train.epochs
     recipe = found_config.train

@@ -58,7 +58,7 @@ def widened(bundle: Bundle) -> Bundle:
 
 
 def _fitting_range(reach_m: float, pillar_m: float) -> float:
-    """Return the shortest range from `reach_m` on that pillars of this size fill as the network's strides need it."""
+    """Return the shortest range from `reach_m` on that holds whole pillars and fits the network's strides."""
     step_m = NECK_STRIDE * pillar_m
     return round(math.ceil(reach_m / step_m - 1e-6) * step_m, 6)
 
@@ -124,7 +124,7 @@ def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: f
     Args:
         passes: of each turn, in its turned frame; two or more.
         turns: see `turns_around`.
-        nms_iou: boxes of a class that overlap more, seen from above, are one object.
+        nms_iou: BEV IoU of two boxes of a class above which they are one object.
     """
     half_sector = _HALF_TURN_RAD / len(passes)
     boxes, scores, labels, off_ahead = [], [], [], []
@@ -153,6 +153,6 @@ def _sees(ranges: Ranges, half_sector_rad: float, distance_m: float) -> bool:
     angles = np.arange(0, min(half_sector_rad + SEAM_MARGIN_RAD, _HALF_TURN_RAD), _STEP_RAD)
     x, y = distance_m * np.cos(angles), distance_m * np.sin(angles)
     (x_min, x_max), (y_min, y_max) = ranges.x_m, ranges.y_m
-    # What is nearer than a range that begins ahead of the sensor, no pass sees.
+    # No pass covers the space nearer than a range that begins ahead of the sensor.
     inside = (x >= min(x_min, 0.0)) & (x <= x_max) & (y <= y_max) & (-y >= y_min)
     return bool(inside.all())

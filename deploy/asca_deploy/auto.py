@@ -91,7 +91,7 @@ def choose(
     best: tuple[Candidate, Network] | None = (candidates[0], reference)
     if precision not in (None, REFERENCE[1]):
         best = None
-    del reference  # what cannot be taken must not stay in memory
+    del reference  # a rejected network must not stay in memory
     start = clock()  # where the CPU is slow, the others are what it is asked for
     for name in names:
         if name == REFERENCE or precision not in (None, name[1]):
@@ -150,7 +150,7 @@ def _try(
         if differs := disagreement(expected, detect(network), spec):
             return _Trial(Candidate(*name, None, differs), None)
         return _Trial(Candidate(*name, _median_ms(detect, network, clock), AGREES), network)
-    except Exception as error:  # of onnxruntime or OpenVINO, which share no base; it only says that this one is out
+    except Exception as error:  # onnxruntime's and OpenVINO's share no base class; the candidate is rejected
         return _Trial(Candidate(*name, None, f"does not run: {first_line(error)}"), None)
 
 

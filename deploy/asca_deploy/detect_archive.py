@@ -310,5 +310,5 @@ def _detector(job: DetectShard) -> Detector:
 
 
 def bundle_digest(bundle: Path) -> str:
-    """Return SHA-256 of the manifest, which holds those of the graphs."""
+    """Return the SHA-256 of the manifest, which holds those of the graphs."""
     return hashlib.sha256((bundle / MANIFEST).read_bytes()).hexdigest()

@@ -198,6 +198,6 @@ def repairs(results: Iterable[DetectedScan]) -> Iterator[str]:
                 "to the nearer end; if they are stored on another scale, state it (--reflectance-scale)"
             )
         for text in texts:
-            names[_NUMBER.sub("#", text)].append(f"{result.path.name}: {text}")  # of one kind: alike but for numbers
+            names[_NUMBER.sub("#", text)].append(f"{result.path.name}: {text}")  # one kind: equal but for numbers
     for lines in names.values():
         yield lines[0] + (f" (and {len(lines) - 1} more scans alike)" if lines[1:] else "")

@@ -34,7 +34,7 @@ _log = logging.getLogger("asca_pillars")
 
 
 View: TypeAlias = Literal["ahead", "around"]
-_WAITING = "waiting"  # beside the names of stages
+_WAITING = "waiting"  # in addition to the names of stages
 _GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
 
 
@@ -107,7 +107,7 @@ class Detector:
         view: View = "ahead",
     ) -> None:
         start = perf_counter()
-        load_kernels(decode.KERNELS)  # here rather than in the first scan
+        load_kernels(decode.KERNELS)  # not during the first scan
         self.folder = find_bundle(bundle)
         self.threads = check_threads(threads)
         check_onnxruntime()
@@ -319,7 +319,7 @@ def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> 
         raise ScanError(f"the points are not an array of numbers; {_GIVE}") from None
     if array.dtype.kind not in "iuf":
         raise ScanError(f"the points are not an array of numbers, but of type {str(array.dtype)[:40]}; {_GIVE}")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is counted
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite and are counted
         scan = np.ascontiguousarray(array, np.float32)
     if scan.ndim != 2 or scan.shape[1] != 4:
         columns = scan.shape[1] if scan.ndim == 2 else 0

@@ -32,10 +32,10 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
 
 _ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTIALS[:-1], "pv_rcnn")}
-_ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
-# Of these sections, and of a pillar detector's `spec` and `spec.grid`, and what they are where they are not written: in
-# bundles made before there were sparse necks, scores of both stages, other direction bins and anchors, and pooled maps.
-# Whether they were taken out is told by the graphs' metadata.
+_ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # schema 2, whose 8-bit graphs had the name of the float bundle
+# Defaults of keys that older bundles lack, in these sections and in a pillar detector's `spec` and `spec.grid`: bundles
+# from before sparse necks, scores of both stages, other direction bins and anchors, and pooled maps. A removed key is
+# detected by the graphs' metadata.
 _LATER_KEYS: dict[str, dict[str, Any]] = {
     "spec": {"direction_offset_rad": DIRECTION_OFFSET_RAD},
     "pillar": {"neck": "dense"},

@@ -34,7 +34,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
         raise BundleError(f"{manifest}: {error.strerror}") from None
     except RecursionError:
         raise BundleError(f"{manifest} is damaged (nested too deeply); {EXPORT_AGAIN}") from None
-    except ValueError as error:  # of the JSON, or of its UTF-8
+    except ValueError as error:  # invalid JSON or UTF-8
         raise BundleError(f"{manifest} is damaged ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}") from None
     version = data.get("schema_version") if isinstance(data, dict) else None
     if type(version) is not int:

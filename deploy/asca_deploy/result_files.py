@@ -45,7 +45,7 @@ KITTI_FILE = "tracks.txt"
 UNREADABLE_FILE = "unreadable.jsonl"
 INDEX_FILE = "index.html"
 MISSED_IOU = 0.1
-"""A label that no box overlaps so far, seen from above, counts as missed on the page of pictures."""
+"""BEV IoU below which a label counts as missed on the page of pictures."""
 
 
 def _is_kitti_text(path: Path) -> bool:

@@ -14,18 +14,18 @@ from asca_pillars.base.input_files import require_content
 
 
 def default_bundle_path() -> Path:
-    """Return the folder of the model that is used unless another is named: 8-bit, the faster one on every CPU."""
+    """Return the folder of the default model: 8-bit, the faster one on every CPU."""
     return shipped_bundles()["asca_sim_int8"]
 
 
 def shipped_bundles() -> dict[str, Path]:
-    """Return folders of the models that come with the package, by name."""
+    """Return the folders of the models that come with the package, by name."""
     folders = Path(str(resources.files("asca_deploy") / "bundles")).iterdir()
     return {folder.name: folder for folder in sorted(folders) if (folder / MANIFEST).is_file()}
 
 
 def find_bundle(bundle: str | Path | None) -> Path:
-    """Return the folder meant by a path, by the name of a bundle that ships, or by None.
+    """Return the folder for a path, for the name of a bundle that ships, or for None.
 
     Raises:
         BundleError: there is neither.

@@ -23,17 +23,17 @@ from asca_pillars.geometry.overlap import paired_bev_intersection
 _Doubles = NDArray[np.float64]
 _Integers = NDArray[np.int64]
 
-MEASURED_SIGMA_M = 0.2  # of a box's center, on either axis
+MEASURED_SIGMA_M = 0.2  # standard deviation of a box's center, on either axis
 # Sigma of an object's first velocity per metre of its length, and its bounds, m/s: people are slow and short.
 FIRST_SPEED_PER_M, FIRST_SPEED_MPS = 4.0, (2.0, 12.0)
 ACCELERATION_MPS2 = 3.0
 GATE = 9.21  # squared distance over its variance: 99 % of a track's own detections in the plane
-FADE_PER_S = 1.0  # of a track's score that nothing confirms
-MAX_SCORE = 0.98  # so that the best tracks end, too
-MAX_SCAN_GAP_S = 2.0  # between two scans of one drive
+FADE_PER_S = 1.0  # decay of an unconfirmed track's score
+MAX_SCORE = 0.98  # upper bound, so that the best tracks end too
+MAX_SCAN_GAP_S = 2.0  # largest gap between two scans of one drive
 WEAK_SHARE = 0.7
 """Share of the lowest threshold from which on detections continue tracks that better ones began."""
-MAX_UNLOOKED_FADE_S = 0.2  # of the time until the first scan after a detection, in which nobody looked
+MAX_UNLOOKED_FADE_S = 0.2  # longest decay of a track that the scan before confirmed
 
 
 @dataclass

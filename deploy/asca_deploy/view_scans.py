@@ -102,7 +102,7 @@ class ScanServer:
         self.names = [scan.name.as_posix() + scan.path.suffix for scan in named]
         self.said = tuple(scan_input.said)
         answers = _Answers(paths, scan_input, detector, around=around)
-        answers.boxes(0)  # what is wrong with all scans is said before the page opens
+        answers.boxes(0)  # errors that concern all scans are raised before the page opens
         files = {f"/{file.name}": file.read_bytes() for file in page_modules()}
         files["/"] = files["/index.html"]
         page = {

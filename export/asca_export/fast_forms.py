@@ -22,7 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 from asca_pillars.models.map_backbone import SSDHead
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
 
-# What one step of an 8-bit tensor counts for in the graph: any number would do but one, which OpenVINO leaves out and
+# Value of one step of an 8-bit tensor in the graph: any number would do but one, which OpenVINO leaves out and
 # then takes the tensor for a float.
 STEP_VALUE = 1 / 64
 

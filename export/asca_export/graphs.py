@@ -28,7 +28,7 @@ from asca_pillars.ops.pillar.prepare import FEATURES
 B = TypeVar("B", bound=Bundle)
 
 OPSET = 20
-_EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
+_EXAMPLE_ROWS = 6  # rows of the traced example; dynamic in the graph
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
 
 
@@ -38,7 +38,7 @@ def export_encoder(encode: nn.Module, path: Path) -> None:
     `encode` is a `PillarEncoder`, or has its interface. M and P are dynamic. The `paper` reading takes P up to
     the limit that it was trained with.
     """
-    points, pillars = 4 * TRACED_PILLARS, TRACED_PILLARS  # of the example that the tracer sees; neither is kept
+    points, pillars = 4 * TRACED_PILLARS, TRACED_PILLARS  # sizes of the traced example; dynamic in the graph
     point_counts = torch.full((pillars,), points // pillars)
     example = (
         torch.rand(points, len(FEATURES)),
@@ -140,7 +140,7 @@ def sign(folder: Path, bundle: B) -> B:
 def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
     """Write a module as an ONNX file; `names` are those of `torch.onnx.export`."""
     with errors_only("torch.onnx"), errors_only("onnxscript"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch about torch
+        warnings.simplefilter("ignore")  # torch's warnings about its own code
         program = torch.onnx.export(
             module.eval(),
             tuple(example),

@@ -27,7 +27,7 @@ from asca_pillars.ops.two_stage.decode import Scores, reported_detections
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
 BOX_TOLERANCE_M = 0.01
 YAW_TOLERANCE_RAD = np.deg2rad(0.5)
-OVERLAP_TIE = 1e-4  # of an overlap with the largest that suppression allows
+OVERLAP_TIE = 1e-4  # tolerance of an overlap at the NMS threshold
 COMPARED_ANCHORS = 100  # per class and scan: the best ones, whatever their score, so that there is always something
 
 
@@ -103,7 +103,7 @@ def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArr
     """Return the logits (A, H, W), or rows (M, A), of each class: (classes, n); likewise of A * classes."""
     classes = len(spec.classes)
     channels = scores if scores.ndim == 3 else scores.T
-    if spec.scores_per_anchor > 1:  # of an anchor those of all classes, then the next anchor's
+    if spec.scores_per_anchor > 1:  # anchor-major: scores of all classes for an anchor, then the next anchor
         channels = channels.reshape(-1, classes, channels.size // len(channels)).swapaxes(0, 1)
     return channels.reshape(classes, scores.size // classes)
 
@@ -255,6 +255,6 @@ def _ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.
 
 
 def _beyond_allowed(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.float64]:
-    """Return (N, M): overlap minus the largest that suppression keeps side by side; -inf for pairs of two classes."""
+    """Return (N, M): overlap minus the largest that suppression allows; -inf for pairs of two classes."""
     same_class = a.labels[:, None] == b.labels[None]
     return np.where(same_class, bev_iou(a.boxes, b.boxes) - spec.post.nms_iou, -np.inf)

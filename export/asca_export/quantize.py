@@ -29,14 +29,14 @@ HEAD = "head"
 STEPS = 255
 WEIGHT_STEPS = 64
 EMPTY_SIZE = 256  # cells to a side; the deepest convolution of the paper's neck sees 99 of them
-PLACES = 8000  # of each scan and layer, whose inputs weights are rounded for
-_DAMPING = 0.001  # of the moments' mean diagonal, so that inputs that hardly ever move do not blow up
+PLACES = 8000  # samples of each scan and layer for rounding weights
+_DAMPING = 0.001  # of the moments' mean diagonal, for inputs of little variance
 _SHRINK = 0.95  # a range may lose this much of its end where that spares it coarser steps
 TINY = 1e-6  # a channel that is never above it is as good as empty; its step must not be 0
 
 
 def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
-    """Return steps of a canvas that holds the unitless features of all these scans, (P, C) each, and zero exactly."""
+    """Return the steps of a canvas for the unitless features of all these scans, (P, C) each, and exactly zero."""
     lows, highs = zip(*((features.min(axis=0), features.max(axis=0)) for features in pillar_features), strict=True)
     low, high = np.minimum(np.min(lows, axis=0), 0.0), np.maximum(np.max(highs, axis=0), 0.0)
     scale = np.maximum((high - low) / STEPS, TINY).astype(np.float32)

@@ -116,7 +116,7 @@ class RoundedMaps:
         quantize_backbone(self._template, path, eight_bit, self._parameters(eight_bit))
 
     def _parameters(self, eight_bit: Sequence[str]) -> dict[str, Tensor]:
-        """Return parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
+        """Return the parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
         own = dict(self._rounded.named_parameters())
         return {
             name: own[name] if name.rpartition(".")[0] in eight_bit else parameter

@@ -17,8 +17,8 @@ from asca_export.quantize import HEAD, PLACES, STEPS, TINY, round_together
 from asca_export.sparse_forms import SparseBackbone
 from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 
-BEST_CELLS = 32  # of each scan and anchor, that the head is rounded for
-OTHER_CELLS = 64  # of each scan beside them, so that background stays background
+BEST_CELLS = 32  # highest-scoring cells of each scan and anchor for rounding the head
+OTHER_CELLS = 64  # other cells of each scan, so that background scores stay low
 
 
 class SparseSample(NamedTuple):

@@ -10,7 +10,7 @@ from asca_pillars.base.errors import TrainingError
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 _COUNTER = "num_batches_tracked"
 _WITHOUT_EFFECT = ("global_step",)  # OpenPCDet's counter of training steps lies beside the weights
-_NAMED = 5  # of the names that do not fit
+_NAMED = 5  # mismatched names in an error, at most
 
 
 def as_it_is(array: Tensor) -> Tensor:
@@ -86,7 +86,7 @@ _HEADS = {"scores": "conv_cls", "boxes": "conv_box", "directions": "conv_dir_cls
 
 
 def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as_it_is) -> Iterator[Link]:
-    """Return links of `backbone_2d` and `dense_head`.
+    """Return the links of `backbone_2d` and `dense_head`.
 
     Args:
         block_convs: convolutions of each block after its first.

@@ -19,7 +19,7 @@ from asca_pillars.models.openpcdet.pv_rcnn_links import pv_rcnn_links
 _ENCODER, _VOXELS = "voxel_encoder.pfn_layers.0", "middle_encoder"
 FIRST_LINEAR = f"{_ENCODER}.linear.weight"
 FUSION = "points_encoder.point_feature_fusion_layer.0.conv.weight"
-_OLD_FEATURES = 9  # of a point before 1.0, where boxes had other axes, too
+_OLD_FEATURES = 9  # features of a point before 1.0, whose boxes had other axes too
 
 
 def _part(layer: str, layers: int) -> str:
@@ -58,7 +58,7 @@ _NAMES: tuple[tuple[str, _Name], ...] = (
 def mmdetection3d_links(
     model: PillarModel | PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, legacy: bool = True
 ) -> Iterator[Link]:
-    """Return links for our network of this model.
+    """Return the links for our network of this model.
 
     Args:
         model: ours.

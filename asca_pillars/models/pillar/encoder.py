@@ -116,7 +116,7 @@ class ChannelAttention(_ChannelMixing):
         """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
         gram = features.T @ features  # (C, C)
         query, key = self.query.weight, self.key.weight
-        products = query @ gram @ key.T  # of queries and keys, summed over the pillars
+        products = query @ gram @ key.T  # products of queries and keys, summed over the pillars
         query_norm = _norm((query @ gram * query).sum(dim=1))
         key_norm = _norm((key @ gram * key).sum(dim=1))
         logits = products / (query_norm[:, None] * key_norm[None, :]) * self.temperature
@@ -203,7 +203,7 @@ class PillarEncoder(nn.Module):
         super().__init__()
         self.slots = limits.max_points if empty_slots else 0
         if empty_slots:
-            self.register_buffer("empty_slot", torch.zeros(channels))  # what a row of zeros gives
+            self.register_buffer("empty_slot", torch.zeros(channels))  # output for a row of zeros
         self.linear = nn.Linear(len(FEATURES), channels, bias=False)
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
         self.point_attention = PointAttention(channels, limits.max_points) if cpa == "point" else None

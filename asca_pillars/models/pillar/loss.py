@@ -89,7 +89,7 @@ def states_by_class(state: Tensor, scores: int) -> Tensor:
 
 
 def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
-    """Return the targets of the anchors at M active head cells; the others take no part.
+    """Return the targets of the anchors at M active head cells; the loss ignores others.
 
     Args:
         targets: of whole maps.
@@ -144,7 +144,7 @@ def quality_focal_loss(logits: Tensor, state: Tensor, quality: Tensor, alpha: fl
 def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
     """Return the 3D IoU of positive anchors' predicted boxes with their targets: (n, 7) -> (n,), without gradient."""
     anchors, directions = targets.anchors.cpu().numpy(), targets.directions.cpu().numpy()
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows overlaps nothing
+    with np.errstate(over="ignore", invalid="ignore"):  # an overflowing box overlaps nothing
         # Half a turn changes no overlap, so the direction that is predicted does not matter.
         found, wanted = (
             decode_boxes(each.detach().cpu().numpy(), directions, anchors).astype(np.float64)

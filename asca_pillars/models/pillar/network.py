@@ -89,7 +89,7 @@ class PillarDetector(Trainable):
         return self.neck(canvas)  # type: ignore[no-any-return]
 
     def read_head(self, features: Tensor, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Return head maps of what `head_input` gave for that batch, or rows of them, see `forward`."""
+        """Apply the head to the result of `head_input` for that batch: maps, or rows of them, see `forward`."""
         if batch.neck is not None:
             return self.head.at_cells(features)
         maps: HeadMaps[Tensor] = self.head(features)

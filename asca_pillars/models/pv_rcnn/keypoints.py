@@ -11,7 +11,7 @@ from asca_pillars.models.two_stage.sets import SetAbstraction, first_occurrences
 from asca_pillars.ops.points.neighbors import PointScale
 
 _SHARE = 4  # by which the impact's hidden layer is narrower, which the paper does not give
-_INITIAL_STD = 1e-3  # of the impact's last weights: training starts at features that are hardly adjusted
+_INITIAL_STD = 1e-3  # std of the last layer's initial weights: training starts at nearly unadjusted features
 
 
 class Adjustment(nn.Module):
@@ -82,8 +82,8 @@ def _interpolated(features: Tensor, scale: PointScale[Tensor]) -> Tensor:
     return (near * scale.nearest_weights[:, :, None]).sum(dim=1)
 
 
-_OFFSET_CHANNELS = 16  # of f', which the paper does not give
-_ALIGN_STD = 1e-3  # of the last weights: training starts at almost undeformed keypoints, and all weights learn
+_OFFSET_CHANNELS = 16  # channels of f', which the paper does not give
+_ALIGN_STD = 1e-3  # std of the last initial weights: training starts at almost undeformed keypoints, with gradients
 
 
 class Surroundings(NamedTuple):

@@ -131,7 +131,7 @@ class FirstStageOutputs(NamedTuple):
     levels: list[Tensor]
     """Features (M, channels) of the active voxels of every level."""
     canvas: Tensor
-    """(B, H, W, C) conv_out seen from above, what the map's backbone reads."""
+    """(B, H, W, C) conv_out as a bird's-eye-view map, the input of the 2D backbone."""
     maps: HeadMaps[Tensor]
     """Scores (B, A * classes, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W)."""
 
@@ -143,7 +143,7 @@ class PvRcnn(nn.Module):
         spec: grid, strides and classes that its parts were made for.
         settings: its sources, likewise.
         voxels: the sparse 3D backbone.
-        neck: the backbone on the map seen from above.
+        neck: the 2D backbone on the bird's-eye-view map.
         head: of the anchors, each with a score for every class.
         encode: voxel set abstraction and keypoint weighting (sections 3.2 and 3.3).
         refine: RoI-grid pooling and the second stage's heads (section 3.4).

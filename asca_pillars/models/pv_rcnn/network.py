@@ -79,7 +79,7 @@ class PvRcnnDetector(Trainable):
         return PvRcnnOutputs(first.maps, found, proposals)
 
     def loss(self, outputs: PvRcnnOutputs, batch: LabeledVoxels) -> Mapping[str, Tensor]:
-        """Return the terms of what is trained by name, see `detection_loss` and `refine_loss`, all of weight 1."""
+        """Return loss terms of the trained parts by name, see `detection_loss` and `refine_loss`, all of weight 1."""
         device = outputs.found.confidence.device
         first = {} if self._kept else detection_loss(outputs.maps, batch.anchors, self.loss_weights)._asdict()
         targets, learnt = _roi_targets(outputs.proposals, batch)

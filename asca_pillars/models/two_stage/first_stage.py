@@ -76,7 +76,7 @@ def open_first_stage(source: str) -> FirstStage:
     Raises:
         AscaError: as `TorchFirstStage`.
     """
-    path = Path(source)  # of a bundle the folder, which an export replaces as a whole
+    path = Path(source)  # for a bundle its folder, which an export replaces as a whole
     return _open_first_stage(source, path.stat().st_mtime_ns if path.exists() else 0)
 
 

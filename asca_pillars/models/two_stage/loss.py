@@ -79,7 +79,7 @@ def corner_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
 
 
 def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
-    """1 - IoU + (distance of the centers / diagonal of the box around both)^2, seen from above (AFE-RCNN, eq. 17).
+    """1 - IoU + (distance of the centers / diagonal of the box around both)^2, in bird's-eye view (AFE-RCNN, eq. 17).
 
     Both boxes as rectangles along the axes of their proposals, which have these sizes: (R, 7), (R, 7), (R, 3) -> (R,).
     """

@@ -80,7 +80,7 @@ class RefineDetector(Trainable):
         return RefineOutputs(found, batch.proposals)
 
     def loss(self, outputs: RefineOutputs, batch: LabeledProposals) -> Mapping[str, Tensor]:
-        """Return the terms by name, see `refine_loss`; proposals of IGNORED boxes take no part."""
+        """Return the terms by name, see `refine_loss`; proposals of IGNORED boxes are left out."""
         found, targets, learnt = outputs.found, batch.targets, batch.learnt
         counted = Refinements(found.confidence[learnt], found.residuals[learnt], found.keypoint_logits)
         wanted = RefineTargets(

@@ -19,7 +19,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
 
-_FORMAT = 3  # of the files; another number lets old ones lie
+_FORMAT = 3  # format of the files; with another number, old ones are not read
 
 
 @dataclass(frozen=True)

@@ -76,13 +76,13 @@ class SetAbstraction(nn.Module):
 
 
 def first_occurrences(indices: Tensor, count: int) -> Tensor:
-    """Return (Q, T) 1 for what `ball_query` found, 0 where it repeats a ball's first member, and for index `count`."""
+    """Return (Q, T) 1 for points that `ball_query` found, 0 for repetitions of the first one and for index `count`."""
     again = (indices[:, 1:] != indices[:, :1]) & (indices[:, 1:] < count)
     return torch.cat([indices[:, :1] < count, again], dim=1).float()
 
 
 _NEAREST = 3
-_LEAST_DISTANCE_M = 1e-8  # of a point that stands where a cell's center is
+_LEAST_DISTANCE_M = 1e-8  # lower bound, for a point at a cell's center
 
 
 class VectorPool(nn.Module):

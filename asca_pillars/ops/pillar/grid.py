@@ -283,7 +283,7 @@ def map_cells(cells: NDArray[np.int64], grid: PillarGrid) -> MapCells[NDArray[np
 def pool_pillars(
     features: NDArray[Value], cells: NDArray[np.int64], grid: PillarGrid
 ) -> tuple[NDArray[Value], NDArray[np.int64]]:
-    """Return features (P, C) of pillars at cells (P,) of the grid -> (M, C) and (M,) of the map.
+    """Pool features (P, C) of pillars at cells (P,) of the grid -> (M, C) and (M,) of the map.
 
     Steps of a quantized graph may be pooled as well: their order is that of the values.
     """

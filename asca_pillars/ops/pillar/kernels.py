@@ -86,7 +86,7 @@ def _sort_points(
         occupied = 0
         for cell in range(block, block + _BLOCK):
             occupied |= tally[cell]
-        if not occupied:  # as most of them are, and looking at a block at once costs little
+        if not occupied:  # most blocks are empty, and a block is tested at once
             continue
         for cell in range(block, block + _BLOCK):
             count = tally[cell]

@@ -191,7 +191,7 @@ def _three_nearest(
         row, column = min(max(cells[query, 0], 0), ny - 1), min(max(cells[query, 1], 0), nx - 1)
         found, away = (none, none, none), (infinity, infinity, infinity)
         for ring in range(max(nx, ny)):
-            # What lies outside `ring - 1` rings is that many columns away, but for rounding.
+            # Points outside `ring - 1` rings are at least that many columns away, within rounding.
             clear = max(ring - np.float32(1.01), np.float32(0)) / per_m
             if away[2] < clear * clear:
                 break

@@ -9,7 +9,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-_EIGHTHS = (1, 2, 4, 6, 8)  # of the samples: one more width would save less than its operators cost
+_EIGHTHS = (1, 2, 4, 6, 8)  # widths as shares of the samples: one more would save less than its operators cost
 
 Indices = TypeVar("Indices")
 

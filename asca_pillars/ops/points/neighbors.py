@@ -68,7 +68,7 @@ def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[
 
 @lru_cache(maxsize=64)  # the radius in columns follows the scan where that is wide
 def _visiting_order(radius: float) -> NDArray[np.int32]:
-    """Return (row, column) offsets (M, 2) of the columns that a ball of so many columns' radius can reach, shuffled."""
+    """Return shuffled (row, column) offsets (M, 2) of the columns that a ball can reach; the radius is in columns."""
     reach = math.ceil(radius + _ROUNDING)
     offsets = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - reach
     gap = np.maximum(np.abs(offsets) - 1 - _ROUNDING, 0)
@@ -89,7 +89,7 @@ _CUBE_ROUNDING = 1e-2  # of a column: how far float32 may misplace a point that 
 
 
 def cube_cells_m(half_length_m: float, cells: int) -> NDArray[np.float32]:
-    """Return centers of the cells of a cube, seen from its own: (cells^3, 3) metres; z varies fastest, x slowest."""
+    """Return centers of the cells of a cube, relative to its own: (cells^3, 3) metres; z varies fastest, x slowest."""
     share = (np.indices((cells, cells, cells)).reshape(3, -1).T + 0.5) * (2 / cells) - 1
     return np.ascontiguousarray(half_length_m * share, np.float32)
 

@@ -27,7 +27,7 @@ class Columns(NamedTuple):
 
 
 def require_points(points: NDArray[Any]) -> NDArray[np.float32]:
-    """Return points (N, >=3), x, y, z in metres first, as contiguous float32, without a copy if they are.
+    """Return points (N, >=3), x, y, z in metres first, as contiguous float32, without a copy if possible.
 
     Raises:
         ValueError: another shape, or a coordinate that is not finite, which has no column.

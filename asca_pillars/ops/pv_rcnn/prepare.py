@@ -142,7 +142,7 @@ class VoxelScan(NamedTuple):
     """Nearest voxels (K, 3) for each source, see `three_nearest`; (0, 3) where they are not needed."""
     nearest_weights: tuple[NDArray[np.float32], ...]
     bev_cells: NDArray[np.int32]
-    """(K, 4) flat indices into the map seen from above, see `bilinear_cells`."""
+    """(K, 4) flat indices into the bird's-eye-view map, see `bilinear_cells`."""
     bev_weights: NDArray[np.float32]
     """(K, 4)."""
     scales: tuple[PointScale[NDArray[Any]], ...]

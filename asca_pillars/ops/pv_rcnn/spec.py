@@ -24,7 +24,7 @@ class VoxelSpec(DetectorSpec):
 
     Attributes:
         grid: of the voxels.
-        last_stride: of conv4 seen from above; along z it always halves. With 1 the map has cells of four voxels instead
+        last_stride: of conv4 along x and y; along z it always halves. With 1 the map has cells of four voxels instead
             of eight, and conv4's first convolution has a kernel along z alone: one that kept the resolution and grew
             sideways would more than double the active cells.
         anchor_places: `ends`: anchors stand evenly from one end of the range to the other, both included, as in the
@@ -86,12 +86,12 @@ class VoxelSpec(DetectorSpec):
 
     @property
     def map_stride(self) -> int:
-        """Voxels along x and along y of a cell of the map seen from above."""
+        """Voxels along x and along y of a cell of the bird's-eye-view map."""
         return self.level_strides[-1][1]
 
     @property
     def map_shape(self) -> tuple[int, int]:
-        """Rows and columns of the map seen from above, on which the head answers."""
+        """Rows and columns of the bird's-eye-view map, that of the head."""
         return self.level_shapes[-1][1:]
 
     def map_places_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

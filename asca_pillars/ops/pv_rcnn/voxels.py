@@ -14,7 +14,7 @@ from asca_pillars.base.strict import Strict
 from asca_pillars.ops.sparse.rulebooks import MAX_Z_CELLS, CellMap, Shape
 
 KERNELS = "asca_pillars.ops.pv_rcnn.kernels"
-_TOLERANCE = 1e-2  # of a number of voxels: room for float dust and for sizes written with few digits
+_TOLERANCE = 1e-2  # of a voxel, for rounding errors and for sizes written with few digits
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class VoxelGrid(Strict):
         return (lows + (np.stack([x, y, z], axis=-1) + 0.5) * sizes).astype(np.float32)
 
     def cells(self, points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
-        """Return flat index (y * nx + x) * nz + z of each point's voxel, or -1 outside the ranges.
+        """Return the flat index (y * nx + x) * nz + z of each point's voxel, or -1 outside the ranges.
 
         A border belongs to the voxel above it. Points are compared as float32.
 

@@ -18,7 +18,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
 
 Shape = tuple[int, int, int]
-"""Cells along z, y, x; a map seen from above has one along z."""
+"""Cells along z, y, x; a bird's-eye-view map has one along z."""
 
 
 class Links(NamedTuple):
@@ -55,7 +55,7 @@ class Convolution:
                 )
 
     def output_shape(self, shape: Shape) -> Shape:
-        """Return cells of the output for an input of this shape."""
+        """Return the shape of the output for an input of this shape."""
         sizes = zip(shape, self.kernel, self.stride, self.padding, strict=True)
         z, y, x = ((size + 2 * padding - kernel) // stride + 1 for size, kernel, stride, padding in sizes)
         return z, y, x

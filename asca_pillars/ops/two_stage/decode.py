@@ -70,7 +70,7 @@ def refined_detections(
         scores: (R,) in [0, 1], which take the place of the first stage's, see `refined_scores`.
         residuals: (R, 7), see `decode_refinement`.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left out below
+    with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are left out below
         boxes = decode_refinement(residuals, proposals.boxes)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
     own = np.flatnonzero(usable)

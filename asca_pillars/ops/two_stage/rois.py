@@ -86,7 +86,7 @@ FOREGROUND_IOU = 0.55
 HARD_IOU = 0.1
 """3D IoU from which background is hard; below it is easy."""
 _FOREGROUND_SHARE = 0.5
-_HARD_SHARE = 0.8  # of the background
+_HARD_SHARE = 0.8  # share of hard samples in the background
 _BORDER_M = 0.1  # around a box, in which a keypoint is neither inside nor outside
 _CONFIDENCE_IOU = 0.25, 0.75  # where the confidence begins to rise from 0, and where it reaches 1
 

@@ -62,7 +62,7 @@ def measure_matrix(
     ways = [way for bundle in bundles for way in _ways(bundle, default_threads() if threads is None else threads)]
     for number in track(len(ways), "opening"):
         way = ways[number]
-        # What does not run with so many threads does not with others, and is one row.
+        # A way that fails with these threads fails with others too, and gets one row.
         if not any(isinstance(result, str) and _same_but_threads(way, other) for other, result in opened.items()):
             opened[way] = _open(bundles[way.bundle], way, scans[0], mounting)
     detectors = {str(way): detector for way, detector in opened.items() if isinstance(detector, Detector)}

@@ -10,7 +10,7 @@ from asca_deploy.benchmark.timing import Track, pillars_of, run_frame, silently
 from asca_deploy.detector import Detector
 
 COUNTS = (1_000, 10_000, 100_000, 1_000_000)
-JITTER_M = 0.02  # what a LiDAR's own noise is like
+JITTER_M = 0.02  # similar to a LiDAR's range noise
 
 
 @dataclass(frozen=True)

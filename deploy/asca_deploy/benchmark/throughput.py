@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asca_deploy.benchmark.timing import Percentiles, Spread, Track, run_frame, silently
 from asca_deploy.detector import Detector
 
-FRAMES = 8  # of one round, at least
+FRAMES = 8  # minimum of a round
 
 
 @dataclass(frozen=True)

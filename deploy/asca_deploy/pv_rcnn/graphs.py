@@ -22,7 +22,7 @@ _KEPT_BYTES = 64 << 20
 
 
 def map_channels(bundle: PvRcnnBundle) -> int:
-    """Return channels of the map seen from above."""
+    """Return the channels of the bird's-eye-view map."""
     return bundle.pv_rcnn.voxel_channels[-1] * bundle.spec.level_shapes[-1][0]
 
 

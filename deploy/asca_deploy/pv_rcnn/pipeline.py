@@ -65,7 +65,7 @@ class VoxelAnswer(NamedTuple):
     scan: VoxelScan
     levels: dict[str, NDArray[np.float32]]
     bev: NDArray[np.float32]
-    """(K, C) the map seen from above at the keypoints, in steps where the map is."""
+    """(K, C) features of the bird's-eye-view map at the keypoints, in steps where the map is."""
     maps: HeadMaps[NDArray[np.float32]] | None
     """(channels, H, W); None of a scan without voxels."""
 

@@ -242,11 +242,11 @@ class _Run:
         yield from self._skip()
 
     def first(self) -> str:
-        """Return the first reason why a scan was skipped, to end a sentence with."""
+        """Return the first reason why a scan was skipped, as the end of a sentence."""
         return f": {self.troubles[0]}" if self.troubles else ""
 
     def skipped(self) -> list[str]:
-        """Return a sentence, if scans were skipped."""
+        """Return a sentence on skipped scans, if there are any."""
         return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
@@ -305,7 +305,7 @@ def _about(
         **detector_scope(detector.spec, around=task.around).to_json(),
         "score": least,
         "around": task.around,
-        "mounting": to_dict(mounting),  # what the files that `reading` names had in them
+        "mounting": to_dict(mounting),  # content of the files that `reading` names
         "reading": {name: None if value is None else str(value) for name, value in asdict(reading).items()},
     }
 

@@ -24,7 +24,7 @@ from asca_pillars.detection.detections import Detections
 
 JOURNAL_FILE = "detections.partial.jsonl"
 _LONGEST_HEAD_BYTES = 1 << 24
-_KEY = "journal of asca detect"  # of the first line, whose text is the key of the others
+_KEY = "journal of asca detect"  # key of the first line, whose text is the key of the others
 
 
 class ScanResult(NamedTuple):

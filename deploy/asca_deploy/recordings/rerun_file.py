@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from asca_deploy.recordings.results import Found
 from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
 
-MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
+MAX_POINTS = 20_000  # points shown of a scan: a whole revolution of 120,000 takes 14 MB a second
 TIMELINE = "time"
 MOVES_MPS = 0.5
 """Speed below which tracks have no arrow."""
 _BACKGROUND = (14, 18, 24)
 APPLICATION = "asca-pillars"
-_HEAD_BYTES = 4096  # of a file, among which the application's name is
+_HEAD_BYTES = 4096  # leading bytes of a file that hold the application's name
 _FLUSH_S = 60.0
 
 

@@ -77,7 +77,7 @@ class Live:
         self._tracker, self._pose_of = tracker, pose_of
         self._queue = ScanQueue("drop")
         self._ended = threading.Event()
-        self._frame_id: str | None = None  # of the scans whose transform was taken
+        self._frame_id: str | None = None  # frame of the scans whose transform is used
         self._scale: float | None = None
         self._scale_scans = 0
         self._is_answering = False
@@ -140,7 +140,7 @@ class Live:
         self._queue.interrupt()
 
     def busy_s(self) -> float:
-        """Return for how many seconds the detector has worked on a scan without an answer; 0 while it waits for one."""
+        """Return the seconds that the detector has spent on a scan without an answer; 0 while it waits for one."""
         since = self._working_since
         return 0.0 if since is None else monotonic() - since
 

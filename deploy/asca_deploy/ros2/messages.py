@@ -110,7 +110,7 @@ def detection_array(stamp: Stamp, found: Detections | Tracks) -> Fields:
 def diagnostic_array(
     sec: int, nanosec: int, *, level: int, message: str, hardware_id: str, values: Mapping[str, object]
 ) -> Fields:
-    """Return `diagnostic_msgs/DiagnosticArray` of one status.
+    """Return a `diagnostic_msgs/DiagnosticArray` of one status.
 
     Args:
         sec: when, seconds.
@@ -154,7 +154,7 @@ def _with_tracks(found: Detections | Tracks) -> list[tuple[Detection, tuple[int,
 
 
 def _pose(box: Detection, *, lift_m: float = 0.0, yaw_rad: float | None = None) -> Fields:
-    """Return `geometry_msgs/Pose` of a box's center, or above it; turned about z."""
+    """Return a `geometry_msgs/Pose` of a box's center, or above it; turned about z."""
     half = (box.yaw_rad if yaw_rad is None else yaw_rad) / 2
     return {
         "position": {"x": box.x_m, "y": box.y_m, "z": box.z_m + lift_m},

@@ -134,7 +134,7 @@ def refine_inputs(scan: RefineScan) -> dict[str, NDArray[Any]]:
 
 
 def grid_names(number: int, samples: int) -> GroupedBalls[str]:
-    """Return names of the inputs for the balls around grid points, of one radius."""
+    """Return the names of the inputs for the balls around grid points, of one radius."""
     groups = [(f"grid_{number}_queries_{width}", f"grid_{number}_members_{width}") for width in group_widths(samples)]
     return GroupedBalls(tuple(BallGroup(*group) for group in groups), f"grid_{number}_rows")
 

@@ -19,7 +19,7 @@ from asca_pillars.ops.points.sampling import read_map
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, voxel_scan
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
 
-RELATIVE_TOLERANCE = 1e-4  # of what a graph gives, to its largest value where that is above 1
+RELATIVE_TOLERANCE = 1e-4  # of a graph's outputs, relative to their largest value where that is above 1
 
 Array = NDArray[np.float32]
 

@@ -22,7 +22,7 @@ from asca_export.sparse_quantize import count_steps, highest_outputs, mixed_prod
 from asca_pillars.models.pv_rcnn.layers import SparseConvBlock, VoxelBackbone
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
 
-_PLACES = 1000  # of each scan and layer, whose inputs weights are rounded for; 27 taps make a product of them dear
+_PLACES = 1000  # samples of each scan and layer for rounding weights; with 27 taps their product is expensive
 
 
 class VoxelSample(NamedTuple):

@@ -23,7 +23,7 @@ from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStage, requir
 
 
 def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a copy of a backbone that also returns its head's input in float32, named NECK; the rest stays as it is.
+    """Return a copy of a backbone that also returns its head's input in float32, named NECK; the rest is unchanged.
 
     It is (1, H, W, C) of a dense neck, (M, C) at the active head cells of a sparse one. Channels of an 8-bit backbone
     are scaled so that all have steps of one size.
